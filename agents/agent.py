@@ -1,0 +1,94 @@
+"""The seam between a trial and its student, and what crosses it.
+
+An agent is any CRL algorithm. **The cost limit is an argument of ``update``, never agent state**: it is a
+vector [k], it may be infinite, and it changes between updates. NumPy crosses the seam, tensors do not.
+
+Letters: T steps, B environments, k costs, E episodes finished in the rollout, M of its steps truncated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """T steps of B environments, collected under one policy.
+
+    Attributes:
+        observations: what the policy saw, float32 [T, B, n].
+        actions: what it did: int64 [T, B] (categorical) or float32 [T, B, m] (Gaussian, before clipping).
+        rewards: float64 [T, B].
+        costs: float64 [T, B, k].
+        terminated: the step ended an episode for good (value afterwards is 0), bool [T, B].
+        truncated: the step ended an episode by a time-out (value afterwards is bootstrapped), bool
+            [T, B]; never true where ``terminated`` is.
+        final_observations: the true last observations of the truncated steps, in row-major order of
+            ``truncated``, float32 [M, n].
+        last_observations: what the policy would see next, float32 [B, n]; bootstraps the episodes that
+            the end of the rollout cuts.
+    """
+
+    observations: npt.NDArray[np.float32]
+    actions: npt.NDArray[Any]
+    rewards: Floats
+    costs: Floats
+    terminated: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+    final_observations: npt.NDArray[np.float32]
+    last_observations: npt.NDArray[np.float32]
+
+
+class Agent(Protocol):
+    """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
+
+    def act(
+        self, observations: npt.NDArray[np.float32], generator: np.random.Generator
+    ) -> npt.NDArray[Any]:
+        """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        ...
+
+    def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
+        """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        ...
+
+    def update(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
+        """Learn from one rollout under the given limits.
+
+        Args:
+            rollout: T x B steps collected with the current policy.
+            episode_costs: undiscounted costs of the episodes that finished in it, [E, k]; E may be 0,
+                and then nothing is known about the constraints: what depends on them waits.
+            limits: the cost limits d in force, [k], each >= 0, possibly infinite.
+
+        Returns:
+            Metrics, finite or NaN; every update of an agent returns the same keys.
+        """
+        ...
+
+    def add_noise(self, noise: float, observations: npt.NDArray[np.float32]) -> dict[str, float]:
+        """Make the policy more exploratory once (Algorithm 2, line 9).
+
+        Args:
+            noise: eps_pi in (0, 1].
+            observations: states at which the policy's randomness is measured, [N, n].
+
+        Returns:
+            What was done, as metrics; the same keys every time.
+        """
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All learnt and adaptive state: a tree of dicts, lists, JSON scalars and NumPy arrays."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        ...

@@ -1,0 +1,144 @@
+"""The vocabulary of constrained Markov decision processes that every other package speaks.
+
+A CMDP is (S, A, T, gamma, R, C, d) (paper, section 3). ``CMDPSpec`` is all of it that a task fixes;
+the limits d are never part of it, because in RECRL they change (``CostLimits``). The discount gamma
+belongs to the student's critics: returns, episode costs and limits are *undiscounted* sums over an
+episode, which is the unit in which the paper states its limits.
+
+Letters: k is the number of cost functions, b an episode's index, B the training budget.
+
+Imports neither Gymnasium nor torch at run time, so that teachers can use it alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    import gymnasium
+
+Floats = npt.NDArray[np.float64]
+
+
+class Phase(StrEnum):
+    """Where a trial stands: the paper's training phase (limits d_t ... d_d) or deployment (d_d)."""
+
+    TRAINING = "training"
+    DEPLOYMENT = "deployment"
+
+
+@dataclass(frozen=True)
+class CMDPSpec:
+    """What a task fixes of a CMDP: spaces, cost functions and horizon, but not the limits d.
+
+    Attributes:
+        name: the task's registry name, for example ``rivergrid-1a``.
+        observation_space: of one environment (not batched).
+        action_space: of one environment; ``Discrete`` or a bounded or unbounded ``Box``.
+        cost_names: names of the k >= 1 cost functions, in the order of every cost vector.
+        horizon: steps after which an episode is truncated, or None if it never is.
+    """
+
+    name: str
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+    cost_names: tuple[str, ...]
+    horizon: int | None
+
+    def __post_init__(self) -> None:
+        if not self.cost_names:
+            raise ValueError(f"{self.name}: a CMDP needs at least one cost function, got none")
+        if len(set(self.cost_names)) != len(self.cost_names):
+            raise ValueError(f"{self.name}: cost names must differ, got {self.cost_names}")
+
+    @property
+    def num_costs(self) -> int:
+        """The number of cost functions, k."""
+        return len(self.cost_names)
+
+
+@dataclass(frozen=True)
+class CostLimits:
+    """Upper limits d on the expected undiscounted episode costs, one per cost function.
+
+    Attributes:
+        values: [k], each >= 0 and possibly infinite (no constraint in that dimension).
+
+    >>> CostLimits((5.0, math.inf)).finite
+    (True, False)
+    """
+
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", tuple(float(value) for value in self.values))
+        if not self.values:
+            raise ValueError("cost limits: at least one is needed, got none")
+        for value in self.values:
+            if not value >= 0.0:  # also catches NaN
+                raise ValueError(f"cost limits must be at least 0, got {value}")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __iter__(self) -> Iterator[float]:
+        return iter(self.values)
+
+    def __getitem__(self, index: int) -> float:
+        return self.values[index]
+
+    @property
+    def finite(self) -> tuple[bool, ...]:
+        """Which dimensions constrain anything, [k]."""
+        return tuple(math.isfinite(value) for value in self.values)
+
+    @property
+    def array(self) -> Floats:
+        """The limits as a new float64 array, [k]."""
+        return np.array(self.values, dtype=np.float64)
+
+    def to_json(self) -> list[float | str]:
+        """The limits as strict JSON, infinity spelt ``"inf"``: JSON has no infinite number."""
+        return [value if math.isfinite(value) else "inf" for value in self.values]
+
+    @classmethod
+    def from_json(cls, values: Iterable[float | str]) -> CostLimits:
+        """The inverse of ``to_json``."""
+        return cls(tuple(float(value) for value in values))
+
+    @classmethod
+    def unlimited(cls, num_costs: int) -> CostLimits:
+        """Limits that constrain nothing: the CMDP is an MDP (paper, section 4)."""
+        return cls((math.inf,) * num_costs)
+
+
+@dataclass(frozen=True)
+class EpisodeStats:
+    """One finished episode: all that a teacher, a figure or a user ever sees of it.
+
+    Attributes:
+        index: b, counted from 0 over the whole trial in the order in which episodes end.
+        phase: the phase in which it ended.
+        end_step: environment steps the trial had taken, over all its environments, when it ended.
+        length: its number of steps, at least 1.
+        episode_return: undiscounted sum of rewards.
+        costs: undiscounted sums of costs, [k].
+        limits: the cost limits in force when it ended, [k].
+        noise: the teacher's policy noise in force when it ended, in [0, 1].
+    """
+
+    index: int
+    phase: Phase
+    end_step: int
+    length: int
+    episode_return: float
+    costs: tuple[float, ...]
+    limits: CostLimits
+    noise: float

@@ -1,0 +1,44 @@
+"""The seam between environments and agents: a batch of CMDPs stepped together.
+
+Every task reaches the agents as a ``CMDPVectorEnv``. What crosses, and nothing else:
+
+- ``step(actions)`` returns observations [B, ...], rewards float64 [B], terminated bool [B], truncated
+  bool [B] and ``info``, in which
+    - ``info["cost"]`` is float64 [B, k], the step's costs in the order of ``cmdp.cost_names``;
+    - ``info["final_obs"]`` [B, ...] holds the true last observation in the rows where an episode
+      ended (elsewhere its content means nothing); it is present only if one ended.
+- An environment whose episode ended is reset in the same step (Gymnasium's ``SAME_STEP``), so row i of
+  the returned observations is then the first of the next episode.
+- ``state_dict`` holds everything that the future depends on, generators included; a tree of dicts,
+  lists, JSON scalars and NumPy arrays. ``load_state_dict`` continues exactly from there.
+
+Letters: B environments, k costs.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from recrl.environments.cmdp import CMDPSpec
+
+
+class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
+    """B environments of one task; see the module's docstring for the contract.
+
+    Attributes:
+        cmdp: what the task fixes of the CMDP.
+    """
+
+    cmdp: CMDPSpec
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future of these environments depends on."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""

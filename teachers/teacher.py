@@ -1,0 +1,107 @@
+"""The seam between a trial and its teacher.
+
+A teacher is a pure function ``step(state, report) -> (Lesson, state')``. The *trial* holds the state and
+checkpoints it with the agent; a teacher keeps nothing between calls, so it can run inline, in an actor of
+its own or in one actor that a whole sweep shares, and always gives the same limits. It is asked once per
+policy update, with every episode that finished since the last one.
+
+Letters: d_t training limits, d_d deployment limits, B the training budget in environment steps,
+p = env steps / B in [0, 1] the progress, k the number of costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from recrl.environments.cmdp import CostLimits, EpisodeStats
+
+# A teacher's state: JSON values only, so that it can be checkpointed and sent between processes.
+TeacherState = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What the student is to learn under until the next lesson.
+
+    Attributes:
+        limits: the cost limits d, [k].
+        policy_noise: eps_pi in [0, 1], noise to add to the student's policy once, before it collects
+            the next batch (Algorithm 2, line 9); 0 for none.
+    """
+
+    limits: CostLimits
+    policy_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.policy_noise <= 1.0:
+            raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
+
+
+@dataclass(frozen=True)
+class ProgressReport:
+    """What a trial tells its teacher after a policy update.
+
+    Attributes:
+        update: index of the policy update just done, counted from 1.
+        env_steps: environment steps taken so far, over all the trial's environments.
+        episodes: the episodes that finished since the last report, in order; may be empty.
+    """
+
+    update: int
+    env_steps: int
+    episodes: tuple[EpisodeStats, ...]
+
+
+@dataclass(frozen=True)
+class TeacherSpec:
+    """Everything a teacher is made of; crosses process boundaries.
+
+    Attributes:
+        name: registry name (``none``, ``linear``, ``dynamic``, ...), entry point or import path.
+        options: the teacher's settings, validated by its config class.
+        train_limits: d_t, [k], possibly infinite.
+        deploy_limits: d_d, [k], finite, each at most d_t.
+        train_steps: B, environment steps of the training phase, at least 1.
+    """
+
+    name: str
+    options: Mapping[str, Any]
+    train_limits: CostLimits
+    deploy_limits: CostLimits
+    train_steps: int
+
+    def __post_init__(self) -> None:
+        if len(self.train_limits) != len(self.deploy_limits):
+            raise ValueError(
+                f"train_limits and deploy_limits must have one entry per cost, "
+                f"got {len(self.train_limits)} and {len(self.deploy_limits)}"
+            )
+        for train, deploy in zip(self.train_limits, self.deploy_limits, strict=True):
+            if train < deploy:
+                raise ValueError(
+                    f"train_limits must be at least deploy_limits (d_t >= d_d), "
+                    f"got {train} < {deploy}"
+                )
+        if self.train_steps < 1:
+            raise ValueError(f"train_steps must be at least 1, got {self.train_steps}")
+
+
+class Teacher(Protocol):
+    """A cost-limit curriculum (the paper's CLiC teacher)."""
+
+    def start(self) -> tuple[Lesson, TeacherState]:
+        """The first lesson and the state before any update."""
+        ...
+
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+        """The next lesson, given all finished episodes; never changes ``state``.
+
+        Idempotent on the update index: asked again for the update that ``state`` has already seen, it
+        returns the same lesson and the same state.
+
+        Raises:
+            ValueError: ``report.update`` is neither the update after the state's nor the state's own.
+        """
+        ...
