@@ -49,9 +49,7 @@ class Rollout:
 class Agent(Protocol):
     """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
 
-    def act(
-        self, observations: npt.NDArray[np.float32], generator: np.random.Generator
-    ) -> npt.NDArray[Any]:
+    def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
         ...
 

@@ -81,8 +81,7 @@ class TeacherSpec:
         for train, deploy in zip(self.train_limits, self.deploy_limits, strict=True):
             if train < deploy:
                 raise ValueError(
-                    f"train_limits must be at least deploy_limits (d_t >= d_d), "
-                    f"got {train} < {deploy}"
+                    f"train_limits must be at least deploy_limits (d_t >= d_d), got {train} < {deploy}"
                 )
         if self.train_steps < 1:
             raise ValueError(f"train_steps must be at least 1, got {self.train_steps}")
