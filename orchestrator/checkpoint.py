@@ -1,0 +1,104 @@
+"""Checkpoints: a tree of plain values and arrays in one file that runs no code when it is read.
+
+A tree is made of dicts with string keys, lists, strings, numbers, booleans, None and NumPy arrays. The file
+is a magic line, the SHA-256 of the rest, and a safetensors payload whose metadata holds the tree as JSON with
+each array replaced by its key. A file cut short or changed in a single bit is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from recrl.orchestrator.errors import CheckpointError
+
+MAGIC = b"recrl checkpoint 1\n"
+_ARRAY = "__array__"
+
+
+def encode(tree: dict[str, Any]) -> bytes:
+    """The bytes of a checkpoint holding ``tree``.
+
+    Raises:
+        TypeError: a leaf is neither a JSON value nor an array.
+    """
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
+    skeleton = json.dumps(_without_arrays(tree, arrays, "$"))
+    payload = safetensors.numpy.save(arrays, metadata={"tree": skeleton})
+    return MAGIC + hashlib.sha256(payload).digest() + payload
+
+
+def decode(data: bytes, *, source: str) -> dict[str, Any]:
+    """The tree that ``encode`` wrote.
+
+    Args:
+        data: a whole checkpoint.
+        source: where it came from, for the error.
+
+    Raises:
+        CheckpointError: the bytes are not an intact checkpoint of this version.
+    """
+    if not data.startswith(MAGIC):
+        raise CheckpointError(f"{source}: not a checkpoint of this version of recrl")
+    digest, payload = data[len(MAGIC) : len(MAGIC) + 32], data[len(MAGIC) + 32 :]
+    if hashlib.sha256(payload).digest() != digest:
+        raise CheckpointError(f"{source}: the checkpoint is truncated or damaged (its checksum differs)")
+    try:
+        arrays = safetensors.numpy.load(payload)
+        header_length = int.from_bytes(payload[:8], "little")
+        metadata = json.loads(payload[8 : 8 + header_length])["__metadata__"]
+        tree = _with_arrays(json.loads(metadata["tree"]), arrays)
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CheckpointError(f"{source}: the checkpoint cannot be read: {error}") from error
+    if not isinstance(tree, dict):
+        raise CheckpointError(f"{source}: the checkpoint holds no tree")
+    return tree
+
+
+def load(path: Path) -> dict[str, Any]:
+    """The tree in a checkpoint file.
+
+    Raises:
+        CheckpointError: the file is missing, truncated, damaged or of another version.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error.strerror}") from error
+    return decode(data, source=str(path))
+
+
+def _without_arrays(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: str) -> Any:
+    """The tree with each array moved to ``arrays`` and replaced by its path."""
+    if isinstance(value, np.ndarray):
+        arrays[path] = np.array(value, order="C")
+        return {_ARRAY: path}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str) or key == _ARRAY:
+                raise TypeError(f"checkpoint: {path}: keys must be strings other than {_ARRAY}, got {key!r}")
+        return {key: _without_arrays(item, arrays, f"{path}.{key}") for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_arrays(item, arrays, f"{path}.{index}") for index, item in enumerate(value)]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"checkpoint: {path}: cannot store a {type(value).__name__}")
+
+
+def _with_arrays(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
+    """The inverse of ``_without_arrays``."""
+    if isinstance(value, dict):
+        if _ARRAY in value:
+            return arrays[value[_ARRAY]]
+        return {key: _with_arrays(item, arrays) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_with_arrays(item, arrays) for item in value]
+    return value

@@ -1,0 +1,31 @@
+"""The questions a user may have, each an exception; only ``cli`` turns them into text and exit codes."""
+
+from __future__ import annotations
+
+
+class RecrlError(Exception):
+    """Anything that a user can understand and mend; its text is one clear sentence."""
+
+
+class GridError(RecrlError):
+    """A grid file is wrong; ``problems`` holds one located sentence for every mistake in it."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+class CheckpointError(RecrlError):
+    """A checkpoint is truncated, damaged or of another version; an older one may serve."""
+
+
+class LostLeaseError(RecrlError):
+    """Another attempt has taken this trial over; this one must write nothing more."""
+
+
+class SweepBusyError(RecrlError):
+    """Another process is running this sweep."""
+
+
+class TeacherUnavailableError(RecrlError):
+    """The teacher did not answer; nothing is lost, the trial can be resumed."""

@@ -1,0 +1,173 @@
+"""What one trial is: a frozen, JSON-able value that fixes everything a result depends on.
+
+Two trials with equal specs give equal bytes. Paths, cluster addresses, logging and the number of workers
+are therefore not in it. ``trial_id`` is a hash of the spec's canonical JSON; ``group`` is the same hash
+without the seed, so that runs to be averaged share it.
+
+Letters: d_t training limits, d_d deployment limits, B the training budget, T rollout steps.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from recrl.environments.cmdp import CostLimits
+from recrl.teachers.teacher import TeacherSpec
+
+
+class TrialState(StrEnum):
+    """Where a trial stands, as its files say."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    COMPLETE = "complete"
+    FAILED = "failed"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether no further launch of the same grid would work on it by itself."""
+        return self in (TrialState.COMPLETE, TrialState.FAILED)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A task, student or teacher chosen in a grid.
+
+    Attributes:
+        name: registry name, entry point or import path.
+        options: its settings, as JSON values; validated by its own config class.
+        label: what tables, figures and folders call it; the name unless the grid says otherwise.
+    """
+
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.label:
+            object.__setattr__(self, "label", self.name)
+
+    def to_json(self) -> dict[str, Any]:
+        """The choice as JSON values."""
+        return {"name": self.name, "options": dict(self.options), "label": self.label}
+
+
+@dataclass(frozen=True)
+class TrialSpec:
+    """One cell of a sweep.
+
+    Attributes:
+        task: the CMDP.
+        agent: the student.
+        method: the teacher; its label is the method's name in tables and figures.
+        train_limits: d_t, [k]; infinite where the teacher is to measure its start or needs none.
+        deploy_limits: d_d, [k], finite, at most d_t.
+        train_steps: B, environment steps of the training phase, at least 1.
+        deploy_steps: environment steps of the deployment phase, at least 0.
+        num_envs: environments stepped together, at least 1.
+        rollout_steps: T, steps of each environment between two policy updates, at least 1.
+        evaluation_episodes: episodes of each frozen-policy evaluation at the end, at least 0.
+        seed: at least 0; the same seed gives the same initial policy and the same environment stream
+            under every method.
+    """
+
+    task: Choice
+    agent: Choice
+    method: Choice
+    train_limits: CostLimits
+    deploy_limits: CostLimits
+    train_steps: int
+    deploy_steps: int
+    num_envs: int
+    rollout_steps: int
+    evaluation_episodes: int
+    seed: int
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps of both phases, over all environments."""
+        return self.train_steps + self.deploy_steps
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps between two policy updates, T x num_envs."""
+        return self.num_envs * self.rollout_steps
+
+    @property
+    def num_updates(self) -> int:
+        """Policy updates of the whole trial; the last one ends at or after ``total_steps``."""
+        return -(-self.total_steps // self.steps_per_update)
+
+    @property
+    def teacher(self) -> TeacherSpec:
+        """The teacher's part of the spec."""
+        return TeacherSpec(
+            name=self.method.name,
+            options=self.method.options,
+            train_limits=self.train_limits,
+            deploy_limits=self.deploy_limits,
+            train_steps=self.train_steps,
+        )
+
+    @property
+    def trial_id(self) -> str:
+        """Ten hex digits that differ whenever anything a result depends on differs."""
+        return _digest(self.to_json())
+
+    @property
+    def group(self) -> str:
+        """The trial's identity without its seed: what seeds are averaged over."""
+        return _digest({key: value for key, value in self.to_json().items() if key != "seed"})
+
+    @property
+    def folder_name(self) -> str:
+        """A readable, unique and safe name for the trial's folder."""
+        labels = (self.task.label, self.agent.label, self.method.label)
+        readable = "__".join(re.sub(r"[^A-Za-z0-9.+-]+", "-", label).strip(".-")[:40] for label in labels)
+        return f"{readable}__s{self.seed}__{self.trial_id}"
+
+    @property
+    def title(self) -> str:
+        """What people call the trial: ``rivergrid-1a ppo-lag dynamic seed 3``."""
+        return f"{self.task.label} {self.agent.label} {self.method.label} seed {self.seed}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The spec as strict JSON values; ``from_json`` is its inverse."""
+        return {
+            "task": self.task.to_json(),
+            "agent": self.agent.to_json(),
+            "method": self.method.to_json(),
+            "train_limits": self.train_limits.to_json(),
+            "deploy_limits": self.deploy_limits.to_json(),
+            "train_steps": self.train_steps,
+            "deploy_steps": self.deploy_steps,
+            "num_envs": self.num_envs,
+            "rollout_steps": self.rollout_steps,
+            "evaluation_episodes": self.evaluation_episodes,
+            "seed": self.seed,
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> TrialSpec:
+        """The spec that ``to_json`` wrote."""
+        return cls(
+            **{
+                **value,
+                "task": Choice(**value["task"]),
+                "agent": Choice(**value["agent"]),
+                "method": Choice(**value["method"]),
+                "train_limits": CostLimits.from_json(value["train_limits"]),
+                "deploy_limits": CostLimits.from_json(value["deploy_limits"]),
+            }
+        )
+
+
+def _digest(value: Mapping[str, Any]) -> str:
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]

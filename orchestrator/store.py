@@ -1,0 +1,509 @@
+"""The files of a sweep: the truth that everything else (status, MLflow, figures) is a view of.
+
+    <root>/<sweep>/
+        sweep.json              name, creation time, recrl's version
+        grid.yaml               the grid file as given to the last launch
+        lock                    held by the one process that runs the sweep
+        figures/                what ``recrl-sweep figures`` drew
+        mlflow.db, mlartifacts/ the default MLflow store
+        trials/<task>__<agent>__<method>__s<seed>__<id>/
+            spec.json           the TrialSpec
+            state.json          the TrialRecord: status, progress, lease, committed file lengths
+            episodes.csv        a row an episode: EPISODE_COLUMNS and one cost_i, limit_i per cost
+            updates.csv         a row a policy update: UPDATE_COLUMNS and the student's own metrics
+            events.jsonl        a line an event: noise added, limits measured, phase changed
+            evaluation.csv      a row an episode of the frozen-policy evaluations: EVALUATION_COLUMNS
+            checkpoints/        the newest two checkpoints
+            provenance.json     versions, commit, machine
+            log.txt, error.txt  the trial's log; the traceback of a failed trial
+
+Rules. Small files are written beside and renamed. Rows are appended only by ``TrialWriter.commit``, then
+synced, then a checkpoint that holds the files' lengths is written, then ``state.json``: whatever dies
+between, a restart cuts the files back to the newest intact checkpoint and nothing is there twice. Readers
+look only at committed bytes. A writer holds a lease (a token in ``state.json``): once another attempt has
+taken the trial over, its every write is refused.
+"""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import io
+import json
+import os
+import secrets
+import socket
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from recrl.environments.cmdp import EpisodeStats
+from recrl.orchestrator import checkpoint
+from recrl.orchestrator.errors import CheckpointError, LostLeaseError, SweepBusyError
+from recrl.orchestrator.spec import TrialSpec, TrialState
+
+EPISODE_COLUMNS = ("index", "phase", "end_step", "length", "episode_return", "noise")
+UPDATE_COLUMNS = (
+    "update",
+    "phase",
+    "end_step",
+    "episodes",
+    "episode_return",
+    "noise",
+    "time",
+    "collect_seconds",
+    "update_seconds",
+)
+EVALUATION_COLUMNS = ("policy", "index", "length", "episode_return")
+KEPT_CHECKPOINTS = 2
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a whole file so that a reader, or a crash, sees the old one or the new one, never a part."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
+    try:
+        with beside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write strict JSON atomically."""
+    write_atomically(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+@dataclass(frozen=True)
+class TrialRecord:
+    """What ``state.json`` says of a trial.
+
+    Attributes:
+        status: where it stands.
+        attempt: how often it was started, from 1; 0 if never.
+        token: the lease of the attempt that may write.
+        update: policy updates done.
+        env_steps: environment steps taken.
+        total_steps: environment steps of the whole trial.
+        started_at: when the first attempt began, seconds since 1970.
+        heartbeat: when an attempt last said that it lives, seconds since 1970.
+        cpu_seconds: CPU time of all attempts, as far as committed.
+        steps_per_second: environment steps per wall second, over the last interval.
+        host: the machine of the last attempt.
+        pid: its process.
+        committed: lengths in bytes of the row files, as of the last commit.
+        start_limits: the training limits d_t the teacher measured, or None.
+        error: one line saying why the trial failed, or empty.
+    """
+
+    status: TrialState = TrialState.WAITING
+    attempt: int = 0
+    token: str = ""
+    update: int = 0
+    env_steps: int = 0
+    total_steps: int = 0
+    started_at: float = 0.0
+    heartbeat: float = 0.0
+    cpu_seconds: float = 0.0
+    steps_per_second: float = 0.0
+    host: str = ""
+    pid: int = 0
+    committed: dict[str, int] = field(default_factory=dict)
+    start_limits: list[float | str] | None = None
+    error: str = ""
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> TrialRecord:
+        """The record that was written as JSON."""
+        return cls(**{**value, "status": TrialState(value["status"])})
+
+
+class SweepStore:
+    """The folder of one sweep; every path in it is a property here.
+
+    Attributes:
+        folder: ``<root>/<sweep>``.
+    """
+
+    def __init__(self, root: Path, name: str) -> None:
+        self.folder = root.absolute() / name
+        self.name = name
+
+    @property
+    def grid_path(self) -> Path:
+        """The grid file as given to the last launch."""
+        return self.folder / "grid.yaml"
+
+    @property
+    def info_path(self) -> Path:
+        """Name, creation time and version."""
+        return self.folder / "sweep.json"
+
+    @property
+    def trials_folder(self) -> Path:
+        """One folder a trial."""
+        return self.folder / "trials"
+
+    @property
+    def figures_folder(self) -> Path:
+        """What ``recrl-sweep figures`` draws."""
+        return self.folder / "figures"
+
+    @property
+    def mlflow_database(self) -> Path:
+        """The default MLflow store (sqlite)."""
+        return self.folder / "mlflow.db"
+
+    @property
+    def mlflow_artifacts(self) -> Path:
+        """The default place of MLflow's artifacts."""
+        return self.folder / "mlartifacts"
+
+    def trial(self, spec: TrialSpec) -> TrialStore:
+        """The trial's folder; it need not exist yet."""
+        return TrialStore(self.trials_folder / spec.folder_name)
+
+    def trials(self) -> list[TrialStore]:
+        """Every trial on disk, in the order of the folders' names."""
+        if not self.trials_folder.is_dir():
+            return []
+        return [TrialStore(path.parent) for path in sorted(self.trials_folder.glob("*/spec.json"))]
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the sweep, so that no second process runs it.
+
+        Raises:
+            SweepBusyError: another process holds it.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / "lock").open("a+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                holder = file.read().strip() or "another process"
+                raise SweepBusyError(
+                    f"{self.folder}: this sweep is already being run by {holder}; wait for it or stop it"
+                ) from error
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            file.flush()
+            yield
+
+
+class TrialStore:
+    """The folder of one trial: its paths, and what readers may know of it.
+
+    Attributes:
+        folder: the trial's folder; its name is ``TrialSpec.folder_name``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @property
+    def spec_path(self) -> Path:
+        """The TrialSpec as JSON."""
+        return self.folder / "spec.json"
+
+    @property
+    def state_path(self) -> Path:
+        """The TrialRecord as JSON."""
+        return self.folder / "state.json"
+
+    @property
+    def episodes_path(self) -> Path:
+        """A row an episode."""
+        return self.folder / "episodes.csv"
+
+    @property
+    def updates_path(self) -> Path:
+        """A row a policy update."""
+        return self.folder / "updates.csv"
+
+    @property
+    def events_path(self) -> Path:
+        """A line an event."""
+        return self.folder / "events.jsonl"
+
+    @property
+    def evaluation_path(self) -> Path:
+        """A row an episode of the frozen-policy evaluations."""
+        return self.folder / "evaluation.csv"
+
+    @property
+    def checkpoints_folder(self) -> Path:
+        """The newest checkpoints."""
+        return self.folder / "checkpoints"
+
+    @property
+    def provenance_path(self) -> Path:
+        """Versions, commit and machine."""
+        return self.folder / "provenance.json"
+
+    @property
+    def log_path(self) -> Path:
+        """The trial's log."""
+        return self.folder / "log.txt"
+
+    @property
+    def error_path(self) -> Path:
+        """The traceback of a failed trial."""
+        return self.folder / "error.txt"
+
+    @cached_property
+    def spec(self) -> TrialSpec:
+        """What the trial is; it must be on disk."""
+        return TrialSpec.from_json(json.loads(self.spec_path.read_text()))
+
+    def record(self) -> TrialRecord:
+        """Where the trial stands now; a blank record if it was never started."""
+        try:
+            return TrialRecord.from_json(json.loads(self.state_path.read_text()))
+        except FileNotFoundError:
+            return TrialRecord()
+
+    def episodes(self) -> pd.DataFrame:
+        """The committed episodes: EPISODE_COLUMNS, then cost_i and limit_i for each cost."""
+        return self._committed_csv(self.episodes_path)
+
+    def updates(self) -> pd.DataFrame:
+        """The committed policy updates: UPDATE_COLUMNS, cost_i, limit_i, then the student's metrics."""
+        return self._committed_csv(self.updates_path)
+
+    def events(self) -> list[dict[str, Any]]:
+        """The committed events, in order; each has ``update``, ``end_step`` and ``event``."""
+        return [json.loads(line) for line in self._committed(self.events_path).splitlines()]
+
+    def evaluation(self) -> pd.DataFrame:
+        """The frozen-policy evaluations: EVALUATION_COLUMNS, then cost_i; empty before the end."""
+        if not self.evaluation_path.exists():
+            return pd.DataFrame(columns=list(EVALUATION_COLUMNS))
+        return pd.read_csv(self.evaluation_path)
+
+    def checkpoints(self) -> list[Path]:
+        """The checkpoints on disk, newest first."""
+        return sorted(self.checkpoints_folder.glob("checkpoint-*.recrl"), reverse=True)
+
+    def latest_checkpoint(self) -> dict[str, Any] | None:
+        """The newest intact checkpoint, or None; damaged ones are passed over."""
+        for path in self.checkpoints():
+            try:
+                return checkpoint.load(path)
+            except CheckpointError:
+                continue
+        return None
+
+    def begin(self, spec: TrialSpec) -> TrialWriter:
+        """Take the trial over: from now on only the returned writer may write.
+
+        Args:
+            spec: the trial; must be what the folder already holds, if anything.
+        """
+        self.checkpoints_folder.mkdir(parents=True, exist_ok=True)
+        with self.locked():
+            if not self.spec_path.exists():
+                write_json(self.spec_path, spec.to_json())
+            old = self.record()
+            record = replace(
+                old,
+                status=TrialState.RUNNING,
+                attempt=old.attempt + 1,
+                token=secrets.token_hex(8),
+                total_steps=spec.total_steps,
+                started_at=old.started_at or time.time(),
+                heartbeat=time.time(),
+                host=socket.gethostname(),
+                pid=os.getpid(),
+                error="",
+            )
+            write_json(self.state_path, asdict(record))
+        return TrialWriter(self, record)
+
+    def set_status(self, status: TrialState, *, error: str = "") -> None:
+        """Say from outside where the trial stands, for a trial that can no longer say it itself.
+
+        Revokes the lease of whoever still writes.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with self.locked():
+            record = replace(self.record(), status=status, error=error, token="")
+            write_json(self.state_path, asdict(record))
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Exclude other writers of this trial on the same file system, for a moment."""
+        with (self.folder / ".lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    def _committed(self, path: Path) -> bytes:
+        length = self.record().committed.get(path.name, 0)
+        if length == 0:
+            return b""
+        with path.open("rb") as file:
+            return file.read(length)
+
+    def _committed_csv(self, path: Path) -> pd.DataFrame:
+        data = self._committed(path)
+        return pd.read_csv(io.BytesIO(data)) if data else pd.DataFrame()
+
+
+class TrialWriter:
+    """The lease on a trial: buffers its rows and commits them together with a checkpoint.
+
+    Attributes:
+        store: the trial's folder.
+        record: the last record this writer wrote.
+    """
+
+    def __init__(self, store: TrialStore, record: TrialRecord) -> None:
+        self.store = store
+        self.record = record
+        self._rows: dict[Path, list[str]] = {
+            store.episodes_path: [],
+            store.updates_path: [],
+            store.events_path: [],
+        }
+        self._lengths = {path.name: 0 for path in self._rows}
+        self._cpu_origin = time.process_time()
+        self._cpu_before = record.cpu_seconds
+
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU time of all attempts of this trial so far."""
+        return self._cpu_before + time.process_time() - self._cpu_origin
+
+    def restore(self) -> dict[str, Any] | None:
+        """The newest intact checkpoint, with the row files cut back to it; None to start afresh.
+
+        A damaged checkpoint is renamed ``*.damaged`` and the one before it is used.
+        """
+        tree: dict[str, Any] | None = None
+        with self._lease():
+            for path in self.store.checkpoints():
+                try:
+                    tree = checkpoint.load(path)
+                    break
+                except CheckpointError:
+                    path.rename(path.with_suffix(".damaged"))
+            lengths = tree["files"] if tree else {}
+            for path in self._rows:
+                self._lengths[path.name] = int(lengths.get(path.name, 0))
+                if path.exists():
+                    os.truncate(path, self._lengths[path.name])
+            self._cpu_before = float(tree["cpu_seconds"]) if tree else 0.0
+            self._cpu_origin = time.process_time()
+            self._write_record(committed=dict(self._lengths))
+        return tree["trial"] if tree else None
+
+    def append_episode(self, episode: EpisodeStats) -> None:
+        """Add an episode's row to the next commit."""
+        row: dict[str, Any] = {name: getattr(episode, name) for name in EPISODE_COLUMNS}
+        row |= {f"cost_{i}": cost for i, cost in enumerate(episode.costs)}
+        row |= {f"limit_{i}": limit for i, limit in enumerate(episode.limits)}
+        self._append_csv(self.store.episodes_path, row)
+
+    def append_update(self, row: Mapping[str, Any]) -> None:
+        """Add an update's row to the next commit; every row of a trial has the same keys."""
+        self._append_csv(self.store.updates_path, row)
+
+    def append_event(self, event: Mapping[str, Any]) -> None:
+        """Add an event's line to the next commit."""
+        self._rows[self.store.events_path].append(json.dumps(event) + "\n")
+
+    def write_evaluation(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write the frozen-policy evaluations, whole."""
+        with self._lease():
+            write_atomically(self.store.evaluation_path, _csv_text(rows, header=True).encode())
+
+    def commit(self, tree: dict[str, Any], *, update: int, env_steps: int, **changes: Any) -> None:
+        """Make everything appended so far, and the trial's state, safe.
+
+        Args:
+            tree: the trial's whole state after ``update``.
+            update: policy updates done.
+            env_steps: environment steps taken.
+            changes: further fields of the TrialRecord to set.
+
+        Raises:
+            LostLeaseError: another attempt runs the trial now; nothing was written.
+            OSError: the disk is full or gone; the previous commit stands.
+        """
+        with self._lease():
+            lengths = {
+                path.name: _append_synced(path, "".join(rows), at=self._lengths[path.name])
+                for path, rows in self._rows.items()
+            }
+            cpu_seconds = self.cpu_seconds
+            data = checkpoint.encode({"trial": tree, "files": lengths, "cpu_seconds": cpu_seconds})
+            write_atomically(self.store.checkpoints_folder / f"checkpoint-{update:08d}.recrl", data)
+            self._write_record(
+                committed=lengths, update=update, env_steps=env_steps, cpu_seconds=cpu_seconds, **changes
+            )
+            self._lengths = lengths
+            for rows in self._rows.values():
+                rows.clear()
+            for old in self.store.checkpoints()[KEPT_CHECKPOINTS:]:
+                old.unlink()
+
+    def heartbeat(self, *, update: int, env_steps: int, steps_per_second: float) -> None:
+        """Say that the trial lives and how far it is; commits nothing.
+
+        Raises:
+            LostLeaseError: another attempt runs the trial now.
+        """
+        with self._lease():
+            self._write_record(update=update, env_steps=env_steps, steps_per_second=steps_per_second)
+
+    def close(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
+        """End this attempt: complete, failed with an error, or waiting to be resumed."""
+        with self._lease():
+            if traceback:
+                write_atomically(self.store.error_path, traceback.encode())
+            self._write_record(status=status, error=error, steps_per_second=0.0)
+
+    @contextmanager
+    def _lease(self) -> Iterator[None]:
+        with self.store.locked():
+            if self.store.record().token != self.record.token:
+                raise LostLeaseError(f"{self.store.folder.name}: another attempt runs this trial now")
+            yield
+
+    def _write_record(self, **changes: Any) -> None:
+        self.record = replace(self.record, heartbeat=time.time(), **changes)
+        write_json(self.store.state_path, asdict(self.record))
+
+    def _append_csv(self, path: Path, row: Mapping[str, Any]) -> None:
+        first = self._lengths[path.name] == 0 and not self._rows[path]
+        self._rows[path].append(_csv_text([row], header=first))
+
+
+def _csv_text(rows: Sequence[Mapping[str, Any]], *, header: bool) -> str:
+    """CSV lines for rows with equal keys; floats as the shortest text that reads back equal."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]) if rows else [], lineterminator="\n")
+    if header:
+        writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _append_synced(path: Path, text: str, *, at: int) -> int:
+    """Write ``text`` at byte ``at`` of a file, cutting off what was behind; returns the new length."""
+    with path.open("r+b" if path.exists() else "w+b") as file:
+        file.truncate(at)
+        file.seek(at)
+        file.write(text.encode())
+        file.flush()
+        os.fsync(file.fileno())
+        return file.tell()
