@@ -1,0 +1,120 @@
+"""A bandit with one continuous action and a closed-form constrained optimum, for Gaussian policies.
+
+Observation: the constant 1, float32 [1].
+Action: a in [-1, 1], float32 [1]; what lies outside is clipped to it.
+Reward: 1 - (1 - a)^2 a step, best at a = 1.
+Cost: ``effort`` = a^2 a step.
+Termination: never; truncated after ``horizon`` steps.
+Source: ours.
+
+The reward is concave and the cost convex, so by Jensen's inequality no random policy beats a constant action:
+
+    J*(d) = H (1 - (1 - a*)^2),    a* = min(1, sqrt(d / H)).
+
+A Gaussian of mean m and standard deviation s inside the bounds earns s^2 less and costs s^2 more a step.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.spaces import Box
+from gymnasium.vector.utils import batch_space
+from pydantic import BaseModel, ConfigDict, Field
+
+from recrl.environments.cmdp import CMDPSpec, CostLimits, Floats
+from recrl.environments.vector import CMDPVectorEnv
+
+
+class ContinuousBanditOptions(BaseModel):
+    """Settings of ``continuous-bandit``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    horizon: int = Field(default=10, ge=1, le=10_000, description="H, steps in an episode (ours).")
+
+
+def continuous_bandit_optimum(options: ContinuousBanditOptions, limits: CostLimits) -> float:
+    """J*(d) = H (1 - (1 - a*)^2), a* = min(1, sqrt(d / H)).
+
+    >>> continuous_bandit_optimum(ContinuousBanditOptions(horizon=10), CostLimits((2.5,)))
+    7.5
+    """
+    best = min(1.0, math.sqrt(limits[0] / options.horizon))
+    return options.horizon * (1.0 - (1.0 - best) ** 2)
+
+
+class ContinuousBanditVectorEnv(CMDPVectorEnv):
+    """B continuous bandits; deterministic, so that nothing but the step counts is state."""
+
+    def __init__(self, name: str, num_envs: int, options: ContinuousBanditOptions) -> None:
+        if num_envs < 1:
+            raise ValueError(f"{name}: num_envs must be at least 1, got {num_envs}")
+        self.num_envs = num_envs
+        self.single_observation_space = Box(0.0, 1.0, (1,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.cmdp = CMDPSpec(
+            name, self.single_observation_space, self.single_action_space, ("effort",), options.horizon
+        )
+        self._horizon = options.horizon
+        self._elapsed: npt.NDArray[np.int64] | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """Start B episodes."""
+        super().reset(seed=seed, options=options)
+        self._elapsed = np.zeros(self.num_envs, np.int64)
+        return self._observations(), {}
+
+    def step(
+        self, actions: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float32], Floats, npt.NDArray[np.bool_], npt.NDArray[np.bool_], dict[str, Any]]:
+        """Take one step in every environment; see ``recrl.environments.vector`` for what is returned."""
+        if self._elapsed is None:
+            raise ValueError(f"{self.cmdp.name}: call reset before the first step")
+        actions = np.asarray(actions, np.float64)
+        if actions.shape != (self.num_envs, 1) or not np.isfinite(actions).all():
+            raise ValueError(
+                f"{self.cmdp.name}: actions must be finite and of shape {(self.num_envs, 1)}, "
+                f"got {actions.tolist()}"
+            )
+        pull: Floats = np.clip(actions, -1.0, 1.0)
+        self._elapsed += 1
+        truncated = self._elapsed >= self._horizon
+        self._elapsed[truncated] = 0
+        info: dict[str, Any] = {"cost": pull**2}
+        if truncated.any():
+            info["final_obs"] = self._observations()
+        rewards: Floats = 1.0 - (1.0 - pull[:, 0]) ** 2
+        return self._observations(), rewards, np.zeros(self.num_envs, np.bool_), truncated, info
+
+    def state_dict(self) -> dict[str, Any]:
+        """The steps taken in each episode."""
+        if self._elapsed is None:
+            raise ValueError(f"{self.cmdp.name}: there is no state before reset")
+        return {"elapsed": self._elapsed.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        if np.shape(state["elapsed"]) != (self.num_envs,):
+            raise ValueError(
+                f"{self.cmdp.name}: the saved state is of {np.size(state['elapsed'])} environments, "
+                f"these are {self.num_envs}"
+            )
+        self._elapsed = np.array(state["elapsed"], np.int64)
+
+    def _observations(self) -> npt.NDArray[np.float32]:
+        return np.ones((self.num_envs, 1), np.float32)
+
+
+def make_continuous_bandit(
+    name: str, num_envs: int, options: ContinuousBanditOptions
+) -> ContinuousBanditVectorEnv:
+    """B environments of ``continuous-bandit``."""
+    return ContinuousBanditVectorEnv(name, num_envs, options)

@@ -1,0 +1,134 @@
+"""Every task by name: how to build it, what can be set, and its optimum where that is known.
+
+A name is one of ``TASKS``, an entry point in the group ``recrl.tasks``, or an import path
+``package.module:attribute``. What the last two lead to is either a ``Task``, or a callable that takes the
+task's options as keywords and returns one scalar Gymnasium environment that reports ``info["cost"]``.
+
+Nothing here imports a task's module before that task is asked for.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.plugins import load_attribute, resolve
+from recrl.environments.vector import CMDPVectorEnv
+
+
+@dataclass(frozen=True)
+class Task:
+    """How to build one task. Strings are import paths ``package.module:attribute``, loaded when needed.
+
+    Attributes:
+        summary: one sentence for people who choose a task.
+        options: a frozen pydantic model of what can be set.
+        make: callable (name, num_envs, options) -> CMDPVectorEnv.
+        optimum: callable (options, limits) -> J*(d), or None where nobody knows it.
+        sample_options: options under which the contract suite runs it: whatever is required, and short
+            episodes.
+    """
+
+    summary: str
+    options: str | type[BaseModel]
+    make: str | Callable[[str, int, Any], CMDPVectorEnv]
+    optimum: str | Callable[[Any, CostLimits], float] | None = None
+    sample_options: Mapping[str, Any] = field(default_factory=dict)
+
+
+TASKS: dict[str, Task] = {
+    "two-state": Task(
+        summary="A camp and a mine, one cost, closed-form optimum: for testing learners.",
+        options="recrl.environments.two_state:TwoStateOptions",
+        make="recrl.environments.two_state:make_two_state",
+        optimum="recrl.environments.two_state:two_state_optimum",
+        sample_options={"arrival": 0.5},
+    ),
+    "two-state-2": Task(
+        summary="A camp and a mine, two costs, closed-form optimum: for testing learners.",
+        options="recrl.environments.two_state:TwoStateOptions",
+        make="recrl.environments.two_state:make_two_state",
+        optimum="recrl.environments.two_state:two_state_optimum",
+        sample_options={"arrival": 0.5},
+    ),
+    "continuous-bandit": Task(
+        summary="One continuous action, one cost, closed-form optimum: for testing Gaussian policies.",
+        options="recrl.environments.continuous_bandit:ContinuousBanditOptions",
+        make="recrl.environments.continuous_bandit:make_continuous_bandit",
+        optimum="recrl.environments.continuous_bandit:continuous_bandit_optimum",
+    ),
+}
+
+
+class KeywordOptions(BaseModel):
+    """The options of a task that is a plain callable: whatever it takes as keywords."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+
+def find_task(name: str) -> Task:
+    """The task called ``name``.
+
+    Raises:
+        UnknownNameError: nobody provides it; the message names the nearest known task.
+        ValueError: what the name leads to is neither a Task nor callable.
+    """
+    found = resolve(name, kind="task", group="recrl.tasks", ours=TASKS)
+    if isinstance(found, Task):
+        return found
+    if not callable(found):
+        raise ValueError(f"task {name!r} must be a Task or return an environment, got {type(found).__name__}")
+    return Task(
+        summary=f"The environment that {name} returns.",
+        options=KeywordOptions,
+        make=functools.partial(load_attribute("recrl.environments.vectorize:make_from_callable"), found),
+    )
+
+
+def task_options(name: str, options: Mapping[str, Any]) -> BaseModel:
+    """The validated options of a task, defaults filled in; ``model_dump`` of it is canonical.
+
+    Raises:
+        UnknownNameError: nobody provides the task.
+        pydantic.ValidationError: all mistakes in the options at once.
+    """
+    model: type[BaseModel] = _loaded(find_task(name).options)
+    return model.model_validate(dict(options))
+
+
+def make_vector(name: str, num_envs: int, *, options: Mapping[str, Any] | None = None) -> CMDPVectorEnv:
+    """B = ``num_envs`` environments of a task; ``reset(seed=...)`` seeds them.
+
+    Args:
+        name: a name of ours, an entry point's name, or ``package.module:attribute``.
+        num_envs: B, at least 1.
+        options: the task's settings, validated by its options model.
+    """
+    task = find_task(name)
+    environment: CMDPVectorEnv = _loaded(task.make)(name, num_envs, task_options(name, options or {}))
+    return environment
+
+
+def optimal_return(name: str, options: Mapping[str, Any], limits: CostLimits) -> float | None:
+    """J*(d), the largest expected undiscounted return under limits d, or None where nobody knows it."""
+    task = find_task(name)
+    if task.optimum is None:
+        return None
+    canonical = task_options(name, options).model_dump_json()
+    return _cached_optimum(name, canonical, limits)
+
+
+@functools.lru_cache(maxsize=4096)
+def _cached_optimum(name: str, canonical: str, limits: CostLimits) -> float:
+    task = find_task(name)
+    return float(_loaded(task.optimum)(task_options(name, json.loads(canonical)), limits))
+
+
+def _loaded(reference: Any) -> Any:
+    return load_attribute(reference) if isinstance(reference, str) else reference
