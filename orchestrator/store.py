@@ -26,7 +26,6 @@ taken the trial over, its every write is refused.
 
 from __future__ import annotations
 
-import csv
 import fcntl
 import io
 import json
@@ -34,7 +33,7 @@ import os
 import secrets
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -329,13 +328,15 @@ class TrialStore:
             write_json(self.state_path, asdict(record))
         return TrialWriter(self, record)
 
-    def set_status(self, status: TrialState, *, error: str = "") -> None:
+    def set_status(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
         """Say from outside where the trial stands, for a trial that can no longer say it itself.
 
         Revokes the lease of whoever still writes.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with self.locked():
+            if traceback:
+                write_atomically(self.error_path, traceback.encode())
             record = replace(self.record(), status=status, error=error, token="")
             write_json(self.state_path, asdict(record))
 
@@ -422,9 +423,10 @@ class TrialWriter:
         self._rows[self.store.events_path].append(json.dumps(event) + "\n")
 
     def write_evaluation(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write the frozen-policy evaluations, whole."""
+        """Write the frozen-policy evaluations, whole; at least one row, all with the same keys."""
         with self._lease():
-            write_atomically(self.store.evaluation_path, _csv_text(rows, header=True).encode())
+            lines = [_csv_line(rows[0]), *(_csv_line(row.values()) for row in rows)]
+            write_atomically(self.store.evaluation_path, "".join(lines).encode())
 
     def commit(self, tree: dict[str, Any], *, update: int, env_steps: int, **changes: Any) -> None:
         """Make everything appended so far, and the trial's state, safe.
@@ -465,12 +467,10 @@ class TrialWriter:
         with self._lease():
             self._write_record(update=update, env_steps=env_steps, steps_per_second=steps_per_second)
 
-    def close(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
-        """End this attempt: complete, failed with an error, or waiting to be resumed."""
+    def close(self, status: TrialState) -> None:
+        """End this attempt: complete, or waiting to be resumed."""
         with self._lease():
-            if traceback:
-                write_atomically(self.store.error_path, traceback.encode())
-            self._write_record(status=status, error=error, steps_per_second=0.0)
+            self._write_record(status=status, steps_per_second=0.0)
 
     @contextmanager
     def _lease(self) -> Iterator[None]:
@@ -484,18 +484,14 @@ class TrialWriter:
         write_json(self.store.state_path, asdict(self.record))
 
     def _append_csv(self, path: Path, row: Mapping[str, Any]) -> None:
-        first = self._lengths[path.name] == 0 and not self._rows[path]
-        self._rows[path].append(_csv_text([row], header=first))
+        if self._lengths[path.name] == 0 and not self._rows[path]:
+            self._rows[path].append(_csv_line(row))
+        self._rows[path].append(_csv_line(row.values()))
 
 
-def _csv_text(rows: Sequence[Mapping[str, Any]], *, header: bool) -> str:
-    """CSV lines for rows with equal keys; floats as the shortest text that reads back equal."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]) if rows else [], lineterminator="\n")
-    if header:
-        writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+def _csv_line(values: Iterable[Any]) -> str:
+    """A CSV line of numbers and plain words; floats as the shortest text that reads back equal."""
+    return ",".join(map(str, values)) + "\n"
 
 
 def _append_synced(path: Path, text: str, *, at: int) -> int:

@@ -1,0 +1,332 @@
+"""One trial, as a pure program: a student learns a task under a teacher's limits, and leaves files.
+
+Knows neither Ray nor MLflow: an executor runs it, a mirror shows it. All of a trial's state (agent,
+optimisers, multipliers, teacher, environments, generators, counters, partial episodes) is in one tree, so a
+trial killed anywhere and resumed gives the bytes of one that never stopped.
+
+The walk of an update: collect T x B steps under the lesson in force; append the episodes that finished;
+``agent.update(rollout, episode costs, limits)``; ``teacher.step(state, report)`` gives the next lesson. When
+the budget B is spent the phase is deployment, the limits are d_d, the noise is 0 and the teacher is not asked
+any more; the student goes on learning. At the end the policy is frozen and evaluated.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+
+from recrl.agents.agent import Agent
+from recrl.agents.collect import Collector, FinishedEpisode
+from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CostLimits, EpisodeStats, Floats, Phase
+from recrl.environments.registry import make_vector
+from recrl.orchestrator.errors import LostLeaseError
+from recrl.orchestrator.provenance import collect as collect_provenance
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.store import TrialStore, TrialWriter, write_json
+from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import Lesson, ProgressReport, Teacher
+
+COMMIT_SECONDS = 20.0
+HEARTBEAT_SECONDS = 2.0
+
+logger = logging.getLogger("recrl.trial")
+
+
+class Trial:
+    """A trial in memory, advanced one policy update at a time.
+
+    Attributes:
+        spec: what the trial is.
+        update: policy updates done.
+        env_steps: environment steps taken, over all environments.
+    """
+
+    def __init__(self, spec: TrialSpec, writer: TrialWriter, teacher: Teacher) -> None:
+        """Start the trial, or continue it exactly where its newest intact checkpoint was taken."""
+        self.spec = spec
+        self._writer = writer
+        self._teacher = teacher
+        environment, agent, exploration, self._evaluation_seed = np.random.SeedSequence(spec.seed).spawn(4)
+        self._generator = np.random.default_rng(exploration)
+        envs = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
+        self._cmdp = envs.cmdp
+        self._agent: Agent = make_agent(spec.agent.name, envs.cmdp, spec.agent.options, agent)
+        self._collector = Collector(envs, spec.rollout_steps)
+        tree = writer.restore()
+        if tree is None:
+            self._collector.reset(seed=int(environment.generate_state(1)[0]))
+            self._lesson, self._teacher_state = teacher.start()
+            self.update = self.env_steps = self._episodes = 0
+            logger.info("started: %s", spec.title)
+        else:
+            self._load(tree)
+            logger.info("resumed after update %d, %d environment steps", self.update, self.env_steps)
+
+    @property
+    def phase(self) -> Phase:
+        """The phase of the next update."""
+        return Phase.TRAINING if self.env_steps < self.spec.train_steps else Phase.DEPLOYMENT
+
+    @property
+    def learned(self) -> bool:
+        """Whether every update is done; what is left is the evaluation."""
+        return self.update >= self.spec.num_updates
+
+    def advance(self) -> None:
+        """Do one policy update: collect, record, learn, ask the teacher."""
+        phase, lesson = self.phase, self._lesson
+        clock = time.process_time()
+        rollout, finished = self._collector.collect(self._agent, self._generator)
+        collect_seconds, clock = time.process_time() - clock, time.process_time()
+        episodes = self._number(finished, phase, lesson)
+        self.env_steps += self.spec.steps_per_update
+        costs: Floats = np.array([episode.costs for episode in episodes], dtype=np.float64)
+        costs = costs.reshape(-1, self._cmdp.num_costs)
+        metrics = self._agent.update(rollout, costs, lesson.limits.array)
+        self.update += 1
+        for episode in episodes:
+            self._writer.append_episode(episode)
+        self._writer.append_update(
+            {
+                "update": self.update,
+                "phase": phase,
+                "end_step": self.env_steps,
+                "episodes": len(episodes),
+                "episode_return": _mean([episode.episode_return for episode in episodes]),
+                "noise": lesson.policy_noise,
+                "time": round(time.time(), 3),
+                "collect_seconds": round(collect_seconds, 6),
+                "update_seconds": round(time.process_time() - clock, 6),
+                **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
+                **{f"limit_{i}": limit for i, limit in enumerate(lesson.limits)},
+                **metrics,
+            }
+        )
+        self._next_lesson(episodes, rollout.observations)
+
+    def save(self) -> None:
+        """Commit everything up to the last update, with a checkpoint."""
+        start_limits = self._teacher_state.get("start_limits")
+        self._writer.commit(
+            self._state_dict(), update=self.update, env_steps=self.env_steps, start_limits=start_limits
+        )
+
+    def evaluate(self) -> None:
+        """Freeze the policy and write its evaluations, stochastic and deterministic.
+
+        Environments and generators are fresh and seeded from the trial's seed: nothing of training is
+        touched, and every method of a seed is evaluated on the same environment stream.
+        """
+        rows: list[dict[str, Any]] = []
+        for policy, act in (
+            ("stochastic", self._agent.act),
+            ("deterministic", lambda observations, _: self._agent.act_greedily(observations)),
+        ):
+            environment, exploration = np.random.SeedSequence(
+                entropy=self._evaluation_seed.entropy, spawn_key=self._evaluation_seed.spawn_key
+            ).spawn(2)
+            envs = make_vector(self.spec.task.name, self.spec.num_envs, options=self.spec.task.options)
+            collector = Collector(envs, self.spec.rollout_steps)
+            collector.reset(seed=int(environment.generate_state(1)[0]))
+            episodes = collector.episodes(
+                act, np.random.default_rng(exploration), self.spec.evaluation_episodes
+            )
+            rows += [
+                {
+                    "policy": policy,
+                    "index": index,
+                    "length": episode.length,
+                    "episode_return": episode.episode_return,
+                    **{f"cost_{i}": cost for i, cost in enumerate(episode.costs)},
+                }
+                for index, episode in enumerate(episodes)
+            ]
+        if rows:
+            self._writer.write_evaluation(rows)
+
+    def _number(
+        self, finished: Sequence[FinishedEpisode], phase: Phase, lesson: Lesson
+    ) -> tuple[EpisodeStats, ...]:
+        """The finished episodes of a rollout, with their place in the trial."""
+        episodes = tuple(
+            EpisodeStats(
+                index=self._episodes + offset,
+                phase=phase,
+                end_step=self.env_steps + (episode.step + 1) * self.spec.num_envs,
+                length=episode.length,
+                episode_return=episode.episode_return,
+                costs=episode.costs,
+                limits=lesson.limits,
+                noise=lesson.policy_noise,
+            )
+            for offset, episode in enumerate(finished)
+        )
+        self._episodes += len(episodes)
+        return episodes
+
+    def _next_lesson(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
+        """Ask the teacher, or enter deployment; apply the policy noise it wants."""
+        if self.phase is Phase.DEPLOYMENT:
+            if self._lesson.limits != self.spec.deploy_limits or self._lesson.policy_noise:
+                self._lesson = Lesson(self.spec.deploy_limits)
+            return
+        measured = self._teacher_state.get("start_limits")
+        report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
+        self._lesson, self._teacher_state = self._teacher.step(self._teacher_state, report)
+        if self._teacher_state.get("start_limits") != measured:
+            self._event("start limits measured", limits=self._teacher_state["start_limits"])
+        if self._lesson.policy_noise > 0.0:
+            flat = observations.reshape(-1, observations.shape[-1])
+            done = self._agent.add_noise(self._lesson.policy_noise, flat)
+            self._event("policy noise", policy_noise=self._lesson.policy_noise, **done)
+
+    def _event(self, name: str, **details: Any) -> None:
+        event = {"update": self.update, "end_step": self.env_steps, "event": name, **details}
+        self._writer.append_event(event)
+        logger.info("%s", event)
+
+    def _state_dict(self) -> dict[str, Any]:
+        return {
+            "update": self.update,
+            "env_steps": self.env_steps,
+            "episodes": self._episodes,
+            "lesson": {
+                "limits": self._lesson.limits.to_json(),
+                "policy_noise": self._lesson.policy_noise,
+            },
+            "teacher": dict(self._teacher_state),
+            "agent": self._agent.state_dict(),
+            "collector": self._collector.state_dict(),
+            "generator": self._generator.bit_generator.state,
+        }
+
+    def _load(self, tree: dict[str, Any]) -> None:
+        self.update = tree["update"]
+        self.env_steps = tree["env_steps"]
+        self._episodes = tree["episodes"]
+        self._lesson = Lesson(CostLimits.from_json(tree["lesson"]["limits"]), tree["lesson"]["policy_noise"])
+        self._teacher_state = tree["teacher"]
+        self._agent.load_state_dict(tree["agent"])
+        self._collector.load_state_dict(tree["collector"])
+        self._generator.bit_generator.state = tree["generator"]
+
+
+def run_trial(
+    spec: TrialSpec,
+    store: TrialStore,
+    teacher: Teacher,
+    *,
+    should_stop: Callable[[], bool],
+    commit_seconds: float = COMMIT_SECONDS,
+) -> TrialState:
+    """Run a trial to its end, or until ``should_stop``, from wherever its files say it stands.
+
+    Args:
+        spec: the trial.
+        store: its folder.
+        teacher: who sets the limits; inline or a proxy of a remote one.
+        should_stop: asked after every update; once true, the trial is saved and left waiting.
+        commit_seconds: wall seconds between checkpoints; has no influence on results.
+
+    Returns:
+        COMPLETE, or WAITING if it was stopped.
+
+    Raises:
+        LostLeaseError: another attempt took the trial over.
+        Exception: whatever the task, the student or the teacher raised; the last commit stands.
+    """
+    writer = store.begin(spec)
+    trial = Trial(spec, writer, teacher)
+    committed = beat = time.monotonic()
+    beat_steps = trial.env_steps
+    while not trial.learned:
+        if should_stop():
+            trial.save()
+            writer.close(TrialState.WAITING)
+            logger.info("stopped after update %d; it can be resumed", trial.update)
+            return TrialState.WAITING
+        trial.advance()
+        now = time.monotonic()
+        if now - beat >= HEARTBEAT_SECONDS:
+            writer.heartbeat(
+                update=trial.update,
+                env_steps=trial.env_steps,
+                steps_per_second=(trial.env_steps - beat_steps) / (now - beat),
+            )
+            beat, beat_steps = now, trial.env_steps
+        if now - committed >= commit_seconds:
+            trial.save()
+            committed = now
+    trial.evaluate()
+    trial.save()
+    writer.close(TrialState.COMPLETE)
+    logger.info("complete: %d updates, %d environment steps", trial.update, trial.env_steps)
+    return TrialState.COMPLETE
+
+
+def run_recorded(
+    spec: TrialSpec,
+    store: TrialStore,
+    *,
+    should_stop: Callable[[], bool],
+    teacher: Teacher | None = None,
+    commit_seconds: float = COMMIT_SECONDS,
+) -> TrialState:
+    """``run_trial``, with everything about the run recorded in the trial's folder.
+
+    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``, and nothing is
+    raised here: one trial's failure must not stop the others.
+
+    Returns:
+        How the trial stands now.
+    """
+    store.folder.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
+    with _log_to(store):
+        write_json(store.provenance_path, collect_provenance())
+        try:
+            return run_trial(
+                spec,
+                store,
+                teacher or make_teacher(spec.teacher),
+                should_stop=should_stop,
+                commit_seconds=commit_seconds,
+            )
+        except LostLeaseError as error:
+            logger.warning("%s", error)
+            return store.record().status
+        except Exception as error:
+            logger.exception("failed")
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            store.set_status(TrialState.FAILED, error=text, traceback=traceback.format_exc())
+            return TrialState.FAILED
+
+
+@contextmanager
+def _log_to(store: TrialStore) -> Iterator[None]:
+    """Send the log of this process's trial to its folder."""
+    handler = logging.FileHandler(store.log_path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    root = logging.getLogger("recrl")
+    level = root.level
+    root.setLevel(logging.INFO)
+    root.addHandler(handler)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        root.setLevel(level)
+        handler.close()
+
+
+def _mean(values: Sequence[float] | Floats) -> float:
+    """The mean, or NaN of nothing."""
+    return float(np.mean(values)) if len(values) else float("nan")
