@@ -328,15 +328,13 @@ class TrialStore:
             write_json(self.state_path, asdict(record))
         return TrialWriter(self, record)
 
-    def set_status(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
+    def set_status(self, status: TrialState, *, error: str = "") -> None:
         """Say from outside where the trial stands, for a trial that can no longer say it itself.
 
         Revokes the lease of whoever still writes.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with self.locked():
-            if traceback:
-                write_atomically(self.error_path, traceback.encode())
             record = replace(self.record(), status=status, error=error, token="")
             write_json(self.state_path, asdict(record))
 
@@ -467,10 +465,12 @@ class TrialWriter:
         with self._lease():
             self._write_record(update=update, env_steps=env_steps, steps_per_second=steps_per_second)
 
-    def close(self, status: TrialState) -> None:
-        """End this attempt: complete, or waiting to be resumed."""
+    def close(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
+        """End this attempt: complete, failed with an error, or waiting to be resumed."""
         with self._lease():
-            self._write_record(status=status, steps_per_second=0.0)
+            if traceback:
+                write_atomically(self.store.error_path, traceback.encode())
+            self._write_record(status=status, error=error, steps_per_second=0.0)
 
     @contextmanager
     def _lease(self) -> Iterator[None]:

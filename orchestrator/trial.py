@@ -16,7 +16,7 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from recrl.agents.collect import Collector, FinishedEpisode
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Floats, Phase
 from recrl.environments.registry import make_vector
-from recrl.orchestrator.errors import LostLeaseError
+from recrl.orchestrator.errors import LostLeaseError, TeacherUnavailableError
 from recrl.orchestrator.provenance import collect as collect_provenance
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import TrialStore, TrialWriter, write_json
@@ -221,7 +221,7 @@ class Trial:
 
 def run_trial(
     spec: TrialSpec,
-    store: TrialStore,
+    writer: TrialWriter,
     teacher: Teacher,
     *,
     should_stop: Callable[[], bool],
@@ -231,7 +231,7 @@ def run_trial(
 
     Args:
         spec: the trial.
-        store: its folder.
+        writer: the lease on its folder (``TrialStore.begin``).
         teacher: who sets the limits; inline or a proxy of a remote one.
         should_stop: asked after every update; once true, the trial is saved and left waiting.
         commit_seconds: wall seconds between checkpoints; has no influence on results.
@@ -243,7 +243,6 @@ def run_trial(
         LostLeaseError: another attempt took the trial over.
         Exception: whatever the task, the student or the teacher raised; the last commit stands.
     """
-    writer = store.begin(spec)
     trial = Trial(spec, writer, teacher)
     committed = beat = time.monotonic()
     beat_steps = trial.env_steps
@@ -287,27 +286,33 @@ def run_recorded(
 
     Returns:
         How the trial stands now.
+
+    Raises:
+        TeacherUnavailableError: the teacher's process is gone; the trial waits to be resumed.
     """
-    store.folder.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
+    writer = store.begin(spec)
     with _log_to(store):
         write_json(store.provenance_path, collect_provenance())
         try:
             return run_trial(
                 spec,
-                store,
+                writer,
                 teacher or make_teacher(spec.teacher),
                 should_stop=should_stop,
                 commit_seconds=commit_seconds,
             )
         except LostLeaseError as error:
             logger.warning("%s", error)
-            return store.record().status
+        except TeacherUnavailableError:
+            writer.close(TrialState.WAITING)
+            raise
         except Exception as error:
-            logger.exception("failed")
+            logger.exception("failed after update %d", writer.record.update)
             text = " ".join(f"{type(error).__name__}: {error}".split())
-            store.set_status(TrialState.FAILED, error=text, traceback=traceback.format_exc())
-            return TrialState.FAILED
+            with suppress(LostLeaseError):
+                writer.close(TrialState.FAILED, error=text, traceback=traceback.format_exc())
+        return store.record().status
 
 
 @contextmanager
