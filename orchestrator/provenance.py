@@ -1,0 +1,112 @@
+"""Where a result comes from: commits, versions and the machine, without secrets.
+
+Nothing of the environment's variables, the user's name or the file system is recorded: folders of results
+are made to be shared. The resolved settings are in the trial's ``spec.json``, beside it.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import re
+import subprocess
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any
+
+DISTRIBUTION = "recrl"
+_GIT_SECONDS = 10.0
+
+
+def recrl_version() -> str:
+    """The installed version of recrl."""
+    return version(DISTRIBUTION)
+
+
+def collect(folder: Path | None = None) -> dict[str, Any]:
+    """What a reader needs to reproduce a result, as JSON values.
+
+    Args:
+        folder: the user's project, whose commit is recorded; the working directory by default.
+
+    Returns:
+        ``recrl`` and ``packages``: versions; ``project`` and ``source``: commit and dirty flag of the user's
+        repository and of the one recrl itself runs from, or None outside a repository; ``python``,
+        ``system``, ``machine``, ``cpu`` and ``cpu_count``.
+    """
+    return {
+        "recrl": recrl_version(),
+        "project": git_state((folder or Path.cwd()).resolve()),
+        "source": git_state(Path(__file__).resolve().parent),
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "machine": platform.machine(),
+        "cpu": _cpu_model(),
+        "cpu_count": os.cpu_count(),
+        "packages": package_versions(_dependencies()),
+    }
+
+
+@functools.lru_cache(maxsize=16)
+def git_state(folder: Path) -> dict[str, Any] | None:
+    """The commit that is checked out in ``folder`` and whether tracked files differ from it.
+
+    Asked once per process, so that every trial of a worker says the same.
+
+    Returns:
+        ``{"commit": 40 hex digits, "dirty": bool}``, or None if there is no repository with a commit, or
+        no git.
+    """
+    if "site-packages" in folder.parts:  # an installed copy inside somebody's repository is not of it
+        return None
+    commit = _git(folder, "rev-parse", "--verify", "HEAD")
+    if commit is None:
+        return None
+    changes = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    return {"commit": commit, "dirty": bool(changes)}
+
+
+def package_versions(names: Iterable[str]) -> dict[str, str]:
+    """The installed version of each distribution; those that are not installed are left out."""
+    versions = {}
+    for name in names:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def _dependencies() -> list[str]:
+    """The requirements of recrl itself, without extras."""
+    needed = [line for line in requires(DISTRIBUTION) or [] if "extra ==" not in line]
+    return sorted(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in needed)
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """What git prints, or None if it refuses, is missing or hangs."""
+    try:
+        done = subprocess.run(
+            ["git", "--no-optional-locks", "-C", str(folder), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=_GIT_SECONDS,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def _cpu_model() -> str:
+    """The processor's name as the system gives it, or empty."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return value.strip()
+    except OSError:
+        pass  # no such file outside Linux
+    return platform.processor()
