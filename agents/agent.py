@@ -46,12 +46,16 @@ class Rollout:
     last_observations: npt.NDArray[np.float32]
 
 
-class Agent(Protocol):
-    """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
+class Policy(Protocol):
+    """Whatever chooses actions: all that collecting experience needs to know of an agent."""
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
         ...
+
+
+class Agent(Policy, Protocol):
+    """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
 
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""

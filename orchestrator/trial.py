@@ -23,7 +23,8 @@ import numpy as np
 import torch
 
 from recrl.agents.agent import Agent
-from recrl.agents.collect import Collector, FinishedEpisode
+from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
+from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Floats, Phase
 from recrl.environments.registry import make_vector
@@ -56,10 +57,10 @@ class Trial:
         self._teacher = teacher
         environment, agent, exploration, self._evaluation_seed = np.random.SeedSequence(spec.seed).spawn(4)
         self._generator = np.random.default_rng(exploration)
-        envs = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
-        self._cmdp = envs.cmdp
-        self._agent: Agent = make_agent(spec.agent.name, envs.cmdp, spec.agent.options, agent)
-        self._collector = Collector(envs, spec.rollout_steps)
+        self._environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
+        self._cmdp = self._environments.cmdp
+        self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, agent)
+        self._collector = Collector(self._environments, num_steps=spec.rollout_steps)
         tree = writer.restore()
         if tree is None:
             self._collector.reset(seed=int(environment.generate_state(1)[0]))
@@ -88,8 +89,7 @@ class Trial:
         collect_seconds, clock = time.process_time() - clock, time.process_time()
         episodes = self._number(finished, phase, lesson)
         self.env_steps += self.spec.steps_per_update
-        costs: Floats = np.array([episode.costs for episode in episodes], dtype=np.float64)
-        costs = costs.reshape(-1, self._cmdp.num_costs)
+        costs = episode_costs(finished, self._cmdp.num_costs)
         metrics = self._agent.update(rollout, costs, lesson.limits.array)
         self.update += 1
         for episode in episodes:
@@ -125,19 +125,14 @@ class Trial:
         Environments and generators are fresh and seeded from the trial's seed: nothing of training is
         touched, and every method of a seed is evaluated on the same environment stream.
         """
-        rows: list[dict[str, Any]] = []
-        for policy, act in (
-            ("stochastic", self._agent.act),
-            ("deterministic", lambda observations, _: self._agent.act_greedily(observations)),
-        ):
-            environment, exploration = np.random.SeedSequence(
-                entropy=self._evaluation_seed.entropy, spawn_key=self._evaluation_seed.spawn_key
-            ).spawn(2)
-            envs = make_vector(self.spec.task.name, self.spec.num_envs, options=self.spec.task.options)
-            collector = Collector(envs, self.spec.rollout_steps)
-            collector.reset(seed=int(environment.generate_state(1)[0]))
-            episodes = collector.episodes(
-                act, np.random.default_rng(exploration), self.spec.evaluation_episodes
+        spec, rows = self.spec, []
+        for policy in FrozenPolicy:
+            episodes = evaluate(
+                self._agent,
+                make_vector(spec.task.name, spec.num_envs, options=spec.task.options),
+                policy,
+                num_episodes=spec.evaluation_episodes,
+                seed=self._evaluation_seed,
             )
             rows += [
                 {
@@ -204,6 +199,7 @@ class Trial:
             },
             "teacher": dict(self._teacher_state),
             "agent": self._agent.state_dict(),
+            "environments": self._environments.state_dict(),
             "collector": self._collector.state_dict(),
             "generator": self._generator.bit_generator.state,
         }
@@ -215,6 +211,7 @@ class Trial:
         self._lesson = Lesson(CostLimits.from_json(tree["lesson"]["limits"]), tree["lesson"]["policy_noise"])
         self._teacher_state = tree["teacher"]
         self._agent.load_state_dict(tree["agent"])
+        self._environments.load_state_dict(tree["environments"])
         self._collector.load_state_dict(tree["collector"])
         self._generator.bit_generator.state = tree["generator"]
 
