@@ -37,10 +37,10 @@ class ContinuousBanditOptions(BaseModel):
     horizon: int = Field(default=10, ge=1, le=10_000, description="H, steps in an episode (ours).")
 
 
-def continuous_bandit_optimum(options: ContinuousBanditOptions, limits: CostLimits) -> float:
+def continuous_bandit_optimum(name: str, options: ContinuousBanditOptions, limits: CostLimits) -> float:
     """J*(d) = H (1 - (1 - a*)^2), a* = min(1, sqrt(d / H)).
 
-    >>> continuous_bandit_optimum(ContinuousBanditOptions(horizon=10), CostLimits((2.5,)))
+    >>> continuous_bandit_optimum("continuous-bandit", ContinuousBanditOptions(), CostLimits((2.5,)))
     7.5
     """
     best = min(1.0, math.sqrt(limits[0] / options.horizon))

@@ -30,7 +30,7 @@ class Task:
         summary: one sentence for people who choose a task.
         options: a frozen pydantic model of what can be set.
         make: callable (name, num_envs, options) -> CMDPVectorEnv.
-        optimum: callable (options, limits) -> J*(d), or None where nobody knows it.
+        optimum: callable (name, options, limits) -> J*(d), or None where nobody knows it.
         sample_options: options under which the contract suite runs it: whatever is required, and short
             episodes.
     """
@@ -38,7 +38,7 @@ class Task:
     summary: str
     options: str | type[BaseModel]
     make: str | Callable[[str, int, Any], CMDPVectorEnv]
-    optimum: str | Callable[[Any, CostLimits], float] | None = None
+    optimum: str | Callable[[str, Any, CostLimits], float] | None = None
     sample_options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -62,6 +62,33 @@ TASKS: dict[str, Task] = {
         options="recrl.environments.continuous_bandit:ContinuousBanditOptions",
         make="recrl.environments.continuous_bandit:make_continuous_bandit",
         optimum="recrl.environments.continuous_bandit:continuous_bandit_optimum",
+    ),
+    "rivergrid-1a": Task(
+        summary="The paper's RiverGrid 1a: the goal is only reached through the river, at a cost of 5.",
+        options="recrl.environments.river_grid:RiverGridOptions",
+        make="recrl.environments.river_grid:make_river_grid",
+        optimum="recrl.environments.river_grid:river_grid_optimum",
+        sample_options={"horizon": 20, "costs": ("river", "turns")},
+    ),
+    "rivergrid-1b": Task(
+        summary="The paper's RiverGrid 1b: through the river at a cost of 5, or round it at a cost of 0.",
+        options="recrl.environments.river_grid:RiverGridOptions",
+        make="recrl.environments.river_grid:make_river_grid",
+        optimum="recrl.environments.river_grid:river_grid_optimum",
+        sample_options={"horizon": 20},
+    ),
+    "rivergrid": Task(
+        summary="RiverGrid on a map of one's own or on a random solvable one.",
+        options="recrl.environments.river_grid:RiverGridMapOptions",
+        make="recrl.environments.river_grid:make_river_grid",
+        optimum="recrl.environments.river_grid:river_grid_optimum",
+        sample_options={"horizon": 20, "generate": {"seed": 3}},
+    ),
+    "gymnasium": Task(
+        summary="Any environment that is registered with Gymnasium, by its id.",
+        options="recrl.environments.vectorize:GymnasiumOptions",
+        make="recrl.environments.vectorize:make_gymnasium",
+        sample_options={"id": "CartPole-v1", "costless": True},
     ),
 }
 
@@ -127,7 +154,7 @@ def optimal_return(name: str, options: Mapping[str, Any], limits: CostLimits) ->
 @functools.lru_cache(maxsize=4096)
 def _cached_optimum(name: str, canonical: str, limits: CostLimits) -> float:
     task = find_task(name)
-    return float(_loaded(task.optimum)(task_options(name, json.loads(canonical)), limits))
+    return float(_loaded(task.optimum)(name, task_options(name, json.loads(canonical)), limits))
 
 
 def _loaded(reference: Any) -> Any:

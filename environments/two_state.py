@@ -33,6 +33,7 @@ from recrl.environments.finite_cmdp import FiniteCMDP, FiniteVectorEnv
 
 CAMP, MINE = 0, 1
 COST_NAMES = ("wear", "noise")
+NUM_COSTS = {"two-state": 1, "two-state-2": 2}
 
 
 class TwoStateOptions(BaseModel):
@@ -79,23 +80,21 @@ def expected_steps_in_mine(options: TwoStateOptions) -> float:
     return float(np.sum(1.0 - (1.0 - options.arrival) ** steps))
 
 
-def two_state_optimum(options: TwoStateOptions, limits: CostLimits) -> float:
-    """J*(d) for one or two limits; the module's docstring states it.
+def two_state_optimum(name: str, options: TwoStateOptions, limits: CostLimits) -> float:
+    """J*(d) for the task's one or two limits; the module's docstring states it.
 
-    >>> two_state_optimum(TwoStateOptions(horizon=10), CostLimits((3.0,)))
+    >>> two_state_optimum("two-state", TwoStateOptions(horizon=10), CostLimits((3.0,)))
     12.0
-    >>> two_state_optimum(TwoStateOptions(horizon=10), CostLimits((5.0, 2.0)))
+    >>> two_state_optimum("two-state-2", TwoStateOptions(horizon=10), CostLimits((5.0, 2.0)))
     16.0
     """
     mine = expected_steps_in_mine(options)
     hasty_or_reckless = min(limits[0], mine)
-    reckless = min(hasty_or_reckless, limits[1]) if len(limits) == 2 else 0.0
+    reckless = min(hasty_or_reckless, limits[1]) if NUM_COSTS[name] == 2 else 0.0
     return mine + hasty_or_reckless + reckless
 
 
 def make_two_state(name: str, num_envs: int, options: TwoStateOptions) -> FiniteVectorEnv:
     """B environments of ``two-state`` (k = 1) or ``two-state-2`` (k = 2)."""
-    num_costs = {"two-state": 1, "two-state-2": 2}[name]
-    return FiniteVectorEnv(
-        name, two_state_cmdp(options, num_costs), np.eye(2, dtype=np.float32), num_envs=num_envs
-    )
+    model = two_state_cmdp(options, NUM_COSTS[name])
+    return FiniteVectorEnv(name, model, np.eye(2, dtype=np.float32), num_envs=num_envs)

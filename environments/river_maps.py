@@ -1,0 +1,240 @@
+"""Maps of RiverGrid as drawings: the paper's two, a reader for a user's own, a generator of random ones.
+
+A map is a rectangle of characters, enclosed by walls:
+
+    ``#`` wall, ``.`` dry ground, ``~`` river, ``G`` goal (at least one),
+    ``>`` ``v`` ``<`` ``^`` the start (exactly one, on dry ground), heading east, south, west or north.
+
+Cells are addressed (x, y) with x the column and y the row, both from 0 at the top left; error messages count
+lines and columns from 1, as an editor does.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+Cell = tuple[int, int]
+
+WALL, DRY, RIVER, GOAL = "#", ".", "~", "G"
+STARTS = ">v<^"  # in the order of MiniGrid's headings: 0 east, 1 south, 2 west, 3 north
+TILES = WALL + DRY + RIVER + GOAL + STARTS
+STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # forward, by heading; y grows downwards
+
+GENERATION_ATTEMPTS = 10_000
+
+# The paper's figure 1: it is crossed at a cost of 5 (1a), or also walked round at a cost of 0 (1b).
+MAPS = {
+    "1a": """
+        #########
+        #.~~~~~.#
+        #.~~~~~.#
+        #.~~~~~.#
+        #>~~~~~G#
+        #.~~~~~.#
+        #.~~~~~.#
+        #.~~~~~.#
+        #########
+        """,
+    "1b": """
+        #########
+        #.~~~~~.#
+        #.~~~~~.#
+        #.~~~~~.#
+        #.~~~~~.#
+        #.~~~~~.#
+        #>~~~~~G#
+        #.......#
+        #########
+        """,
+}
+
+
+class MapError(ValueError):
+    """A map that cannot be used; the message says where and why."""
+
+
+@dataclass(frozen=True)
+class RiverMap:
+    """A valid map.
+
+    Attributes:
+        rows: the drawing, top row first; all of one length.
+    """
+
+    rows: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return "\n".join(self.rows)
+
+    @property
+    def width(self) -> int:
+        """Columns, walls included."""
+        return len(self.rows[0])
+
+    @property
+    def height(self) -> int:
+        """Rows, walls included."""
+        return len(self.rows)
+
+    @property
+    def start(self) -> Cell:
+        """The start, (x, y)."""
+        return self.cells(STARTS)[0]
+
+    @property
+    def heading(self) -> int:
+        """The heading at the start: 0 east, 1 south, 2 west, 3 north."""
+        return STARTS.index(self.tile(self.start))
+
+    def tile(self, cell: Cell) -> str:
+        """The character drawn at (x, y)."""
+        return self.rows[cell[1]][cell[0]]
+
+    def cells(self, tiles: str) -> tuple[Cell, ...]:
+        """All cells whose character is one of ``tiles``, row by row."""
+        return tuple((x, y) for y, row in enumerate(self.rows) for x, tile in enumerate(row) if tile in tiles)
+
+    def is_solvable(self, *, through: str) -> bool:
+        """Whether a goal can be reached from the start.
+
+        Args:
+            through: tiles that may be crossed; start and goals always may.
+        """
+        goals = set(self.cells(GOAL))
+        open_cells = goals.union(self.cells(through))
+        frontier = [self.start]
+        while frontier:
+            x, y = frontier.pop()
+            for dx, dy in STEPS:
+                neighbour = (x + dx, y + dy)
+                if neighbour in goals:
+                    return True
+                if neighbour in open_cells:
+                    open_cells.discard(neighbour)
+                    frontier.append(neighbour)
+        return False
+
+    @property
+    def has_dry_route(self) -> bool:
+        """Whether a goal can be reached without entering the river: whether J*(0) is a walk, not a stay."""
+        return self.is_solvable(through=DRY)
+
+
+def parse_map(text: str, *, source: str = "map") -> RiverMap:
+    """The map that ``text`` draws; a common indentation and empty lines around it are ignored.
+
+    Args:
+        text: the drawing, one line a row.
+        source: what to call it in an error, for example a file's name.
+
+    Raises:
+        MapError: it is not a map; the message names the first offending line and column.
+    """
+    lines = textwrap.dedent(text).split("\n")
+    first = next((index for index, line in enumerate(lines) if line.strip()), len(lines))
+    rows = tuple(line.rstrip() for line in "\n".join(lines[first:]).rstrip().split("\n"))
+    _check_drawing(rows, source, first + 1)
+    river_map = RiverMap(rows)
+    if not river_map.is_solvable(through=DRY + RIVER):
+        raise MapError(f"{source}: no goal can be reached from the start, open a way through the walls")
+    return river_map
+
+
+def read_map(path: Path) -> RiverMap:
+    """The map drawn in a text file.
+
+    Raises:
+        MapError: the file cannot be read or is not a map.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise MapError(f"{path}: cannot be read as a map ({error})") from error
+    return parse_map(text, source=str(path))
+
+
+def _check_drawing(rows: tuple[str, ...], source: str, first_line: int) -> None:
+    width, height = len(rows[0]), len(rows)
+    if width < 3 or height < 3:
+        raise MapError(f"{source}: must be at least 3 columns by 3 rows, got {width} by {height}")
+    starts = []
+    for y, row in enumerate(rows):
+        line = f"{source}: line {y + first_line}"
+        if len(row) != width:
+            raise MapError(f"{line}: must have {width} columns like the first row, got {len(row)}")
+        for x, tile in enumerate(row):
+            where = f"{line}, column {x + 1}"
+            if tile not in TILES:
+                raise MapError(f"{where}: unknown tile {tile!r}, allowed are {' '.join(TILES)}")
+            if (x in (0, width - 1) or y in (0, height - 1)) and tile != WALL:
+                raise MapError(f"{where}: the border must be wall {WALL!r}, got {tile!r}")
+            if tile in STARTS:
+                starts.append(where)
+                if len(starts) > 1:
+                    raise MapError(f"{where}: there must be one start, the first is at {starts[0]}")
+    if not starts:
+        raise MapError(f"{source}: needs a start, one of {' '.join(STARTS)}")
+    if not any(GOAL in row for row in rows):
+        raise MapError(f"{source}: needs a goal {GOAL!r}")
+
+
+class MapGenerator(BaseModel):
+    """What a random map is drawn from: every tile independently, until the map can be solved."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seed: int = Field(ge=0, description="Seed of the map; equal settings give equal maps (ours).")
+    width: int = Field(default=9, ge=4, le=64, description="Columns, walls included (9 in the paper's maps).")
+    height: int = Field(default=9, ge=4, le=64, description="Rows, walls included (9 in the paper's maps).")
+    river_share: float = Field(
+        default=0.4, ge=0.0, le=1.0, description="Probability that a tile is river (ours)."
+    )
+    wall_share: float = Field(
+        default=0.1, ge=0.0, le=1.0, description="Probability that a tile is an inner wall (ours)."
+    )
+    dry_route: bool | None = Field(
+        default=None,
+        description="Whether a way round the river must (true), must not (false) or may (null) exist (ours).",
+    )
+
+
+def generate_map(settings: MapGenerator) -> RiverMap:
+    """A random solvable map; start, heading and goal are drawn uniformly.
+
+    Raises:
+        MapError: nothing fitting was drawn in ``GENERATION_ATTEMPTS`` attempts.
+    """
+    generator = np.random.default_rng(settings.seed)
+    shares = [settings.wall_share, settings.river_share, 1.0 - settings.wall_share - settings.river_share]
+    if shares[-1] < -1e-12:
+        raise MapError(
+            f"map generator: river_share and wall_share must sum to at most 1, got "
+            f"{settings.river_share} and {settings.wall_share}"
+        )
+    inner = (settings.height - 2, settings.width - 2)
+    for _ in range(GENERATION_ATTEMPTS):
+        tiles = generator.choice([WALL, RIVER, DRY], size=inner, p=np.clip(shares, 0.0, 1.0))
+        start, goal = generator.choice(tiles.size, size=2, replace=False)
+        tiles.flat[start] = STARTS[int(generator.integers(len(STARTS)))]
+        tiles.flat[goal] = GOAL
+        river_map = _enclosed("".join(row) for row in tiles)
+        if settings.dry_route is not None and river_map.has_dry_route != settings.dry_route:
+            continue
+        if river_map.is_solvable(through=DRY + RIVER):
+            return river_map
+    raise MapError(
+        f"map generator: no map in {GENERATION_ATTEMPTS} attempts met {settings.model_dump_json()}, "
+        f"change river_share, wall_share or dry_route"
+    )
+
+
+def _enclosed(rows: Iterable[str]) -> RiverMap:
+    inner = [WALL + row + WALL for row in rows]
+    border = WALL * len(inner[0])
+    return RiverMap((border, *inner, border))

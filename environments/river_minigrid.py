@@ -1,0 +1,132 @@
+"""RiverGrid on MiniGrid, registered with Gymnasium; ``recrl.environments.river_grid`` defines the CMDP.
+
+It is for people: to look at, to wrap, to compare with. Training uses ``RiverGridVectorEnv``, which a test
+holds equal to this one, step for step.
+
+Importing this module registers ``recrl/RiverGrid-1a-v0``, ``recrl/RiverGrid-1b-v0`` and, with the keyword
+``drawing`` for a map of one's own, ``recrl/RiverGrid-v0``:
+
+    gymnasium.make("recrl.environments.river_minigrid:recrl/RiverGrid-1a-v0", render_mode="rgb_array")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.spaces import Box, Discrete
+from minigrid.core.grid import Grid
+from minigrid.core.mission import MissionSpace
+from minigrid.core.world_object import Floor, Goal, Wall, WorldObj
+from minigrid.minigrid_env import MiniGridEnv
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.river_grid import (
+    FORWARD,
+    GOAL_REWARD,
+    HEADINGS,
+    HORIZON,
+    STEP_REWARD,
+    CostName,
+)
+from recrl.environments.river_maps import GOAL, MAPS, RIVER, WALL, Cell, RiverMap, parse_map
+
+TILE_PIXELS = 32
+OBJECTS: dict[str, Callable[[], WorldObj]] = {WALL: Wall, RIVER: Floor, GOAL: Goal}  # a Floor is blue
+
+
+def mission() -> str:
+    """What MiniGrid shows below the grid; a named function, because MiniGrid pickles it."""
+    return "reach the goal, mind the river"
+
+
+def river_minigrid(river_map: RiverMap) -> Grid:
+    """The map as MiniGrid's objects."""
+    grid = Grid(river_map.width, river_map.height)
+    for x in range(river_map.width):
+        for y in range(river_map.height):
+            kind = OBJECTS.get(river_map.tile((x, y)))
+            grid.set(x, y, kind() if kind else None)
+    return grid
+
+
+def render_frame(
+    river_map: RiverMap, cell: Cell, heading: int, *, tile_pixels: int = TILE_PIXELS
+) -> npt.NDArray[np.uint8]:
+    """A picture of the map with the agent in ``cell``, uint8 [height tile_pixels, width tile_pixels, 3]."""
+    frame: npt.NDArray[np.uint8] = river_minigrid(river_map).render(tile_pixels, cell, heading)
+    return frame
+
+
+class RiverGridEnv(MiniGridEnv):
+    """One RiverGrid.
+
+    Args:
+        drawing: the map, see ``recrl.environments.river_maps``.
+        max_steps: H, steps after which an episode is truncated.
+        costs: the cost functions, in order.
+        **minigrid: MiniGrid's own, such as ``render_mode``.
+    """
+
+    def __init__(
+        self,
+        drawing: str = MAPS["1a"],
+        *,
+        max_steps: int = HORIZON,
+        costs: Sequence[CostName] = ("river",),
+        **minigrid: Any,
+    ) -> None:
+        self.river_map = parse_map(drawing)
+        self.cost_names = tuple(costs)
+        super().__init__(
+            mission_space=MissionSpace(mission_func=mission),
+            width=self.river_map.width,
+            height=self.river_map.height,
+            max_steps=max_steps,
+            **{"highlight": False, "tile_size": TILE_PIXELS, **minigrid},
+        )
+        self.action_space = Discrete(3)
+        size = self.river_map.width + self.river_map.height + HEADINGS
+        self.observation_space = Box(0.0, 1.0, (size,), np.float32)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take one step; ``info["cost"]`` is float64 [k]."""
+        if not self.action_space.contains(action):
+            raise ValueError(f"RiverGrid: the action must be 0, 1 or 2, got {action!r}")
+        observation, _, terminated, truncated, _ = super().step(action)
+        reward = GOAL_REWARD if terminated else STEP_REWARD
+        return observation, reward, terminated, truncated and not terminated, {"cost": self._costs(action)}
+
+    def gen_obs(self) -> npt.NDArray[np.float32]:
+        """One-hot x, one-hot y, one-hot heading."""
+        observation = np.zeros(self.width + self.height + HEADINGS, np.float32)
+        x, y = self.agent_pos
+        observation[[x, self.width + y, self.width + self.height + self.agent_dir]] = 1.0
+        return observation
+
+    def _gen_grid(self, width: int, height: int) -> None:
+        self.grid = river_minigrid(self.river_map)
+        self.agent_pos, self.agent_dir = self.river_map.start, self.river_map.heading
+
+    def _costs(self, action: int) -> Floats:
+        costs = {
+            "river": self.river_map.tile((int(self.agent_pos[0]), int(self.agent_pos[1]))) == RIVER,
+            "turns": action != FORWARD,
+        }
+        return np.array([costs[name] for name in self.cost_names], np.float64)
+
+
+def _register() -> None:
+    drawings = {"recrl/RiverGrid-v0": None, **{f"recrl/RiverGrid-{name}-v0": MAPS[name] for name in MAPS}}
+    for identifier, drawing in drawings.items():
+        gymnasium.register(
+            id=identifier,
+            entry_point="recrl.environments.river_minigrid:RiverGridEnv",
+            kwargs={} if drawing is None else {"drawing": drawing},
+        )
+
+
+_register()

@@ -1,0 +1,264 @@
+"""A batch of scalar Gymnasium environments as a ``CMDPVectorEnv``: the way in for a user's own task.
+
+Gymnasium's ``SyncVectorEnv`` would do but for a trap: with same-step autoreset it moves the info of an
+episode's last step to ``final_info`` and puts the *reset's* info in its place, so the cost of the last step
+is lost to whoever reads ``info["cost"]``. Here it stays.
+
+What a scalar environment must do: report ``info["cost"]``, a number or k numbers, at every step; have a
+``Discrete`` or a bounded or unbounded floating-point ``Box`` action space; and be a function of its seed and
+its actions: ``reset(seed=...)`` must determine an episode. It may name its costs in an attribute
+``cost_names``. Observations of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``),
+actions clipped to their bounds.
+
+Every episode is started by ``reset(seed=...)`` with a new seed drawn here, which makes an exact checkpoint
+possible without asking the environment for its state and without pickling it: the seed and the actions so
+far. Restoring replays them, at most one episode per environment, and checks that the same observation comes
+out.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
+
+from recrl.environments.cmdp import CMDPSpec, Floats
+from recrl.environments.vector import CMDPVectorEnv
+
+Environment = gymnasium.Env[Any, Any]
+SEED_BOUND = 2**31  # exclusive; some simulators take 32-bit signed seeds
+
+
+class SyncCMDPVectorEnv(CMDPVectorEnv):
+    """B scalar environments stepped one after another; see the module's docstring.
+
+    Args:
+        name: the task's name, for ``cmdp.name``.
+        factories: one callable per environment; each returns a new one.
+        cost_names: names of the k costs; by default the environment's ``cost_names``, else ``cost``.
+        costless: report zero costs instead of asking the environment for them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        factories: Sequence[Callable[[], Environment]],
+        *,
+        cost_names: Sequence[str] | None = None,
+        costless: bool = False,
+    ) -> None:
+        if not factories:
+            raise ValueError(f"{name}: num_envs must be at least 1, got 0")
+        self.num_envs = len(factories)
+        self._environments = [factory() for factory in factories]
+        first = self._environments[0]
+        self._raw_observation_space = first.observation_space
+        self.single_observation_space = _float32_vectors(name, first.observation_space)
+        self.single_action_space = _supported_actions(name, first.action_space)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.render_mode = first.render_mode
+        if cost_names is None:
+            cost_names = (
+                first.get_wrapper_attr("cost_names") if first.has_wrapper_attr("cost_names") else ("cost",)
+            )
+        horizon = first.spec.max_episode_steps if first.spec is not None else None
+        self.cmdp = CMDPSpec(
+            name, self.single_observation_space, self.single_action_space, tuple(cost_names), horizon
+        )
+        self._costless = costless
+        self._episode_seeds = [0] * self.num_envs
+        self._episode_actions: list[list[Any]] = [[] for _ in range(self.num_envs)]
+        self._observations: npt.NDArray[np.float32] | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """Start B episodes; ``seed`` restarts the generator that every episode's seed is drawn from."""
+        super().reset(seed=seed, options=options)
+        self._observations = np.stack([self._start_episode(index) for index in range(self.num_envs)])
+        return self._observations.copy(), {}
+
+    def step(
+        self, actions: npt.NDArray[Any]
+    ) -> tuple[npt.NDArray[np.float32], Floats, npt.NDArray[np.bool_], npt.NDArray[np.bool_], dict[str, Any]]:
+        """Take one step in every environment; see ``recrl.environments.vector`` for what is returned."""
+        if self._observations is None:
+            raise ValueError(f"{self.cmdp.name}: call reset before the first step")
+        actions = self._checked(actions)
+        last_observations = np.empty_like(self._observations)
+        rewards = np.zeros(self.num_envs)
+        terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
+        costs = np.zeros((self.num_envs, self.cmdp.num_costs))
+        for index, environment in enumerate(self._environments):
+            observation, reward, ended, timed_out, step_info = environment.step(actions[index])
+            last_observations[index] = self._flat(observation)
+            rewards[index], terminated[index], truncated[index] = reward, ended, timed_out and not ended
+            costs[index] = self._reported_costs(step_info)
+            self._episode_actions[index].append(actions[index])
+        info: dict[str, Any] = {"cost": costs}
+        self._observations = last_observations
+        if (terminated | truncated).any():
+            info["final_obs"] = last_observations
+            self._observations = last_observations.copy()
+            for index in np.flatnonzero(terminated | truncated).tolist():
+                self._observations[index] = self._start_episode(index)
+        return self._observations.copy(), rewards, terminated, truncated, info
+
+    def render(self) -> tuple[Any, ...]:
+        """One frame per environment, in the environment's own render mode."""
+        return tuple(environment.render() for environment in self._environments)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the environments."""
+        for environment in self._environments:
+            environment.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The seed and the actions so far of every episode, what they led to, and the generator."""
+        if self._observations is None:
+            raise ValueError(f"{self.cmdp.name}: there is no state before reset")
+        space = self.single_action_space
+        return {
+            "episode_seeds": list(self._episode_seeds),
+            "episode_actions": [
+                np.array(taken, dtype=space.dtype).reshape(-1, *(space.shape or ()))
+                for taken in self._episode_actions
+            ],
+            "observations": self._observations.copy(),
+            "generator": copy.deepcopy(dict(self.np_random.bit_generator.state)),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken, by replaying the episodes under way.
+
+        Raises:
+            ValueError: the replay led elsewhere, so the environment has state that its seed and its actions
+                do not determine and cannot be resumed.
+        """
+        if len(state["episode_seeds"]) != self.num_envs:
+            raise ValueError(
+                f"{self.cmdp.name}: the saved state is of {len(state['episode_seeds'])} environments, "
+                f"these are {self.num_envs}"
+            )
+        self._episode_seeds = [int(seed) for seed in state["episode_seeds"]]
+        self._episode_actions = [list(actions) for actions in state["episode_actions"]]
+        self._observations = np.array(state["observations"], np.float32)
+        for index, environment in enumerate(self._environments):
+            observation, _ = environment.reset(seed=self._episode_seeds[index])
+            for action in self._episode_actions[index]:
+                observation = environment.step(action)[0]
+            if not np.array_equal(self._flat(observation), self._observations[index], equal_nan=True):
+                raise ValueError(
+                    f"{self.cmdp.name}: cannot be resumed, because replaying the episode of environment "
+                    f"{index} gave another observation; reset(seed=...) must determine an episode"
+                )
+        self.np_random.bit_generator.state = state["generator"]
+
+    def _start_episode(self, index: int) -> npt.NDArray[np.float32]:
+        self._episode_seeds[index] = int(self.np_random.integers(SEED_BOUND))
+        self._episode_actions[index] = []
+        return self._flat(self._environments[index].reset(seed=self._episode_seeds[index])[0])
+
+    def _flat(self, observation: Any) -> npt.NDArray[np.float32]:
+        return np.asarray(spaces.flatten(self._raw_observation_space, observation), np.float32)
+
+    def _checked(self, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        space = self.single_action_space
+        actions = np.asarray(actions)
+        expected = (self.num_envs, *(space.shape or ()))
+        if actions.shape != expected:
+            raise ValueError(f"{self.cmdp.name}: actions must have shape {expected}, got {actions.shape}")
+        if isinstance(space, spaces.Box):
+            if not np.isfinite(actions).all():
+                raise ValueError(f"{self.cmdp.name}: actions must be finite, got {actions.tolist()}")
+            clipped: npt.NDArray[Any] = np.clip(actions, space.low, space.high).astype(space.dtype)
+            return clipped
+        if actions.dtype.kind not in "iu" or not all(map(space.contains, actions)):
+            raise ValueError(f"{self.cmdp.name}: actions must lie in {space}, got {actions.tolist()}")
+        return actions.astype(np.int64)
+
+    def _reported_costs(self, info: dict[str, Any]) -> Floats:
+        if self._costless:
+            return np.zeros(self.cmdp.num_costs)
+        if "cost" not in info:
+            raise ValueError(
+                f"{self.cmdp.name}: the environment must report info['cost'] at every step, got only "
+                f"{sorted(info)} (for zero costs: the task gymnasium with costless: true)"
+            )
+        costs = np.asarray(info["cost"], np.float64).reshape(-1)
+        if costs.shape != (self.cmdp.num_costs,) or not np.isfinite(costs).all():
+            raise ValueError(
+                f"{self.cmdp.name}: info['cost'] must be a finite number for each of "
+                f"{', '.join(self.cmdp.cost_names)}, got {info['cost']}"
+            )
+        return costs
+
+
+class GymnasiumOptions(BaseModel):
+    """Settings of the task ``gymnasium``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str = Field(description="The id registered with Gymnasium, or module:id to import the module first.")
+    keywords: dict[str, JsonValue] = Field(
+        default_factory=dict, description="What gymnasium.make passes on to the environment."
+    )
+    cost_names: tuple[str, ...] | None = Field(
+        default=None,
+        min_length=1,
+        description="Names of the costs in info['cost']; by default the environment's cost_names, else cost.",
+    )
+    costless: bool = Field(
+        default=False, description="Whether to report a cost of 0 for an environment that reports none."
+    )
+
+    @field_validator("id")
+    @classmethod
+    def _registered(cls, identifier: str) -> str:
+        try:
+            gymnasium.spec(identifier)
+        except (gymnasium.error.Error, ImportError) as error:
+            raise ValueError(str(error)) from error
+        return identifier
+
+
+def make_gymnasium(name: str, num_envs: int, options: GymnasiumOptions) -> SyncCMDPVectorEnv:
+    """B environments of a registered id."""
+    keywords: dict[str, Any] = dict(options.keywords)
+    factory = functools.partial(gymnasium.make, options.id, disable_env_checker=True, **keywords)
+    return SyncCMDPVectorEnv(
+        name, [factory] * num_envs, cost_names=options.cost_names, costless=options.costless
+    )
+
+
+def make_from_callable(
+    factory: Callable[..., Environment], name: str, num_envs: int, options: BaseModel
+) -> SyncCMDPVectorEnv:
+    """B environments of a user's callable, which takes the options as keywords."""
+    return SyncCMDPVectorEnv(name, [functools.partial(factory, **options.model_dump())] * num_envs)
+
+
+def _float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:
+    flat = spaces.flatten_space(space)
+    if not isinstance(flat, spaces.Box):
+        raise ValueError(f"{name}: observations of {space} cannot be flattened to vectors")
+    return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+
+
+def _supported_actions(name: str, space: spaces.Space[Any]) -> spaces.Box | spaces.Discrete:
+    if isinstance(space, spaces.Discrete) and space.start == 0:
+        return space
+    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and len(space.shape) == 1:
+        return space
+    raise ValueError(
+        f"{name}: actions must be Discrete from 0 or a Box of one dimension of floats, got {space}"
+    )
