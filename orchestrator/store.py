@@ -3,6 +3,7 @@
     <root>/<sweep>/
         sweep.json              name, creation time, recrl's version
         grid.yaml               the grid file as given to the last launch
+        trials.jsonl            the trials of that grid, a TrialSpec a line, in their order
         lock                    held by the one process that runs the sweep
         figures/                what ``recrl-sweep figures`` drew
         mlflow.db, mlartifacts/ the default MLflow store
@@ -142,6 +143,11 @@ class SweepStore:
         return self.folder / "grid.yaml"
 
     @property
+    def specs_path(self) -> Path:
+        """The trials of the last launch's grid, a TrialSpec a line."""
+        return self.folder / "trials.jsonl"
+
+    @property
     def info_path(self) -> Path:
         """Name, creation time and version."""
         return self.folder / "sweep.json"
@@ -169,6 +175,12 @@ class SweepStore:
     def trial(self, spec: TrialSpec) -> TrialStore:
         """The trial's folder; it need not exist yet."""
         return TrialStore(self.trials_folder / spec.folder_name)
+
+    def specs(self) -> list[TrialSpec]:
+        """The trials of the last launch's grid, in their order; none if there was no launch."""
+        if not self.specs_path.exists():
+            return []
+        return [TrialSpec.from_json(json.loads(line)) for line in self.specs_path.read_text().splitlines()]
 
     def trials(self) -> list[TrialStore]:
         """Every trial on disk, in the order of the folders' names."""
