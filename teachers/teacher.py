@@ -104,3 +104,37 @@ class Teacher(Protocol):
             ValueError: ``report.update`` is neither the update after the state's nor the state's own.
         """
         ...
+
+
+# What follows is shared by the teachers of this package. Their states hold at least ``update``, the last
+# update seen (0 before the first), and the last lesson as ``limits`` and ``policy_noise``: a repeated
+# question is answered from the state alone.
+
+
+def progress(env_steps: int, train_steps: int) -> float:
+    """The share p of the training budget that is used up: p = env steps / B, at most 1.
+
+    Algorithm 1, line 3, has p = b / B in episodes. Episodes differ in length, and a run's length is set in
+    steps, so the clock counts steps: p = 1 exactly when deployment begins.
+    """
+    return min(1.0, env_steps / train_steps)
+
+
+def already_seen(state: TeacherState, report: ProgressReport) -> bool:
+    """Whether ``state`` has taken in this very report (False: the report is the next one).
+
+    Raises:
+        ValueError: the report is for any other update.
+    """
+    seen = int(state["update"])
+    if report.update not in (seen, seen + 1):
+        raise ValueError(
+            f"this teacher state has seen update {seen}: the next report must be for update {seen + 1}, "
+            f"or for {seen} again, got {report.update}"
+        )
+    return report.update == seen
+
+
+def last_lesson(state: TeacherState) -> Lesson:
+    """The lesson that ``state`` was returned with."""
+    return Lesson(CostLimits.from_json(state["limits"]), float(state["policy_noise"]))

@@ -1,0 +1,375 @@
+"""The dynamic curriculum: the cost limit follows the student (CLiC_D, Algorithm 2 of the paper).
+
+The teacher compares the student's last two windows. Once return and costs have stopped changing, a student
+that keeps its limit is given a lower one, and a student that does not is stuck: its policy gets noise.
+
+Where Algorithm 2 is silent or goes wrong, and what is done here; the preset ``paper`` is the pseudocode to
+the letter wherever it is defined.
+
+- *Clock.* The student learns once per policy update, so it is judged once per update, over windows of whole
+  updates (``windows``). With one episode an update this is Algorithm 2's clock.
+- *Zero and negative means* (line 5). |new / old - 1| divides by zero for a student that has become perfectly
+  safe, and it would wait for ever. |new - old| <= eps max(|old|, floor) is the same test where that is
+  defined, and 0 against 0 has converged. The floor keeps small means from being compared by their noise.
+- *Nothing finished.* A window without an episode says nothing: hold.
+- *Adherence* (line 6). A student at its optimum has a mean cost on either side of its limit, and C <= d would
+  kick it for ever. C may exceed d by its standard error.
+- *The step* (line 7). B - b counts episodes, but a limit moves only once per window, so that the limits stay
+  far above d_d. Counted in windows that are left, the steps add up to the whole way. The last is not counted:
+  a student needs two windows to settle after a large step, and would meet d_d only at B otherwise.
+- *Which limits a window was played under.* The newer window lies wholly after the last change (line 4); the
+  older one may lie before it, so that a student who follows each change at once is not made to wait twice.
+- *last_change* is reset when limits or policy have changed; line 11 also resets it when nothing has.
+- *Limits never rise.* With the tolerance, C may lie above d: d <- min(d, ...).
+- *Infinite limits.* C <= d holds, and line 7 takes d from infinity to about C: nothing goes wrong. But the
+  start may be measured instead (``start_updates``), and then nothing is judged until it is known.
+- *Several costs* (lines 5 to 7 say "for all i"). One cost that is still moving, or that cannot be kept,
+  would hold the limits of all the others at d_t. Each limit goes its own way: it falls when the return and
+  its own cost have converged and its own limit is kept; the policy gets noise when any converged cost is
+  above its limit. A change in one dimension makes the others wait for at most one window, never longer.
+- *The end.* At B the limits are d_d whatever the student does, and there is no noise.
+
+One consequence of line 7 is kept, and worth knowing: a student whose converged cost is below d_d is given
+d_d at once, whatever remains of the budget.
+
+Letters: d limits in force, d_t training limits, d_d deployment limits, B the training budget in environment
+steps, b an episode, C-bar and r-bar the mean episode cost and return of a window, W a window's size, k the
+number of costs, eps_r, eps_c, eps_pi the paper's settings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from recrl.environments.cmdp import CostLimits
+from recrl.teachers.start import StartMeasurement
+from recrl.teachers.teacher import (
+    Lesson,
+    ProgressReport,
+    TeacherSpec,
+    TeacherState,
+    already_seen,
+    last_lesson,
+    progress,
+)
+from recrl.teachers.windows import Stretch, WindowUnit, extend, last_two_windows
+
+# The pseudocode as it stands. W and eps_pi are not given in the paper: W is five updates of 16 episodes.
+PAPER = {
+    "start_updates": 0,
+    "window": 80,
+    "window_unit": "episodes",
+    "return_floor": 0.0,
+    "cost_floor": 0.0,
+    "adherence_tolerance": "none",
+    "remaining": "episodes",
+    "dimensions": "joint",
+}
+
+
+class DynamicConfig(BaseModel):
+    """The settings of the dynamic curriculum."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: Literal["recommended", "paper"] = Field(
+        default="recommended",
+        description="What fills in the settings that are not given: sound ones, or Algorithm 2 literally.",
+    )
+    start_updates: int = Field(
+        default=1,
+        ge=0,
+        description="Policy updates over which the start is measured where train_limits is infinite; "
+        "0 starts at infinity, as Algorithm 2 does.",
+    )
+    window: int = Field(
+        default=5, ge=1, description="W of Algorithm 2, in window_unit; the paper does not give it."
+    )
+    window_unit: WindowUnit = Field(
+        default="updates",
+        description="What W counts: policy updates, or finished episodes (rounded up to whole updates).",
+    )
+    return_tolerance: float = Field(
+        default=0.1,
+        ge=0.0,
+        description="eps_r: relative change of the mean return up to which it has converged (paper: 0.1).",
+    )
+    cost_tolerance: float = Field(
+        default=0.1,
+        ge=0.0,
+        description="eps_c: relative change of a mean cost up to which it has converged (paper: 0.1).",
+    )
+    return_floor: float = Field(
+        default=1.0,
+        ge=0.0,
+        description="Mean returns nearer to zero than this, in units of the return, count as this much "
+        "in the convergence test.",
+    )
+    cost_floor: float = Field(
+        default=1.0,
+        ge=0.0,
+        description="Mean costs below this, in units of the episode cost, count as this much in the "
+        "convergence test.",
+    )
+    adherence_tolerance: Literal["standard_error", "none"] = Field(
+        default="standard_error",
+        description="By how much a mean cost may exceed its limit and still keep it: one standard error "
+        "of the mean, or nothing (Algorithm 2, line 6).",
+    )
+    remaining: Literal["windows", "episodes"] = Field(
+        default="windows",
+        description="What the step of line 7 divides by: the windows that are left but the last, which "
+        "reaches deploy_limits before B, or the episodes that are left (literal), which does not.",
+    )
+    dimensions: Literal["separate", "joint"] = Field(
+        default="separate",
+        description="Whether each limit falls on its own, or all together once all costs have converged "
+        "and are kept (literal).",
+    )
+    policy_noise: float = Field(
+        default=0.3,
+        ge=0.0,
+        le=1.0,
+        description="eps_pi: noise added to the policy of a student that is stuck; not given in the paper.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in_preset(cls, options: Any) -> Any:
+        is_paper = isinstance(options, dict) and options.get("preset") == "paper"
+        return {**PAPER, **options} if is_paper else options
+
+
+def has_converged(new: float, old: float, *, tolerance: float, floor: float) -> bool:
+    """Whether a mean has stopped changing: |new - old| <= eps max(|old|, floor).
+
+    Algorithm 2, line 5, |new / old - 1| <= eps, made sound for means that are or nearly are zero.
+
+    Args:
+        new: mean over the last window.
+        old: mean over the window before, of any sign.
+        tolerance: eps_r or eps_c.
+        floor: at least 0, in the unit of the means.
+
+    >>> has_converged(-21.0, -20.0, tolerance=0.1, floor=0.0)
+    True
+    >>> has_converged(0.0, 0.0, tolerance=0.1, floor=0.0)
+    True
+    """
+    return abs(new - old) <= tolerance * max(abs(old), floor)
+
+
+def keeps_limit(cost: float, limit: float, *, tolerance: float) -> bool:
+    """Whether the policy adheres to a limit: C-bar <= d + tolerance (Algorithm 2, line 6, has none).
+
+    A mean of equal numbers may differ from them in the last digits, so equality is up to 1e-9.
+    """
+    return cost <= limit + tolerance or math.isclose(cost, limit, rel_tol=1e-9)
+
+
+def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int) -> float:
+    """The limit after one that was kept: d <- max(d_d, C-bar - (C-bar - d_d) / n), never above d.
+
+    Algorithm 2, line 7. Written d_d + (C-bar - d_d)(1 - 1 / n), which is the same and is d_d exactly
+    when n = 1.
+
+    Args:
+        limit: d, possibly infinite.
+        cost: C-bar, at least 0.
+        deploy_limit: d_d, finite.
+        remaining: n, the steps that are left; less than 1 counts as 1.
+
+    >>> next_limit(math.inf, 65.0, 5.0, remaining=6)
+    55.0
+    """
+    if limit <= deploy_limit:
+        return deploy_limit
+    lower = deploy_limit + (cost - deploy_limit) * (1.0 - 1.0 / max(1, remaining))
+    return min(limit, max(deploy_limit, lower))
+
+
+def judge(
+    old: Stretch,
+    new: Stretch,
+    *,
+    limits: CostLimits,
+    deploy_limits: CostLimits,
+    remaining: int,
+    config: DynamicConfig,
+) -> Lesson:
+    """One pass through the body of Algorithm 2, lines 5 to 11.
+
+    Args:
+        old: the window before the last.
+        new: the last window, wholly after the last change.
+        limits: d in force, [k].
+        deploy_limits: d_d, [k].
+        remaining: n of ``next_limit``.
+        config: the settings.
+    """
+    if old.episodes == 0 or new.episodes == 0:
+        return Lesson(limits)
+    converged = _converged(old, new, config)
+    kept = _kept(new, limits, config)
+    if config.dimensions == "joint":
+        converged = [all(converged)] * len(limits)
+        kept = [all(kept)] * len(limits)
+    is_stuck = any(settled and not keeps for settled, keeps in zip(converged, kept, strict=True))
+    lowered = tuple(
+        next_limit(limit, cost, deploy, remaining=remaining) if settled and keeps else limit
+        for limit, cost, deploy, settled, keeps in zip(
+            limits, new.mean_costs, deploy_limits, converged, kept, strict=True
+        )
+    )
+    return Lesson(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
+
+
+def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
+    """Whether the return and the cost of each dimension have converged, [k]."""
+    return_converged = has_converged(
+        new.mean_return, old.mean_return, tolerance=config.return_tolerance, floor=config.return_floor
+    )
+    return [
+        return_converged
+        and has_converged(cost, before, tolerance=config.cost_tolerance, floor=config.cost_floor)
+        for cost, before in zip(new.mean_costs, old.mean_costs, strict=True)
+    ]
+
+
+def _kept(new: Stretch, limits: CostLimits, config: DynamicConfig) -> list[bool]:
+    """Whether each limit is kept, [k]."""
+    exact = config.adherence_tolerance == "none"
+    return [
+        keeps_limit(cost, limit, tolerance=0.0 if exact else error)
+        for cost, limit, error in zip(new.mean_costs, limits, new.standard_errors, strict=True)
+    ]
+
+
+def steps_left(
+    last: Stretch, *, env_steps: int, train_steps: int, unit: Literal["windows", "episodes"]
+) -> int:
+    """How many steps of ``next_limit`` the training budget has room for, at the pace of the last window.
+
+    B is given in environment steps; how many episodes it holds is known only afterwards. The last window
+    took some steps and finished some episodes, so what is left holds (B - env steps) / steps such windows,
+    and as many times its episodes. Rounded down. Of the windows, the last is not counted.
+
+    >>> last = Stretch(env_steps=1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
+    [3, 36]
+    """
+    steps = train_steps - env_steps
+    if unit == "episodes":
+        return steps * last.episodes // max(1, last.env_steps)
+    return steps // max(1, last.env_steps) - 1
+
+
+class DynamicTeacher:
+    """The dynamic curriculum as a function of its state.
+
+    Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
+    episodes since limits or policy were changed, in the unit of W), ``history`` (one ``Stretch`` for each
+    update of the last two windows) and the keys of ``StartMeasurement``.
+
+    Args:
+        spec: d_t, d_d, B and the options of ``DynamicConfig``.
+    """
+
+    def __init__(self, spec: TeacherSpec) -> None:
+        self.spec = spec
+        self.config = DynamicConfig.model_validate(dict(spec.options))
+        self.measurement = StartMeasurement(spec, self.config.start_updates)
+
+    def start(self) -> tuple[Lesson, TeacherState]:
+        """See ``Teacher.start``."""
+        state = _state(
+            update=0,
+            env_steps=0,
+            lesson=Lesson(self.spec.train_limits),
+            last_change=0,
+            history=(),
+            start=self.measurement.begin(),
+        )
+        return last_lesson(state), state
+
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+        """See ``Teacher.step``."""
+        if already_seen(state, report):
+            return last_lesson(state), state
+        start = self.measurement.advance(state, report)
+        history = self._history(state, report)
+        last_change = state["last_change"] + (
+            len(report.episodes) if self.config.window_unit == "episodes" else 1
+        )
+        before = last_lesson(state).limits
+        limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
+        if progress(report.env_steps, self.spec.train_steps) >= 1.0:
+            lesson, history = Lesson(self.spec.deploy_limits), ()
+        elif start["start_limits"] is None or limits != before or last_change < self.config.window:
+            lesson = Lesson(limits)
+        else:
+            lesson = self._judge(limits, history, report.env_steps)
+        has_changed = lesson.limits != before or lesson.policy_noise > 0.0
+        next_state = _state(
+            update=report.update,
+            env_steps=report.env_steps,
+            lesson=lesson,
+            last_change=0 if has_changed else last_change,
+            history=history,
+            start=start,
+        )
+        return lesson, next_state
+
+    def _history(self, state: TeacherState, report: ProgressReport) -> tuple[Stretch, ...]:
+        """The updates of the last two windows, or all of them as long as they are fewer."""
+        latest = Stretch.of_update(
+            report.episodes,
+            env_steps=report.env_steps - state["env_steps"],
+            num_costs=len(self.spec.train_limits),
+        )
+        unit = self.config.window_unit
+        history = extend([Stretch.from_json(stretch) for stretch in state["history"]], latest, unit=unit)
+        windows = last_two_windows(history, self.config.window, unit=unit)
+        return history if windows is None else (*windows[0], *windows[1])
+
+    def _judge(self, limits: CostLimits, history: Sequence[Stretch], env_steps: int) -> Lesson:
+        """The next lesson once W has passed since the last change."""
+        windows = last_two_windows(history, self.config.window, unit=self.config.window_unit)
+        if windows is None:
+            return Lesson(limits)
+        old, new = map(Stretch.pooled, windows)
+        return judge(
+            old,
+            new,
+            limits=limits,
+            deploy_limits=self.spec.deploy_limits,
+            remaining=steps_left(
+                new, env_steps=env_steps, train_steps=self.spec.train_steps, unit=self.config.remaining
+            ),
+            config=self.config,
+        )
+
+
+def _state(
+    *,
+    update: int,
+    env_steps: int,
+    lesson: Lesson,
+    last_change: int,
+    history: Sequence[Stretch],
+    start: dict[str, Any],
+) -> dict[str, Any]:
+    """A state as JSON."""
+    return {
+        "update": update,
+        "env_steps": env_steps,
+        "limits": lesson.limits.to_json(),
+        "policy_noise": lesson.policy_noise,
+        "last_change": last_change,
+        "history": [stretch.to_json() for stretch in history],
+        **start,
+    }

@@ -1,0 +1,78 @@
+"""The teachers by name; a user's own come in by entry point (``recrl.teachers``) or import path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from pydantic import BaseModel
+
+from recrl.environments.plugins import resolve
+from recrl.teachers.dynamic import DynamicConfig, DynamicTeacher
+from recrl.teachers.static import (
+    DecayConfig,
+    NoConfig,
+    cosine,
+    decay_teacher,
+    exponential,
+    linear,
+    none_teacher,
+    step_teacher,
+    unconstrained_teacher,
+)
+from recrl.teachers.teacher import Teacher, TeacherSpec
+
+
+@dataclass(frozen=True)
+class TeacherKind:
+    """What a teacher's name stands for; a user's entry point or import path leads to one of these.
+
+    Attributes:
+        config: the pydantic model of its options.
+        make: builds it; may rely on options that ``config`` has accepted.
+    """
+
+    config: type[BaseModel]
+    make: Callable[[TeacherSpec], Teacher]
+
+
+TEACHERS: dict[str, TeacherKind] = {
+    "none": TeacherKind(NoConfig, none_teacher),
+    "step": TeacherKind(NoConfig, step_teacher),
+    "unconstrained": TeacherKind(NoConfig, unconstrained_teacher),
+    "linear": TeacherKind(DecayConfig, partial(decay_teacher, decay=linear)),
+    "cosine": TeacherKind(DecayConfig, partial(decay_teacher, decay=cosine)),
+    "exponential": TeacherKind(DecayConfig, partial(decay_teacher, decay=exponential)),
+    "dynamic": TeacherKind(DynamicConfig, DynamicTeacher),
+}
+
+
+def _kind(name: str) -> TeacherKind:
+    kind = resolve(name, kind="teacher", group="recrl.teachers", ours=TEACHERS)
+    if not isinstance(kind, TeacherKind):
+        raise TypeError(f"teacher {name!r} must be a recrl.teachers.registry.TeacherKind, got {kind!r}")
+    return kind
+
+
+def teacher_config(name: str, options: Mapping[str, Any]) -> BaseModel:
+    """The validated settings of a teacher, with its defaults and its preset filled in.
+
+    Raises:
+        UnknownNameError: nobody provides a teacher of that name.
+        pydantic.ValidationError: an option is unknown or out of its range.
+    """
+    return _kind(name).config.model_validate(dict(options))
+
+
+def make_teacher(spec: TeacherSpec) -> Teacher:
+    """The teacher that ``spec`` describes.
+
+    Raises:
+        UnknownNameError: nobody provides a teacher of that name.
+        pydantic.ValidationError: an option is unknown or out of its range.
+    """
+    kind = _kind(spec.name)
+    kind.config.model_validate(dict(spec.options))
+    return kind.make(spec)

@@ -1,0 +1,171 @@
+"""Static curricula: the cost limit is a fixed function of the training's progress (Algorithm 1).
+
+The three decays of the paper, and the controls that hold one limit for the whole training phase. The clock
+counts environment steps (``teacher.progress``) and is read once per policy update.
+
+Letters: d_t training limits, d_d deployment limits, B the training budget in environment steps,
+p = env steps / B in [0, 1] the progress, k the number of costs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from recrl.environments.cmdp import CostLimits
+from recrl.teachers.start import StartMeasurement
+from recrl.teachers.teacher import (
+    Lesson,
+    ProgressReport,
+    TeacherSpec,
+    TeacherState,
+    already_seen,
+    last_lesson,
+    progress,
+)
+
+# A decay maps (p, d_t, d_d) to the limit d of one dimension; d_t and d_d finite, d_t >= d_d.
+Decay = Callable[[float, float, float], float]
+
+
+def linear(p: float, train_limit: float, deploy_limit: float) -> float:
+    """Linear decay, Algorithm 1, line 8: d = p d_d + (1 - p) d_t.
+
+    >>> linear(0.25, 100.0, 20.0)
+    80.0
+    """
+    return p * deploy_limit + (1.0 - p) * train_limit
+
+
+def cosine(p: float, train_limit: float, deploy_limit: float) -> float:
+    """Cosine decay, Algorithm 1, line 10: d = cos(pi p / 2) d_t + (1 - cos(pi p / 2)) d_d.
+
+    >>> round(cosine(2 / 3, 100.0, 20.0), 12)
+    60.0
+    """
+    return math.cos(math.pi * p / 2) * train_limit + (1.0 - math.cos(math.pi * p / 2)) * deploy_limit
+
+
+def exponential(p: float, train_limit: float, deploy_limit: float) -> float:
+    """Exponential decay, Algorithm 1, line 6: d = ((d_t - d_d) e^-p + d_d - d_t / e) / (1 - 1 / e).
+
+    >>> round(exponential(-math.log((1 + math.exp(-1)) / 2), 100.0, 20.0), 12)
+    60.0
+    """
+    return ((train_limit - deploy_limit) * math.exp(-p) + deploy_limit - math.exp(-1) * train_limit) / (
+        1.0 - math.exp(-1)
+    )
+
+
+def hold(p: float, train_limit: float, deploy_limit: float) -> float:
+    """No decay: d = d_t."""
+    return train_limit
+
+
+def limit_at(p: float, train_limit: float, deploy_limit: float, decay: Decay) -> float:
+    """The limit of one dimension at progress p, defined for infinite limits too.
+
+    d_d from p = 1 on; infinite as long as d_t is; else the decay, kept above d_d against rounding.
+    """
+    if p >= 1.0 or train_limit == deploy_limit:
+        return deploy_limit
+    if math.isinf(train_limit):
+        return math.inf
+    return max(deploy_limit, decay(p, train_limit, deploy_limit))
+
+
+class StaticTeacher:
+    """A curriculum that looks at the clock only.
+
+    Its state holds ``update``, ``limits`` [k], ``policy_noise`` (always 0) and the keys of
+    ``StartMeasurement``.
+
+    Args:
+        spec: d_t, d_d and B.
+        decay: how the limit falls.
+        start_updates: K, policy updates over which an infinite d_t is measured; 0 to keep it infinite.
+    """
+
+    def __init__(self, spec: TeacherSpec, *, decay: Decay, start_updates: int = 0) -> None:
+        self.spec = spec
+        self.decay = decay
+        self.measurement = StartMeasurement(spec, start_updates)
+
+    def start(self) -> tuple[Lesson, TeacherState]:
+        """See ``Teacher.start``."""
+        state = {
+            "update": 0,
+            "limits": self.spec.train_limits.to_json(),
+            "policy_noise": 0.0,
+            **self.measurement.begin(),
+        }
+        return last_lesson(state), state
+
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+        """See ``Teacher.step``."""
+        if already_seen(state, report):
+            return last_lesson(state), state
+        start = self.measurement.advance(state, report)
+        p = progress(report.env_steps, self.spec.train_steps)
+        limits = CostLimits(
+            tuple(
+                min(limit, limit_at(p, train, deploy, self.decay))
+                for limit, train, deploy in zip(
+                    last_lesson(state).limits,
+                    self.measurement.limits(start),
+                    self.spec.deploy_limits,
+                    strict=True,
+                )
+            )
+        )
+        next_state = {"update": report.update, "limits": limits.to_json(), "policy_noise": 0.0, **start}
+        return last_lesson(next_state), next_state
+
+
+class NoConfig(BaseModel):
+    """The settings of a teacher that has none."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class DecayConfig(BaseModel):
+    """The settings of a decaying curriculum."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start_updates: int = Field(
+        default=1,
+        ge=1,
+        description="Policy updates over which the start of the decay is measured where train_limits is "
+        "infinite (section 5.1 of the paper: 'a few episodes'); more if no episode finished.",
+    )
+
+
+def decay_teacher(spec: TeacherSpec, *, decay: Decay) -> StaticTeacher:
+    """CLiC_L, CLiC_C or CLiC_E, from d_t, or from the measured costs where d_t is infinite."""
+    return StaticTeacher(
+        spec, decay=decay, start_updates=DecayConfig.model_validate(spec.options).start_updates
+    )
+
+
+def none_teacher(spec: TeacherSpec) -> StaticTeacher:
+    """No curriculum: d_d from the start."""
+    return StaticTeacher(replace(spec, train_limits=spec.deploy_limits), decay=hold)
+
+
+def step_teacher(spec: TeacherSpec) -> StaticTeacher:
+    """A control: d_t until B, then d_d at once."""
+    return StaticTeacher(spec, decay=hold)
+
+
+def unconstrained_teacher(spec: TeacherSpec) -> StaticTeacher:
+    """A control: no limit at all until B, whatever d_t is, then d_d at once.
+
+    It is ``step`` with d_t = infinity, which makes an MDP of the training model (paper, section 4): what the
+    student earns and costs when nothing holds it back.
+    """
+    unlimited = CostLimits.unlimited(len(spec.train_limits))
+    return StaticTeacher(replace(spec, train_limits=unlimited), decay=hold)

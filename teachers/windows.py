@@ -1,0 +1,134 @@
+"""What a student did over a stretch of policy updates, and the two windows the dynamic teacher compares.
+
+A policy is constant between two updates, so a window is made of whole updates and its episodes are summed
+up once, when they are reported: judging costs nothing per episode, and a state keeps one short record for
+each update of the last two windows.
+
+Letters: k the number of costs, W a window's size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from recrl.environments.cmdp import EpisodeStats
+
+WindowUnit = Literal["updates", "episodes"]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """The episodes that finished over some consecutive policy updates.
+
+    Attributes:
+        env_steps: environment steps taken in these updates, over all the trial's environments.
+        episodes: how many episodes finished, n; where it is 0 the means are 0 and mean nothing.
+        mean_return: r-bar, the mean undiscounted return.
+        mean_costs: C-bar, the mean undiscounted episode costs, [k].
+        cost_scatter: sums of squared deviations from ``mean_costs``, [k].
+    """
+
+    env_steps: int
+    episodes: int
+    mean_return: float
+    mean_costs: tuple[float, ...]
+    cost_scatter: tuple[float, ...]
+
+    @classmethod
+    def of_update(cls, episodes: Sequence[EpisodeStats], *, env_steps: int, num_costs: int) -> Stretch:
+        """What one update's report says."""
+        single = [
+            cls(0, 1, episode.episode_return, episode.costs, (0.0,) * num_costs) for episode in episodes
+        ]
+        return cls.pooled([*single, cls(env_steps, 0, 0.0, (0.0,) * num_costs, (0.0,) * num_costs)])
+
+    @classmethod
+    def pooled(cls, parts: Sequence[Stretch]) -> Stretch:
+        """Several stretches as one; exact sums, so that the order does not matter."""
+        env_steps = sum(part.env_steps for part in parts)
+        episodes = sum(part.episodes for part in parts)
+        if episodes == 0:
+            zeros = (0.0,) * len(parts[0].mean_costs)
+            return cls(env_steps, 0, 0.0, zeros, zeros)
+        mean_return = math.fsum(part.episodes * part.mean_return for part in parts) / episodes
+        mean_costs = tuple(
+            math.fsum(part.episodes * part.mean_costs[i] for part in parts) / episodes
+            for i in range(len(parts[0].mean_costs))
+        )
+        # Between the parts and within them: sum of n (mean of the part - mean)^2, plus their own scatter.
+        cost_scatter = tuple(
+            math.fsum(
+                part.episodes * (part.mean_costs[i] - mean) ** 2 + part.cost_scatter[i] for part in parts
+            )
+            for i, mean in enumerate(mean_costs)
+        )
+        return cls(env_steps, episodes, mean_return, mean_costs, cost_scatter)
+
+    @property
+    def standard_errors(self) -> tuple[float, ...]:
+        """Standard errors of ``mean_costs``, sqrt(scatter / (n - 1) / n), [k]; 0 where n < 2."""
+        if self.episodes < 2:
+            return (0.0,) * len(self.mean_costs)
+        return tuple(
+            math.sqrt(scatter / (self.episodes - 1) / self.episodes) for scatter in self.cost_scatter
+        )
+
+    def to_json(self) -> list[Any]:
+        """The stretch as a JSON list, in the order of the attributes."""
+        return [
+            self.env_steps,
+            self.episodes,
+            self.mean_return,
+            list(self.mean_costs),
+            list(self.cost_scatter),
+        ]
+
+    @classmethod
+    def from_json(cls, values: Sequence[Any]) -> Stretch:
+        """The inverse of ``to_json``."""
+        env_steps, episodes, mean_return, mean_costs, cost_scatter = values
+        return cls(env_steps, episodes, mean_return, tuple(mean_costs), tuple(cost_scatter))
+
+
+def extend(history: Sequence[Stretch], latest: Stretch, *, unit: WindowUnit) -> tuple[Stretch, ...]:
+    """The history with one more update.
+
+    Where windows are counted in episodes, an update in which none finished only lends its steps to the
+    next one that has any: a history is never longer than the episodes it holds.
+    """
+    if unit == "episodes" and history and history[-1].episodes == 0:
+        return (*history[:-1], Stretch.pooled([history[-1], latest]))
+    return (*history, latest)
+
+
+def latest_window(history: Sequence[Stretch], size: int, *, unit: WindowUnit) -> int | None:
+    """How many of the last updates make a window of W; None if there are too few.
+
+    ``updates``: the last W updates. ``episodes``: the fewest last updates in which at least W episodes
+    finished; with one episode an update, as in Algorithm 2, these are exactly the last W episodes.
+    """
+    if unit == "updates":
+        return size if len(history) >= size else None
+    episodes = 0
+    for count, stretch in enumerate(reversed(history), start=1):
+        episodes += stretch.episodes
+        if episodes >= size:
+            return count
+    return None
+
+
+def last_two_windows(
+    history: Sequence[Stretch], size: int, *, unit: WindowUnit
+) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]] | None:
+    """The updates of the window before the last one, and of the last one; None if there are too few."""
+    new = latest_window(history, size, unit=unit)
+    if new is None:
+        return None
+    split = len(history) - new
+    old = latest_window(history[:split], size, unit=unit)
+    if old is None:
+        return None
+    return tuple(history[split - old : split]), tuple(history[split:])

@@ -1,0 +1,346 @@
+"""Algorithm 2, line by line and in a closed loop with simulated students."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.teachers.dynamic import DynamicConfig, has_converged, judge, keeps_limit, next_limit, steps_left
+from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherState
+from recrl.teachers.windows import Stretch
+
+SPLIT_AT_100 = (slice(0, 100), slice(100, None))
+
+# An episode of a simulated student, (return, costs), from the lesson and the update's index.
+Student = Callable[[Lesson, int], tuple[float, tuple[float, ...]]]
+
+
+def window(mean_return: float, *costs: float, episodes: int = 4, scatter: float = 0.0) -> Stretch:
+    return Stretch(100, episodes, mean_return, costs, (scatter,) * len(costs))
+
+
+def judged(
+    old: Stretch, new: Stretch, *, limits: tuple[float, ...], deploy: tuple[float, ...], **options: Any
+) -> tuple[tuple[float, ...], float]:
+    """Limits and noise after a judgement with five steps left."""
+    lesson = judge(
+        old,
+        new,
+        limits=CostLimits(limits),
+        deploy_limits=CostLimits(deploy),
+        remaining=5,
+        config=DynamicConfig.model_validate(options),
+    )
+    return lesson.limits.values, lesson.policy_noise
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a teacher did: limits and noise after each update, and its last state."""
+
+    limits: list[tuple[float, ...]]
+    noise: list[float]
+    state: TeacherState
+
+
+def play(
+    student: Student,
+    *,
+    train: tuple[float, ...],
+    deploy: tuple[float, ...],
+    updates: int,
+    episodes: Callable[[Lesson], int] = lambda lesson: 16,
+    **options: Any,
+) -> Run:
+    """A closed loop over a budget of ``updates`` updates, of one environment step each."""
+    teacher = make_teacher(
+        TeacherSpec("dynamic", options, CostLimits(train), CostLimits(deploy), train_steps=updates)
+    )
+    lesson, state = teacher.start()
+    run = Run([], [], state)
+    for update in range(1, updates + 1):
+        finished = []
+        for b in range(episodes(lesson)):
+            episode_return, costs = student(lesson, update)
+            finished.append(
+                EpisodeStats(b, Phase.TRAINING, update, 1, episode_return, costs, lesson.limits, 0.0)
+            )
+        lesson, state = teacher.step(state, ProgressReport(update, update, tuple(finished)))
+        run.limits.append(lesson.limits.values)
+        run.noise.append(lesson.policy_noise)
+    return Run(run.limits, run.noise, state)
+
+
+def obedient(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+    """An ideal student: its costs are at the limits at once."""
+    return 9.5, lesson.limits.values
+
+
+# Line 5: convergence.
+
+
+@pytest.mark.parametrize(
+    ("new", "old", "converged"),
+    [
+        (11.0, 10.0, True),
+        (11.1, 10.0, False),
+        (9.0, 10.0, True),
+        (-11.0, -10.0, True),
+        (-11.1, -10.0, False),
+        (0.0, 0.0, True),
+        (0.01, 0.0, False),
+        (0.01, -0.01, False),
+    ],
+)
+def test_without_a_floor_convergence_is_the_ratio_test_of_the_paper(
+    new: float, old: float, converged: bool
+) -> None:
+    assert has_converged(new, old, tolerance=0.1, floor=0.0) is converged
+    if old != 0.0 and new not in (11.0, 9.0, -11.0):  # there the ratio is 0.1 up to rounding
+        assert (abs(new / old - 1) <= 0.1) is converged
+
+
+def test_a_floor_ignores_changes_of_means_near_zero() -> None:
+    assert has_converged(0.05, -0.05, tolerance=0.1, floor=1.0)
+    assert not has_converged(0.2, 0.0, tolerance=0.1, floor=1.0)
+
+
+# Line 6: adherence.
+
+
+def test_a_mean_cost_may_exceed_its_limit_by_the_tolerance() -> None:
+    assert keeps_limit(5.004, 5.0, tolerance=0.01)
+    assert not keeps_limit(5.02, 5.0, tolerance=0.01)
+    assert not keeps_limit(5.004, 5.0, tolerance=0.0)
+    assert keeps_limit(0.1 + 0.2, 0.3, tolerance=0.0)
+
+
+def test_the_tolerance_is_one_standard_error_unless_switched_off() -> None:
+    crossing = window(9.5, 5.1, scatter=0.12)  # standard error sqrt(0.12 / 3 / 4) = 0.1
+    assert judged(crossing, crossing, limits=(5.0,), deploy=(5.0,)) == ((5.0,), 0.0)
+    assert judged(crossing, crossing, limits=(5.0,), deploy=(5.0,), adherence_tolerance="none") == (
+        (5.0,),
+        0.3,
+    )
+
+
+# Line 7: the step.
+
+
+@pytest.mark.parametrize(
+    ("limit", "cost", "remaining", "lowered"),
+    [
+        (100.0, 65.0, 6, 55.0),  # 65 - (65 - 5) / 6
+        (math.inf, 65.0, 6, 55.0),
+        (100.0, 65.0, 1, 5.0),
+        (100.0, 65.0, 0, 5.0),
+        (100.0, 65.0, -1, 5.0),
+        (60.0, 65.0, 60, 60.0),  # 64 would rise
+        (100.0, 3.0, 6, 5.0),
+        (5.0, 3.0, 6, 5.0),
+    ],
+)
+def test_step_towards_a_deployment_limit_of_5_by_hand(
+    limit: float, cost: float, remaining: int, lowered: float
+) -> None:
+    assert next_limit(limit, cost, 5.0, remaining=remaining) == lowered
+
+
+def test_a_dimension_that_is_never_constrained_stays_so() -> None:
+    assert next_limit(math.inf, 3.0, math.inf, remaining=2) == math.inf
+
+
+def test_steps_left_are_estimated_from_the_last_window() -> None:
+    last = Stretch(env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    assert steps_left(last, env_steps=4000, train_steps=5000, unit="windows") == 2  # 3 windows fit
+    assert steps_left(last, env_steps=4000, train_steps=5000, unit="episodes") == 20
+
+
+# Lines 5 to 11 together.
+
+
+def test_a_converged_student_that_keeps_its_limit_gets_a_lower_one() -> None:
+    assert judged(window(9.0, 60.0), window(9.5, 55.0), limits=(60.0,), deploy=(5.0,)) == ((45.0,), 0.0)
+
+
+@pytest.mark.parametrize("new", [window(5.0, 55.0), window(9.5, 40.0)], ids=["return", "cost"])
+def test_a_student_that_still_changes_is_left_alone(new: Stretch) -> None:
+    assert judged(window(9.0, 60.0), new, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
+
+
+def test_a_converged_student_above_its_limit_gets_noise() -> None:
+    stuck = window(9.5, 5.0)
+    assert judged(stuck, stuck, limits=(1.0,), deploy=(1.0,), policy_noise=0.2) == ((1.0,), 0.2)
+
+
+def test_a_window_without_episodes_is_no_evidence() -> None:
+    nothing = window(0.0, 0.0, episodes=0)
+    assert judged(nothing, nothing, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
+
+
+def test_a_dimension_never_blocks_another() -> None:
+    kept, stuck, moving = window(9.5, 55.0, 9.0), window(9.5, 55.0, 9.0), window(9.5, 55.0, 20.0)
+    assert judged(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0)) == ((45.0, 5.0), 0.3)
+    assert judged(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0)) == ((45.0, 30.0), 0.0)
+
+
+def test_jointly_all_dimensions_wait_for_the_last() -> None:
+    kept, stuck, moving = window(9.5, 55.0, 9.0), window(9.5, 55.0, 9.0), window(9.5, 55.0, 20.0)
+    joint = {"dimensions": "joint"}
+    assert judged(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0), **joint) == ((60.0, 5.0), 0.3)
+    assert judged(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((60.0, 30.0), 0.0)
+    assert judged(kept, kept, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((45.0, 8.2), 0.0)
+
+
+# The clock.
+
+
+def test_the_first_judgement_takes_two_windows_and_every_other_one() -> None:
+    run = play(obedient, train=(100.0,), deploy=(60.0,), updates=100, window=4)
+    changes = [update for update in range(2, 40) if run.limits[update - 1] != run.limits[update - 2]]
+    assert changes == [8, 12, 16, 20, 24, 28, 32, 36]
+
+
+@pytest.mark.parametrize(
+    ("options", "episodes", "updates_in_a_window"),
+    [
+        ({"window": 5}, 1, 5),
+        ({"window": 5}, 500, 5),
+        ({"window": 80, "window_unit": "episodes"}, 16, 5),
+        ({"window": 80, "window_unit": "episodes"}, 500, 1),
+    ],
+)
+@pytest.mark.parametrize("deploy", [0.0, 5.0, 25.0])
+def test_an_ideal_student_is_led_to_d_d_a_window_before_the_end(
+    options: dict[str, Any], episodes: int, updates_in_a_window: int, deploy: float
+) -> None:
+    run = play(
+        obedient, train=(250.0,), deploy=(deploy,), updates=285, episodes=lambda lesson: episodes, **options
+    )
+    steps = [before[0] - after[0] for before, after in zip(run.limits, run.limits[1:], strict=False)]
+    assert run.limits[-1 - updates_in_a_window] == (deploy,)
+    assert max(steps) < 16.0
+    assert not any(run.noise)
+
+
+@pytest.mark.parametrize(
+    ("options", "updates_in_a_window"), [({"window": 5}, 5), ({"window": 80, "window_unit": "episodes"}, 1)]
+)
+def test_a_student_that_stays_and_then_crosses_is_judged_in_both_regimes(
+    options: dict[str, Any], updates_in_a_window: int
+) -> None:
+    """RiverGrid: 16 long episodes a batch as long as the agent stays, 500 short ones once it crosses."""
+    batch = iter([16] * 100 + [500] * 185)
+
+    def crosses_after_100(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+        return (-20.0, (80.0,)) if update <= 100 else (9.5, (min(40.0, lesson.limits[0]),))
+
+    run = play(
+        crosses_after_100,
+        train=(100.0,),
+        deploy=(5.0,),
+        updates=285,
+        episodes=lambda lesson: next(batch),
+        **options,
+    )
+    kicks_before, kicks_after = (sum(noise > 0.0 for noise in run.noise[part]) for part in SPLIT_AT_100)
+    assert 75.0 < run.limits[98][0] < 80.0
+    assert kicks_before == 18  # at 15, 20, ..., 100: the limit of update 10 is never kept
+    assert 20.0 < run.limits[150][0] < 40.0
+    assert kicks_after == 0
+    assert run.limits[-1 - updates_in_a_window] == (5.0,)
+
+
+def test_literal_steps_leave_an_ideal_student_far_above_d_d() -> None:
+    """Line 7 with B - b in episodes: from 250, the limit gets to about 158, by the product of its factors."""
+    run = play(
+        obedient,
+        train=(250.0,),
+        deploy=(25.0,),
+        updates=1000,
+        episodes=lambda lesson: 1,
+        preset="paper",
+        window=10,
+    )
+    factors = [1.0 - 1.0 / (1000 - b) for b in range(20, 1000, 10)]
+    assert run.limits[-2][0] == pytest.approx(25.0 + 225.0 * math.prod(factors))
+    assert run.limits[-2][0] > 150.0
+    assert run.limits[-1] == (25.0,)
+
+
+def test_a_stuck_student_is_kicked_once_a_window_and_never_after_the_end() -> None:
+    run = play(lambda lesson, update: (9.5, (5.0,)), train=(1.0,), deploy=(1.0,), updates=40, window=4)
+    kicks = [update for update, noise in enumerate(run.noise, start=1) if noise > 0.0]
+    assert kicks == [8, 12, 16, 20, 24, 28, 32, 36]
+    assert set(run.limits) == {(1.0,)}
+
+
+def test_a_student_that_noise_frees_reaches_d_d() -> None:
+    """RiverGrid 1b: the student crosses at cost 5 whatever the limit, until two kicks have freed it."""
+    kicks = 0
+    seen = 0
+
+    def crosses_until_kicked(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+        nonlocal kicks, seen
+        if lesson.policy_noise > 0.0 and seen != update:
+            kicks, seen = kicks + 1, update
+        return (9.5, (5.0,)) if kicks < 2 else (9.0, (0.0,))
+
+    run = play(crosses_until_kicked, train=(5.0,), deploy=(1.0,), updates=200)
+    assert kicks == 2
+    assert run.limits[-10] == (1.0,)
+
+
+def test_a_perfectly_safe_student_is_not_waited_for_for_ever() -> None:
+    run = play(lambda lesson, update: (0.0, (0.0,)), train=(100.0,), deploy=(25.0,), updates=50)
+    assert run.limits[9] == (25.0,)
+
+
+def test_a_student_that_never_converges_meets_d_d_at_the_end() -> None:
+    run = play(lambda lesson, update: (2.0**update, (1.0,)), train=(100.0,), deploy=(25.0,), updates=50)
+    assert run.limits[-2:] == [(100.0,), (25.0,)]
+
+
+def test_an_infinite_start_is_kept_until_the_first_judgement_or_measured() -> None:
+    def costs_65(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+        return 9.5, (65.0,)
+
+    kept = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40, start_updates=0)
+    assert kept.limits[8:10] == [(math.inf,), (53.0,)]  # 65 - 60 / 5: six windows are left
+    assert kept.state["start_limits"] == ["inf"]
+    measured = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40)
+    assert measured.limits[0] == (65.0,)
+    assert measured.limits[8:10] == [(65.0,), (53.0,)]
+    assert measured.state["start_limits"] == [65.0]
+
+
+def test_a_difficult_dimension_delays_an_easy_one_by_at_most_a_window() -> None:
+    def second_is_hopeless(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+        return 9.5, (lesson.limits[0], 40.0 + 20.0 * (update % 7))
+
+    alone = play(obedient, train=(100.0,), deploy=(5.0,), updates=200)
+    for deploy, train in ((1.0, 1.0), (1.0, 90.0), (1.0, math.inf)):
+        both = play(second_is_hopeless, train=(100.0, train), deploy=(5.0, deploy), updates=200)
+        assert both.limits[-6][0] == 5.0
+        pairs = zip(alone.limits[:-5], both.limits[5:], strict=True)
+        assert all(delayed[0] <= easy[0] + 3.0 for easy, delayed in pairs)
+
+
+def test_the_state_stays_small() -> None:
+    run = play(obedient, train=(250.0,), deploy=(5.0,), updates=100, episodes=lambda lesson: 100)
+    assert run.state["history"] == []
+    for options in ({}, {"window": 80, "window_unit": "episodes"}):
+        teacher = make_teacher(
+            TeacherSpec("dynamic", options, CostLimits((250.0,)), CostLimits((5.0,)), train_steps=10**6)
+        )
+        _, state = teacher.start()
+        for update in range(1, 50):
+            episodes = (
+                EpisodeStats(0, Phase.TRAINING, update, 1, 1.0, (9.0,), CostLimits((9.0,)), 0.0),
+            ) * 30
+            _, state = teacher.step(state, ProgressReport(update, update, episodes))
+        assert len(state["history"]) <= 10

@@ -1,0 +1,256 @@
+"""What every teacher promises, over all of them and over students of any behaviour."""
+
+import json
+import math
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from itertools import cycle, pairwise
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.teachers.registry import TEACHERS, make_teacher
+from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherState
+
+# Every teacher under its defaults, and the dynamic one also where its settings lead elsewhere.
+VARIANTS: list[tuple[str, dict[str, Any]]] = [
+    *((name, {}) for name in TEACHERS),
+    ("linear", {"start_updates": 3}),
+    ("dynamic", {"window": 1, "return_tolerance": 1.0, "cost_tolerance": 1.0}),
+    ("dynamic", {"window": 2, "window_unit": "episodes", "start_updates": 0}),
+    ("dynamic", {"preset": "paper", "window": 2, "return_tolerance": 0.5}),
+]
+CONTRACT = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+TRAIN_STEPS = 100
+
+
+@dataclass(frozen=True)
+class History:
+    """What a trial was set up with and what its student did."""
+
+    train_limits: CostLimits
+    deploy_limits: CostLimits
+    reports: tuple[ProgressReport, ...]
+
+    def specs(self, *, static_only: bool = False) -> list[TeacherSpec]:
+        """A teacher of every variant for this trial."""
+        return [
+            TeacherSpec(name, options, self.train_limits, self.deploy_limits, TRAIN_STEPS)
+            for name, options in VARIANTS
+            if not (static_only and name == "dynamic")
+        ]
+
+    def of_dimension(self, i: int) -> "History":
+        """The same trial, had it known but one of its costs."""
+        return History(
+            CostLimits((self.train_limits[i],)),
+            CostLimits((self.deploy_limits[i],)),
+            tuple(
+                replace(
+                    report,
+                    episodes=tuple(
+                        replace(episode, costs=(episode.costs[i],)) for episode in report.episodes
+                    ),
+                )
+                for report in self.reports
+            ),
+        )
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> History:
+    """Trials of up to three costs, with anything between 0 and 4 episodes an update, to beyond B."""
+    num_costs = draw(st.integers(1, 3))
+    deploy = [draw(st.sampled_from([0.0, 0.1, 5.0, 25.0])) for _ in range(num_costs)]
+    train = [limit + draw(st.sampled_from([0.0, 0.3, 20.0, math.inf])) for limit in deploy]
+    cost = st.one_of(st.sampled_from([0.0, 0.1, 5.0]), st.floats(0.0, 60.0))
+    episode_return = st.one_of(st.sampled_from([0.0, -20.0, 9.5]), st.floats(-50.0, 50.0))
+    reports = []
+    env_steps = 0
+    for update in range(1, draw(st.integers(2, 12)) + 1):
+        env_steps += draw(st.sampled_from([1, 10, 25]))
+        episodes = tuple(
+            EpisodeStats(
+                index=b,
+                phase=Phase.TRAINING,
+                end_step=env_steps,
+                length=1,
+                episode_return=draw(episode_return),
+                costs=tuple(draw(cost) for _ in range(num_costs)),
+                limits=CostLimits(tuple(train)),
+                noise=0.0,
+            )
+            for b in range(draw(st.integers(0, 4)))
+        )
+        reports.append(ProgressReport(update, env_steps, episodes))
+    return History(CostLimits(tuple(train)), CostLimits(tuple(deploy)), tuple(reports))
+
+
+def played(spec: TeacherSpec, reports: tuple[ProgressReport, ...]) -> list[tuple[Lesson, TeacherState]]:
+    """All answers of a teacher, the first before any report."""
+    teacher = make_teacher(spec)
+    answers = [teacher.start()]
+    for report in reports:
+        answers.append(teacher.step(answers[-1][1], report))
+    return answers
+
+
+@CONTRACT
+@given(history=histories())
+def test_limits_never_rise(history: History) -> None:
+    for spec in history.specs():
+        for (before, _), (after, _) in pairwise(played(spec, history.reports)):
+            assert all(new <= old for new, old in zip(after.limits, before.limits, strict=True))
+
+
+@CONTRACT
+@given(history=histories())
+def test_limits_stay_between_d_d_and_d_t(history: History) -> None:
+    for spec in history.specs():
+        unlimited = CostLimits.unlimited(len(spec.train_limits))
+        highest = unlimited if spec.name == "unconstrained" else spec.train_limits
+        for lesson, state in played(spec, history.reports):
+            start = CostLimits.from_json(state["start_limits"] or unlimited.to_json())
+            ordered = zip(spec.deploy_limits, lesson.limits, start, strict=True)
+            assert all(deploy <= limit <= first for deploy, limit, first in ordered)
+            measured = zip(lesson.limits, highest, strict=True)
+            assert all(limit <= train for limit, train in measured)
+
+
+@CONTRACT
+@given(history=histories())
+def test_limits_are_d_d_without_noise_from_the_end_of_the_budget_on(history: History) -> None:
+    last = history.reports[-1]
+    end = ProgressReport(last.update + 1, max(TRAIN_STEPS, last.env_steps + 1), last.episodes)
+    reports = (*history.reports, end)
+    for spec in history.specs():
+        for report, (lesson, _) in zip(reports, played(spec, reports)[1:], strict=True):
+            if report.env_steps >= TRAIN_STEPS:
+                assert lesson == Lesson(history.deploy_limits, 0.0)
+
+
+@CONTRACT
+@given(history=histories())
+def test_a_step_changes_nothing_but_its_answer(history: History) -> None:
+    for spec in history.specs():
+        teacher = make_teacher(spec)
+        _, state = teacher.start()
+        for report in history.reports:
+            before = deepcopy(state)
+            answer = teacher.step(state, report)
+            assert state == before
+            assert teacher.step(state, report) == answer
+            state = answer[1]
+
+
+@CONTRACT
+@given(history=histories())
+def test_the_same_update_again_gets_the_same_answer(history: History) -> None:
+    for spec in history.specs():
+        teacher = make_teacher(spec)
+        _, state = teacher.start()
+        for report in history.reports:
+            lesson, state = teacher.step(state, report)
+            assert teacher.step(state, report) == (lesson, state)
+            assert teacher.step(state, replace(report, episodes=())) == (lesson, state)
+
+
+@CONTRACT
+@given(history=histories(), data=st.data())
+def test_a_resumed_teacher_goes_on_as_if_uninterrupted(history: History, data: st.DataObject) -> None:
+    cut = data.draw(st.integers(0, len(history.reports)))
+    for spec in history.specs():
+        answers = played(spec, history.reports)
+        state = answers[cut][1]
+        teacher = make_teacher(spec)
+        for report, uninterrupted in zip(history.reports[cut:], answers[cut + 1 :], strict=True):
+            restored = json.loads(json.dumps(state, allow_nan=False))
+            assert restored == state
+            lesson, state = teacher.step(restored, report)
+            assert (lesson, state) == uninterrupted
+
+
+@CONTRACT
+@given(history=histories())
+def test_one_teacher_shared_by_two_trials_answers_each_as_its_own(history: History) -> None:
+    halved = tuple(
+        replace(
+            report,
+            episodes=tuple(
+                replace(episode, costs=tuple(cost / 2 for cost in episode.costs))
+                for episode in report.episodes
+            ),
+        )
+        for report in history.reports
+    )
+    for spec in history.specs():
+        shared = make_teacher(spec)
+        first, second = shared.start(), shared.start()
+        own_first, own_second = played(spec, history.reports), played(spec, halved)
+        for update, (one, other) in enumerate(zip(history.reports, halved, strict=True), start=1):
+            first, second = shared.step(first[1], one), shared.step(second[1], other)
+            assert (first, second) == (own_first[update], own_second[update])
+
+
+@CONTRACT
+@given(history=histories())
+def test_the_order_in_which_environments_finish_does_not_matter(history: History) -> None:
+    backwards = tuple(replace(report, episodes=report.episodes[::-1]) for report in history.reports)
+    for spec in history.specs():
+        assert played(spec, backwards) == played(spec, history.reports)
+
+
+@CONTRACT
+@given(history=histories())
+def test_a_static_limit_depends_on_its_own_dimension_only(history: History) -> None:
+    for i in range(len(history.train_limits)):
+        alone = history.of_dimension(i)
+        for spec, own in zip(history.specs(static_only=True), alone.specs(static_only=True), strict=True):
+            together = [lesson.limits[i] for lesson, _ in played(spec, history.reports)]
+            assert together == [lesson.limits[0] for lesson, _ in played(own, alone.reports)]
+
+
+@CONTRACT
+@given(
+    deploy=st.sampled_from([0.0, 1.0, 40.0]),
+    other_train=st.sampled_from([math.inf, 50.0, 0.0]),
+    other_costs=st.lists(st.sampled_from([0.0, 3.0, 40.0]), min_size=1, max_size=12),
+)
+def test_no_dimension_keeps_an_obedient_one_from_d_d(
+    deploy: float, other_train: float, other_costs: list[float]
+) -> None:
+    """A dimension always costs what it may; what the other costs, over and over again, is arbitrary."""
+    limits = CostLimits((50.0, other_train)), CostLimits((deploy, 0.0))
+    for options in (options for name, options in VARIANTS if name == "dynamic" and "preset" not in options):
+        teacher = make_teacher(TeacherSpec("dynamic", options, *limits, TRAIN_STEPS))
+        lesson, state = teacher.start()
+        for update, other in zip(range(1, TRAIN_STEPS), cycle(other_costs), strict=False):
+            costs = (lesson.limits[0], other)
+            episode = EpisodeStats(update, Phase.TRAINING, update, 1, 9.5, costs, lesson.limits, 0.0)
+            lesson, state = teacher.step(state, ProgressReport(update, update, (episode,)))
+        assert lesson.limits[0] == deploy
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_a_gap_in_the_updates_is_an_error(name: str) -> None:
+    teacher = make_teacher(TeacherSpec(name, {}, CostLimits((50.0,)), CostLimits((5.0,)), TRAIN_STEPS))
+    _, state = teacher.start()
+    _, state = teacher.step(state, ProgressReport(1, 10, ()))
+    with pytest.raises(ValueError) as error:
+        teacher.step(state, ProgressReport(3, 30, ()))
+    assert str(error.value) == (
+        "this teacher state has seen update 1: the next report must be for update 2, or for 1 again, got 3"
+    )
+
+
+@pytest.mark.parametrize(("name", "options"), VARIANTS)
+def test_a_cost_that_is_never_constrained_stays_so(name: str, options: dict[str, Any]) -> None:
+    limits = CostLimits((math.inf, 5.0)), CostLimits((math.inf, 5.0))
+    episode = EpisodeStats(0, Phase.TRAINING, 1, 1, 0.0, (3.0, 3.0), limits[1], 0.0)
+    reports = tuple(ProgressReport(update, update, (episode,)) for update in range(1, 120))
+    for lesson, state in played(TeacherSpec(name, options, *limits, TRAIN_STEPS), reports):
+        assert lesson.limits[0] == math.inf
+        assert state["start_limits"] is not None

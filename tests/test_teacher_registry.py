@@ -1,0 +1,110 @@
+"""Teachers by name, their settings, and what importing them brings in."""
+
+import subprocess
+import sys
+from types import ModuleType
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.plugins import UnknownNameError
+from recrl.teachers.dynamic import PAPER, DynamicConfig
+from recrl.teachers.registry import TEACHERS, TeacherKind, make_teacher, teacher_config
+from recrl.teachers.static import NoConfig, step_teacher
+from recrl.teachers.teacher import TeacherSpec
+
+# What a user's module offers under an import path.
+MINE = TeacherKind(NoConfig, step_teacher)
+
+
+def spec(name: str, **options: Any) -> TeacherSpec:
+    return TeacherSpec(name, options, CostLimits((50.0,)), CostLimits((5.0,)), train_steps=100)
+
+
+def test_the_names() -> None:
+    assert sorted(TEACHERS) == [
+        "cosine",
+        "dynamic",
+        "exponential",
+        "linear",
+        "none",
+        "step",
+        "unconstrained",
+    ]
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_every_teacher_is_made_from_its_spec(name: str) -> None:
+    lesson, state = make_teacher(spec(name)).start()
+    assert len(lesson.limits) == 1
+    assert state["update"] == 0
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_every_setting_says_what_it_is(name: str) -> None:
+    for field in TEACHERS[name].config.model_fields.values():
+        assert field.description
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_resolved_settings_validate_to_themselves(name: str) -> None:
+    resolved = teacher_config(name, {})
+    assert teacher_config(name, resolved.model_dump()) == resolved
+
+
+def test_an_unknown_name_is_told_the_nearest_one() -> None:
+    with pytest.raises(UnknownNameError, match="no teacher is called 'liner'; did you mean 'linear'"):
+        make_teacher(spec("liner"))
+
+
+def test_an_import_path_leads_to_a_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("somebodys_package")
+    module.mine = MINE  # type: ignore[attr-defined]
+    module.broken = step_teacher  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "somebodys_package", module)
+    lesson, _ = make_teacher(spec("somebodys_package:mine")).start()
+    assert lesson.limits == CostLimits((50.0,))
+    with pytest.raises(
+        TypeError, match=r"'somebodys_package:broken' must be a recrl.*TeacherKind, got <func"
+    ):
+        make_teacher(spec("somebodys_package:broken"))
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_an_unknown_option_is_refused(name: str) -> None:
+    with pytest.raises(ValidationError, match="windw"):
+        make_teacher(spec(name, windw=3))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("linear", {"start_updates": 0}),
+        ("dynamic", {"start_updates": -1}),
+        ("dynamic", {"window": 0}),
+        ("dynamic", {"window_unit": "steps"}),
+        ("dynamic", {"return_tolerance": -0.1}),
+        ("dynamic", {"cost_floor": -1.0}),
+        ("dynamic", {"policy_noise": 1.5}),
+        ("dynamic", {"preset": "papers"}),
+    ],
+)
+def test_an_option_out_of_its_range_is_refused(name: str, options: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(options))):
+        make_teacher(spec(name, **options))
+
+
+def test_the_paper_preset_fills_in_what_is_not_given() -> None:
+    config = DynamicConfig.model_validate({"preset": "paper", "window": 30})
+    assert config.model_dump(include=set(PAPER)) == {**PAPER, "window": 30}
+
+
+def test_teachers_import_neither_torch_nor_gymnasium() -> None:
+    code = (
+        "import sys, recrl.teachers.registry\n"
+        "print(sorted({'torch', 'gymnasium', 'minigrid', 'ray', 'mlflow'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

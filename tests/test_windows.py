@@ -1,0 +1,67 @@
+"""What is remembered of the student's episodes, and how windows are cut from it."""
+
+import math
+
+import pytest
+
+from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.teachers.windows import Stretch, extend, last_two_windows
+
+
+def of_costs(*costs: float, env_steps: int = 100) -> Stretch:
+    """An update in which episodes of these costs finished, each with the return 2 x cost."""
+    episodes = [
+        EpisodeStats(b, Phase.TRAINING, 0, 1, 2 * cost, (cost,), CostLimits((9.0,)), 0.0)
+        for b, cost in enumerate(costs)
+    ]
+    return Stretch.of_update(episodes, env_steps=env_steps, num_costs=1)
+
+
+def test_an_update_is_summed_up_by_its_means_and_its_scatter() -> None:
+    update = of_costs(1.0, 2.0, 6.0)
+    assert update == Stretch(100, 3, mean_return=6.0, mean_costs=(3.0,), cost_scatter=(14.0,))
+    assert update.standard_errors[0] == pytest.approx(math.sqrt(14 / 2 / 3))
+
+
+def test_one_episode_has_no_standard_error() -> None:
+    assert of_costs(4.0).standard_errors == (0.0,)
+
+
+def test_an_update_without_episodes_says_nothing() -> None:
+    assert of_costs() == Stretch(100, 0, 0.0, (0.0,), (0.0,))
+
+
+def test_pooled_updates_are_one_update() -> None:
+    pooled = Stretch.pooled([of_costs(1.0, 2.0), of_costs(), of_costs(6.0)])
+    assert pooled == Stretch(300, 3, mean_return=6.0, mean_costs=(3.0,), cost_scatter=(14.0,))
+
+
+def test_windows_of_updates_count_updates() -> None:
+    history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0)]
+    assert last_two_windows(history, 2, unit="updates") == (tuple(history[1:3]), tuple(history[3:]))
+    assert last_two_windows(history[:3], 2, unit="updates") is None
+
+
+def test_with_one_episode_an_update_windows_are_those_of_the_paper() -> None:
+    history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0)]
+    assert last_two_windows(history, 2, unit="episodes") == (tuple(history[1:3]), tuple(history[3:]))
+
+
+def test_windows_of_episodes_are_rounded_up_to_whole_updates() -> None:
+    few, many = of_costs(1.0), of_costs(*[2.0] * 30)
+    assert last_two_windows([few, few, few, many], 3, unit="episodes") == ((few, few, few), (many,))
+    assert last_two_windows([many, many], 3, unit="episodes") == ((many,), (many,))
+    assert last_two_windows([few, few, many], 3, unit="episodes") is None
+
+
+def test_an_update_without_episodes_lends_its_steps_to_the_next() -> None:
+    history: tuple[Stretch, ...] = ()
+    for update in (of_costs(), of_costs(), of_costs(5.0), of_costs()):
+        history = extend(history, update, unit="episodes")
+    assert [(stretch.env_steps, stretch.episodes) for stretch in history] == [(300, 1), (100, 0)]
+    assert len(extend(history, of_costs(), unit="updates")) == 3
+
+
+def test_a_stretch_survives_json() -> None:
+    stretch = of_costs(1.0, 2.0)
+    assert Stretch.from_json(stretch.to_json()) == stretch
