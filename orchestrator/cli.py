@@ -1,0 +1,216 @@
+"""``recrl-sweep``: what can be asked on the command line, and how errors become sentences and exit codes.
+
+Imports next to nothing until it knows what is asked, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from recrl.orchestrator.errors import ClusterError, GridError, RecrlError, SweepBusyError
+from recrl.orchestrator.exit_codes import ExitCode
+
+DESCRIPTION = """\
+Run constrained reinforcement learning under cost-limit curricula: every task x student x method x seed of a
+grid file, on all cores or a Ray cluster, so that nothing is lost and nothing is run twice."""
+
+EPILOG = """\
+A first sweep:
+  recrl-sweep validate grids/demo.yaml    is the file right? (all mistakes at once, with their lines)
+  recrl-sweep plan grids/demo.yaml        what would run, how long, how much memory
+  recrl-sweep launch grids/demo.yaml      run it, watch it, draw the figures
+  recrl-sweep ui demo                     open MLflow's pages about it
+
+Going on:
+  recrl-sweep status demo                 from any terminal, whether it runs or not
+  recrl-sweep launch grids/demo.yaml      after a crash, Ctrl-C or with more seeds: the same command; complete
+                                          trials are kept, begun ones go on from their last checkpoint
+  recrl-sweep launch grids/demo.yaml --retry-failed
+  recrl-sweep launch grids/demo.yaml --only method=dynamic task=rivergrid-1b
+
+Exit codes:
+  0    done, or nothing to do
+  1    some trials failed or could not be finished
+  2    the grid or the arguments are wrong; nothing was started
+  3    another process is running this sweep
+  4    Ray or MLflow could not be started or reached
+  5    plan --check: a launch would have something to do
+  130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
+
+SWEEP_HELP = "a sweep's name, or its grid file; may be left out where there is only one"
+
+
+def parser() -> argparse.ArgumentParser:
+    """Everything that can be asked."""
+    top = _parser("recrl-sweep", DESCRIPTION, EPILOG)
+    top.add_argument("--version", action="version", version=f"recrl {importlib.metadata.version('recrl')}")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    launch = _command(
+        commands, "launch", "run what is not complete, draw the figures, say where everything is"
+    )
+    _add_grid(launch)
+    _add_selection(launch)
+    _add_tracking(launch)
+    launch.add_argument(
+        "--executor",
+        choices=("ray", "inline"),
+        default="ray",
+        help="ray: side by side on all cores or a cluster (default); inline: one after the other in this "
+        "process, for debuggers",
+    )
+    launch.add_argument(
+        "--address",
+        metavar="HOST:PORT",
+        help="an existing Ray cluster, or 'auto' for this machine's; by default one is started here",
+    )
+    launch.add_argument(
+        "--no-mlflow",
+        dest="mlflow",
+        action="store_false",
+        help="send nothing to MLflow; 'sync' can do it later",
+    )
+    launch.add_argument(
+        "--no-figures", dest="figures", action="store_false", help="draw no figures at the end"
+    )
+
+    plan = _command(commands, "plan", "say what a launch would do, and about how long it takes")
+    _add_grid(plan)
+    _add_selection(plan)
+    plan.add_argument(
+        "--check", action="store_true", help="end with 5 if a launch would have something to do"
+    )
+
+    _add_grid(_command(commands, "validate", "check a grid file; all mistakes at once, with their lines"))
+
+    status = _command(commands, "status", "say how far a sweep is, from its files alone")
+    _add_sweep(status)
+    status.add_argument("--brief", action="store_true", help="one line, without the table of trials")
+
+    _add_sweep(_command(commands, "figures", "draw the figures and tables of what is there so far"))
+
+    user_interface = _command(commands, "ui", "open MLflow's pages about a sweep, on this machine only")
+    _add_sweep(user_interface)
+    _add_tracking(user_interface)
+
+    sync = _command(commands, "sync", "bring MLflow up to the files, for example after it was unreachable")
+    _add_sweep(sync)
+    _add_tracking(sync)
+    sync.add_argument(
+        "--rebuild", action="store_true", help="send everything again, for example to an empty MLflow"
+    )
+    return top
+
+
+def main(given: Sequence[str] | None = None) -> int:
+    """Do what is asked.
+
+    Args:
+        given: the arguments; those of the process by default.
+
+    Returns:
+        An exit code.
+    """
+    given = list(sys.argv[1:] if given is None else given)
+    arguments = parser().parse_args(given)
+    arguments.given = given
+    try:
+        from rich.console import Console  # noqa: PLC0415  (--help is to be quick)
+
+        from recrl.orchestrator.commands import COMMANDS  # noqa: PLC0415
+
+        return COMMANDS[arguments.command](arguments, Console())
+    except GridError as error:
+        print(error, file=sys.stderr)
+        mistakes = f"{len(error.problems)} mistake{'s' if len(error.problems) > 1 else ''}"
+        print(f"{mistakes} in {arguments.grid}; nothing was started", file=sys.stderr)
+        return ExitCode.WRONG_INPUT
+    except RecrlError as error:
+        print(f"recrl-sweep: {error}", file=sys.stderr)
+        return _code_of(error)
+    except KeyboardInterrupt:
+        again = "; go on with the same command" if arguments.command == "launch" else ""
+        print(f"Stopped at once{again}.", file=sys.stderr)
+        return ExitCode.STOPPED
+    except BrokenPipeError:  # the reader, for example ``head``, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return ExitCode.OK
+
+
+def _code_of(error: RecrlError) -> ExitCode:
+    if isinstance(error, SweepBusyError):
+        return ExitCode.BUSY
+    return ExitCode.CANNOT_RUN if isinstance(error, ClusterError) else ExitCode.WRONG_INPUT
+
+
+def _parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    return argparse.ArgumentParser(
+        prog=name,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, summary: str
+) -> argparse.ArgumentParser:
+    command = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
+    if name != "validate":
+        command.add_argument(
+            "--root", type=Path, default=Path("runs"), help="the folder of all sweeps (default: runs)"
+        )
+    return command
+
+
+def _add_grid(command: argparse.ArgumentParser) -> None:
+    command.add_argument("grid", type=Path, metavar="GRID.yaml", help="what the sweep is made of")
+
+
+def _add_sweep(command: argparse.ArgumentParser) -> None:
+    command.add_argument("sweep", nargs="?", metavar="SWEEP", help=SWEEP_HELP)
+
+
+def _add_selection(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--only",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="only these trials: task, agent or method by label, or seed; several values with commas, "
+        "method=none,dynamic",
+    )
+    command.add_argument(
+        "--retry-failed", action="store_true", help="try failed trials again, from their last checkpoint"
+    )
+    command.add_argument(
+        "--max-concurrent",
+        type=_at_least_one,
+        metavar="N",
+        help="trials at once, at most; by default as many as fit (or as the grid says)",
+    )
+
+
+def _add_tracking(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--tracking-uri",
+        metavar="URI",
+        help="an MLflow store or server; by default MLFLOW_TRACKING_URI, or a database in the sweep's folder",
+    )
+
+
+def _at_least_one(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
+    return number
+
+
+if __name__ == "__main__":
+    sys.exit(main())

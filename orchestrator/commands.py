@@ -1,0 +1,270 @@
+"""What the commands of ``recrl-sweep`` do and say; ``cli`` has what can be asked.
+
+Each function takes the parsed arguments and a console, and returns an exit code. What a person can mend is
+raised as a RecrlError, which ``cli`` turns into a sentence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shlex
+import subprocess
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from recrl.orchestrator import display
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.executors import Executor, InlineExecutor
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.grid import GridSpec, read_grid
+from recrl.orchestrator.plan import Plan, estimate, make_plan, trials_at_once
+from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
+from recrl.orchestrator.store import SweepStore
+from recrl.orchestrator.sweep import Mirror, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.validation import nearest
+
+Command = Callable[[argparse.Namespace, Console], ExitCode]
+
+
+def run_validate(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Check a grid file; nothing is started or written."""
+    grid = read_grid(arguments.grid)
+    sizes = (len(grid.tasks), len(grid.agents), len(grid.methods), len(grid.seeds))
+    product = " x ".join(str(size) for size in sizes)
+    _say(
+        console,
+        f"{arguments.grid}: {grid.name} is right: {len(grid.trials())} trials, from "
+        f"tasks x agents x methods x seeds = {product}",
+    )
+    return ExitCode.OK
+
+
+def run_plan(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Say what a launch would do; nothing is started or written."""
+    grid, store = _grid_and_store(arguments)
+    plan = make_plan(grid.trials(), store, only=_only(arguments.only), retry_failed=arguments.retry_failed)
+    console.print(display.plan_table(plan))
+    _say(console, "")
+    _say_plan(plan, grid, arguments, console)
+    for orphan in plan.orphans:
+        _say(console, f"not in the grid any more, left alone: {_short(orphan.folder)}")
+    return ExitCode.TRIALS_LEFT if arguments.check and plan.to_do else ExitCode.OK
+
+
+def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Work on everything in the grid that is not complete."""
+    grid, store = _grid_and_store(arguments)
+    stop = threading.Event()
+
+    def watch(plan: Plan) -> None:
+        _say_plan(plan, grid, arguments, console)
+        if plan.to_do:
+            chosen = [trial.spec for trial in plan.trials]
+            shown.enter_context(display.live_progress(lambda: progress(chosen, store), console))
+
+    def finish(after: SweepProgress) -> None:
+        shown.close()
+        if arguments.figures and not stop.is_set() and after.counts[Standing.COMPLETE]:
+            _draw(store, console)
+
+    def say_stopping() -> None:
+        _say(console, "Stopping: running trials save where they are. Once more to stop at once.")
+
+    with contextlib.ExitStack() as shown, stopping_on_signals(stop, say_stopping):
+        result = launch(
+            grid,
+            store,
+            _executor(grid, arguments),
+            stop=stop,
+            only=_only(arguments.only),
+            retry_failed=arguments.retry_failed,
+            start_mirror=_start_mirror(arguments),
+            watch=watch,
+            finish=finish,
+        )
+    return _say_result(result, store, arguments, console)
+
+
+def run_status(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Say how far a sweep is, from its files alone."""
+    store = _store(arguments)
+    now = progress(store.specs(), store)
+    if not arguments.brief:
+        console.print(display.status_table(now))
+        _say(console, "")
+    _say(console, f"{store.name}: {display.status_sentence(now)}")
+    _say_failures(now, store, console)
+    return ExitCode.OK
+
+
+def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Draw the figures and tables of what is on disk."""
+    _draw(_store(arguments), console)
+    return ExitCode.OK
+
+
+def run_ui(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Open MLflow's pages about a sweep, on this machine only."""
+    from recrl.orchestrator.tracking import tracking_uri, ui_command  # noqa: PLC0415  (imports mlflow)
+
+    store = _store(arguments)
+    command = ui_command(store, tracking_uri(store, arguments.tracking_uri))
+    _say(console, f"Starting: {shlex.join(command)}")
+    _say(console, "Ctrl-C ends it.")
+    with contextlib.suppress(KeyboardInterrupt):
+        return ExitCode.OK if subprocess.call(command) == 0 else ExitCode.CANNOT_RUN
+    return ExitCode.OK
+
+
+def run_sync(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Bring MLflow up to the files."""
+    from recrl.orchestrator.tracking import sync, tracking_uri  # noqa: PLC0415  (imports mlflow)
+
+    store = _store(arguments)
+    uri = tracking_uri(store, arguments.tracking_uri)
+    sync(store, uri, rebuild=arguments.rebuild)
+    _say(console, f"{store.name} is in {uri}")
+    return ExitCode.OK
+
+
+def sweep_store(root: Path, sweep: str | None) -> SweepStore:
+    """The sweep that a person means.
+
+    Args:
+        root: the folder of all sweeps.
+        sweep: its name, or its grid file; None for the only one under ``root``.
+
+    Raises:
+        RecrlError: there is no such sweep, or more than one that could be meant.
+    """
+    names = sorted(path.parent.name for path in root.glob("*/sweep.json"))
+    if sweep is None:
+        if len(names) == 1:
+            return SweepStore(root, names[0])
+        listed = f"say which one: {', '.join(names)}" if names else "launch one first"
+        raise RecrlError(f"{root}: holds {len(names)} sweeps; {listed}")
+    if sweep.endswith((".yaml", ".yml")):
+        sweep = read_grid(Path(sweep)).name
+    if sweep not in names:
+        listed = f" (there: {', '.join(names)})" if names else ", nothing was launched there yet"
+        raise RecrlError(f"{root}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
+    return SweepStore(root, sweep)
+
+
+def _grid_and_store(arguments: argparse.Namespace) -> tuple[GridSpec, SweepStore]:
+    grid = read_grid(arguments.grid)
+    return grid, SweepStore(arguments.root, grid.name)
+
+
+def _only(pairs: Sequence[str]) -> dict[str, list[str]]:
+    """``["method=none,linear", "seed=0"]`` as what ``plan.select`` reads."""
+    wanted: dict[str, list[str]] = {}
+    for pair in pairs:
+        key, equals, values = pair.partition("=")
+        if not equals or not values:
+            raise RecrlError(f"--only: must look like method=dynamic or seed=0,1, got {pair!r}")
+        wanted.setdefault(key, []).extend(values.split(","))
+    return wanted
+
+
+def _executor(grid: GridSpec, arguments: argparse.Namespace) -> Executor:
+    if arguments.executor == "inline":
+        return InlineExecutor()
+    from recrl.orchestrator.ray_executor import RayExecutor  # noqa: PLC0415  (imports ray)
+
+    return RayExecutor(
+        address=arguments.address,
+        cpus_per_trial=grid.resources.cpus_per_trial,
+        gpus_per_trial=grid.resources.gpus_per_trial,
+        max_concurrent=arguments.max_concurrent or grid.resources.max_concurrent,
+    )
+
+
+def _start_mirror(arguments: argparse.Namespace) -> Callable[[SweepStore], Mirror] | None:
+    if not arguments.mlflow:
+        return None
+    from recrl.orchestrator.tracking import start_mirror, tracking_uri  # noqa: PLC0415  (imports mlflow)
+
+    return lambda store: start_mirror(store, tracking_uri(store, arguments.tracking_uri))
+
+
+def _draw(store: SweepStore, console: Console) -> None:
+    from recrl.analysis.report import draw  # noqa: PLC0415  (imports matplotlib)
+
+    draw(store, store.figures_folder)
+    _say(console, f"Figures    {_short(store.figures_folder)}")
+
+
+def _say_plan(plan: Plan, grid: GridSpec, arguments: argparse.Namespace, console: Console) -> None:
+    inline = arguments.command == "launch" and arguments.executor == "inline"
+    at_once = trials_at_once(
+        cpus_per_trial=grid.resources.cpus_per_trial,
+        max_concurrent=1 if inline else arguments.max_concurrent or grid.resources.max_concurrent,
+    )
+    _say(console, f"{grid.name}: {display.plan_sentence(plan)}")
+    _say(console, display.estimate_sentence(estimate(plan, concurrent=at_once)))
+
+
+def _say_failures(now: SweepProgress, store: SweepStore, console: Console) -> None:
+    def folder_of(trial: TrialProgress) -> str:
+        return str(_short(store.trial(trial.spec).folder))
+
+    for line in display.failures(now.standing(Standing.FAILED), folder_of):
+        _say(console, line)
+
+
+def _say_result(
+    result: SweepResult, store: SweepStore, arguments: argparse.Namespace, console: Console
+) -> ExitCode:
+    """Say what came of a launch, where it is, and how to go on."""
+    _say(console, f"Results    {_short(store.folder)}")
+    if arguments.mlflow:
+        root = "" if arguments.root == Path("runs") else f" --root {shlex.quote(str(arguments.root))}"
+        _say(console, f"MLflow     recrl-sweep ui {store.name}{root}")
+    _say(console, f"{store.name}: {display.status_sentence(result.progress)}")
+    _say_failures(result.progress, store, console)
+    again = shlex.join(["recrl-sweep", *arguments.given])
+    if result.progress.is_complete:
+        return ExitCode.OK
+    if result.stopped:
+        _say(console, f"Stopped; nothing is lost. Go on with: {again}")
+        return ExitCode.STOPPED
+    if result.failed:
+        _say(
+            console,
+            f"Try what failed again with: {again}{'' if arguments.retry_failed else ' --retry-failed'}",
+        )
+    else:
+        _say(console, f"Not everything could be finished. Go on with: {again}")
+    return ExitCode.TRIALS_FAILED
+
+
+def _store(arguments: argparse.Namespace) -> SweepStore:
+    return sweep_store(arguments.root, arguments.sweep)
+
+
+def _short(path: Path) -> Path:
+    """The path as seen from here, where it is below."""
+    with contextlib.suppress(ValueError):
+        return path.relative_to(Path.cwd())
+    return path
+
+
+def _say(console: Console, sentence: str) -> None:
+    """One line as it is: no markup, no colours, no wrapping."""
+    console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+
+
+COMMANDS: Mapping[str, Command] = {
+    "launch": run_launch,
+    "plan": run_plan,
+    "validate": run_validate,
+    "status": run_status,
+    "figures": run_figures,
+    "ui": run_ui,
+    "sync": run_sync,
+}

@@ -1,0 +1,153 @@
+"""A launch: the one place that makes what is on disk match a grid.
+
+First run, resume after a crash, retry of what failed and more seeds are the same call. The lock sees to it
+that there is one at a time; the plan says what is to do; the executor does it; what came of it is read back
+from the files.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Protocol
+
+from recrl.orchestrator.executors import Executor
+from recrl.orchestrator.grid import GridSpec
+from recrl.orchestrator.plan import Plan, make_plan
+from recrl.orchestrator.provenance import collect
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
+from recrl.orchestrator.store import SweepStore, write_atomically, write_json
+
+
+class Mirror(Protocol):
+    """Something that shows the sweep elsewhere while it runs."""
+
+    def stop(self) -> None:
+        """Show what is left, and end."""
+        ...
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What came of a launch.
+
+    Attributes:
+        plan: what there was to do.
+        progress: where the chosen trials stand now.
+        stopped: whether it was asked to stop before its end.
+    """
+
+    plan: Plan
+    progress: SweepProgress
+    stopped: bool
+
+    @property
+    def failed(self) -> tuple[TrialProgress, ...]:
+        """The trials that stand as failed, also from earlier launches."""
+        return self.progress.standing(Standing.FAILED)
+
+
+def launch(
+    grid: GridSpec,
+    store: SweepStore,
+    executor: Executor,
+    *,
+    stop: threading.Event,
+    only: Mapping[str, Sequence[str]] | None = None,
+    retry_failed: bool = False,
+    start_mirror: Callable[[SweepStore], Mirror] | None = None,
+    watch: Callable[[Plan], None] | None = None,
+    finish: Callable[[SweepProgress], None] | None = None,
+) -> SweepResult:
+    """Work on everything in the grid that is not finished.
+
+    Args:
+        grid: the checked grid.
+        store: the sweep's folder.
+        executor: who runs the trials.
+        stop: once set, running trials save where they are, and the call returns.
+        only: the trials to work on, as ``plan.select`` reads it; all by default.
+        retry_failed: whether failed trials are tried again.
+        start_mirror: begins to show the sweep elsewhere, before the first trial.
+        watch: told the plan before the first trial.
+        finish: called after the last trial, before the mirror stops: draws figures, for example.
+
+    Raises:
+        SweepBusyError: another process is running this sweep.
+        RecrlError: ``only`` names what is not in the grid, or the executor cannot run at all.
+    """
+    specs = grid.trials()
+    make_plan(specs, store, only=only)  # a mistake in ``only`` leaves no trace
+    with store.lock():
+        _write_files(grid, specs, store)
+        plan = make_plan(specs, store, only=only, retry_failed=retry_failed)
+        chosen = [trial.spec for trial in plan.trials]
+        if watch is not None:
+            watch(plan)
+        mirror = start_mirror(store) if start_mirror is not None else None
+        try:
+            try:
+                executor.run(plan.to_do, store, stop)
+            finally:
+                _leave_none_running(plan.to_do, store)
+            result = SweepResult(plan, progress(chosen, store), stopped=stop.is_set())
+            if finish is not None:
+                finish(result.progress)
+        finally:
+            if mirror is not None:
+                mirror.stop()
+    return result
+
+
+@contextmanager
+def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Iterator[None]:
+    """Set ``stop`` on the first SIGINT or SIGTERM, raise KeyboardInterrupt on the second, die of the third.
+
+    Args:
+        stop: what a launch looks at.
+        say: called on the first signal.
+    """
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            for signum in signals:
+                signal.signal(signum, signal.SIG_DFL)
+            raise KeyboardInterrupt
+        stop.set()
+        say()
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, handle) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) -> None:
+    """Say in the sweep's folder what it is."""
+    try:
+        created_at = json.loads(store.info_path.read_text())["created_at"]
+    except FileNotFoundError:
+        created_at = time.time()
+    info = {"name": grid.name, "created_at": created_at, "launched_at": time.time(), **collect()}
+    write_json(store.info_path, info)
+    write_atomically(store.grid_path, grid.text)
+    lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs)
+    write_atomically(store.specs_path, lines.encode())
+
+
+def _leave_none_running(specs: Sequence[TrialSpec], store: SweepStore) -> None:
+    """After the executor nobody works on a trial: one that still says so waits to be resumed."""
+    for spec in specs:
+        files = store.trial(spec)
+        if files.record().status is TrialState.RUNNING:
+            files.set_status(TrialState.WAITING)

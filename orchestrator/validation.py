@@ -1,0 +1,111 @@
+"""Pydantic's errors as sentences for people, each at its place in a file.
+
+A sentence says what is allowed and what was given: ``must be at least 1, got 0``. An unknown key names the
+nearest known one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from recrl.orchestrator.located_yaml import Place
+
+_SENTENCES: Mapping[str, str] = {
+    "missing": "is required",
+    "greater_than": "must be greater than {gt}, got {given}",
+    "greater_than_equal": "must be at least {ge}, got {given}",
+    "less_than": "must be less than {lt}, got {given}",
+    "less_than_equal": "must be at most {le}, got {given}",
+    "multiple_of": "must be a multiple of {multiple_of}, got {given}",
+    "finite_number": "must be finite, got {given}",
+    "int_type": "must be a whole number, got {given}",
+    "int_parsing": "must be a whole number, got {given}",
+    "int_from_float": "must be a whole number, got {given}",
+    "float_type": "must be a number, got {given}",
+    "float_parsing": "must be a number, got {given}",
+    "bool_type": "must be true or false, got {given}",
+    "bool_parsing": "must be true or false, got {given}",
+    "string_type": "must be text, got {given}",
+    "string_too_short": "must have at least {min_length} characters, got {given}",
+    "string_too_long": "must have at most {max_length} characters, got {given}",
+    "literal_error": "must be {expected}, got {given}",
+    "enum": "must be {expected}, got {given}",
+    "list_type": "must be a list, got {given}",
+    "tuple_type": "must be a list, got {given}",
+    "dict_type": "must be a mapping of settings, got {given}",
+    "mapping_type": "must be a mapping of settings, got {given}",
+    "model_type": "must be a mapping of settings, got {given}",
+    "model_attributes_type": "must be a mapping of settings, got {given}",
+    "too_short": "must have at least {min_length} entries, got {actual_length}",
+    "too_long": "must have at most {max_length} entries, got {actual_length}",
+    "value_error": "{error}",
+    "assertion_error": "{error}",
+}
+
+
+def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator[tuple[Place, str]]:
+    """Every mistake as (place relative to the validated value, sentence).
+
+    Args:
+        error: what pydantic found.
+        model: the class that was validated, to name the nearest known key; None where it is not known.
+    """
+    for item in error.errors(include_url=False):
+        place, kind = item["loc"], item["type"]
+        if kind == "extra_forbidden":
+            yield place, _unknown_key(str(place[-1]), known_keys(model, place[:-1]))
+            continue
+        values = {**item.get("ctx", {}), "given": shown(item["input"])}
+        if kind in _SENTENCES:
+            yield place, _SENTENCES[kind].format(**values)
+        else:
+            yield place, f"{item['msg'][:1].lower()}{item['msg'][1:]}, got {values['given']}"
+
+
+def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
+    """The keys that are allowed at ``place`` inside a value of ``model``; [] where that is not known."""
+    for part in place:
+        if model is None:
+            return []
+        if isinstance(part, str) and part in model.model_fields:
+            model = _model_in(model.model_fields[part].annotation)
+    return list(model.model_fields) if model else []
+
+
+def shown(value: Any) -> str:
+    """A value as a person wrote it, cut to a readable length."""
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError):
+        text = repr(value)
+    if isinstance(value, str):
+        text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """``; did you mean 'window'?``, or nothing where no known name is near."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def _unknown_key(key: str, known: list[str]) -> str:
+    listed = f" (known: {', '.join(known)})" if known else ""
+    return f"unknown key{nearest(key, known)}{listed}"
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The pydantic model that an annotation is about: itself, in a list, optional or annotated."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in typing.get_args(annotation):
+        found = _model_in(argument)
+        if found is not None:
+            return found
+    return None
