@@ -26,14 +26,10 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
 from recrl.environments.cmdp import CostLimits, Floats
-from recrl.environments.finite_cmdp import FiniteCMDP, Integers
+from recrl.environments.finite_cmdp import FiniteCMDP, InfeasibleLimitsError, Integers
 
 TOLERANCE = 1e-9  # relative; on returns and costs
 MAX_POLICIES = 10_000
-
-
-class InfeasibleLimitsError(ValueError):
-    """No policy keeps the limits."""
 
 
 @dataclass(frozen=True, eq=False)

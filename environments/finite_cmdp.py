@@ -26,6 +26,10 @@ Integers = npt.NDArray[np.int64]
 Booleans = npt.NDArray[np.bool_]
 
 
+class InfeasibleLimitsError(ValueError):
+    """No policy keeps the cost limits."""
+
+
 @dataclass(frozen=True, eq=False)
 class FiniteCMDP:
     """The tables of a finite CMDP with a finite horizon (Altman 1999, chapter 2).

@@ -143,7 +143,10 @@ def make_vector(name: str, num_envs: int, *, options: Mapping[str, Any] | None =
 
 
 def optimal_return(name: str, options: Mapping[str, Any], limits: CostLimits) -> float | None:
-    """J*(d), the largest expected undiscounted return under limits d, or None where nobody knows it."""
+    """J*(d), the largest expected undiscounted return under limits d.
+
+    None where nobody knows it; -inf where no policy keeps the limits, the supremum of an empty set.
+    """
     task = find_task(name)
     if task.optimum is None:
         return None

@@ -15,6 +15,7 @@ Deterministic: seeding is accepted and changes nothing. ``RiverGridVectorEnv`` s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -24,7 +25,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from recrl.environments.cmdp import CostLimits
-from recrl.environments.finite_cmdp import FiniteCMDP, FiniteVectorEnv, Integers
+from recrl.environments.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError, Integers
 from recrl.environments.plugins import load_attribute
 from recrl.environments.river_maps import (
     GOAL,
@@ -195,8 +196,11 @@ def make_river_grid(name: str, num_envs: int, options: RiverGridOptions) -> Rive
 
 
 def river_grid_optimum(name: str, options: RiverGridOptions, limits: CostLimits) -> float:
-    """J*(d), exact to about 1e-9."""
+    """J*(d), exact to about 1e-9; -inf where no policy keeps the limits."""
     # Loaded here because it needs SciPy, which takes half a second to import and which no trial uses.
     solve = load_attribute("recrl.environments.exact:solve_by_lagrangian")
     model = river_cmdp(task_map(name, options), costs=options.costs, horizon=options.horizon)
-    return float(solve(model, limits).episode_return)
+    try:
+        return float(solve(model, limits).episode_return)
+    except InfeasibleLimitsError:
+        return -math.inf

@@ -9,6 +9,8 @@ Every task reaches the agents as a ``CMDPVectorEnv``. What crosses, and nothing 
       ended (elsewhere its content means nothing); it is present only if one ended.
 - An environment whose episode ended is reset in the same step (Gymnasium's ``SAME_STEP``), so row i of
   the returned observations is then the first of the next episode.
+- Actions that mean nothing (a wrong shape, a number that is no action, NaN) and a step before the first reset
+  raise a ValueError. Continuous actions outside their bounds are clipped to them.
 - ``state_dict`` holds everything that the future depends on, generators included; a tree of dicts,
   lists, JSON scalars and NumPy arrays. ``load_state_dict`` continues exactly from there.
 
