@@ -1,0 +1,73 @@
+"""Generalised advantage estimation for the reward and every cost at once.
+
+Letters: T steps, B environments, C = 1 + k signals (the reward, then the k costs), M truncated steps,
+gamma the discount, lambda the trace decay.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats
+
+
+def next_values(
+    values: Floats,
+    *,
+    terminated: npt.NDArray[np.bool_],
+    truncated: npt.NDArray[np.bool_],
+    final_values: Floats,
+    last_values: Floats,
+) -> Floats:
+    """The value of what truly followed each step.
+
+    Inside an episode that is V(s_{t+1}); 0 after a termination; the value of the true last observation
+    after a time-out (not of the next episode's first, which is what row t + 1 holds); and at the rollout's
+    end the value of the observation that the policy would see next.
+
+    Args:
+        values: V(s_t), [T, B, C].
+        terminated: [T, B].
+        truncated: [T, B].
+        final_values: of the true last observations of the M truncated steps in row-major order, [M, C].
+        last_values: of the observations after the rollout, [B, C].
+
+    Returns:
+        [T, B, C].
+    """
+    following = np.concatenate([values[1:], last_values[None]])
+    following[truncated] = final_values
+    following[terminated] = 0.0
+    return following
+
+
+def generalised_advantages(
+    signals: Floats,
+    values: Floats,
+    following: Floats,
+    *,
+    ended: npt.NDArray[np.bool_],
+    discount: float,
+    trace_decays: Floats,
+) -> Floats:
+    """Generalised advantage estimates (Schulman et al. 2016, equation 16), in one backward pass.
+
+    delta_t = r_t + gamma V(s_{t+1}) - V(s_t);  A_t = delta_t + gamma lambda A_{t+1} within an episode.
+
+    Args:
+        signals: rewards and costs a step, [T, B, C].
+        values: V(s_t), [T, B, C].
+        following: V(s_{t+1}) as ``next_values`` gives it, [T, B, C].
+        ended: the step ended an episode, for good or by a time-out, [T, B].
+        discount: gamma in [0, 1].
+        trace_decays: lambda in [0, 1] of each signal, [C].
+
+    Returns:
+        [T, B, C].
+    """
+    advantages: Floats = signals + discount * following - values
+    carry = (discount * trace_decays) * ~ended[..., None]
+    for step in range(len(advantages) - 2, -1, -1):
+        advantages[step] += carry[step] * advantages[step + 1]
+    return advantages

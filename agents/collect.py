@@ -1,0 +1,178 @@
+"""Collecting experience: T steps of B environments under one policy.
+
+Knows no algorithm and no limits. Between two calls it keeps the current observations and the sums of the
+episodes under way, so episodes go on across rollouts; ``state_dict`` holds both and a resumed collector
+continues exactly. The environments' own state and the generator's are the caller's to save.
+
+Letters: T steps, B environments, k costs, n observation components, E finished episodes, M truncated steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.agents.agent import Policy, Rollout
+from recrl.agents.spaces import environment_actions, observation_rows, observation_size
+from recrl.environments.vector import CMDPVectorEnv
+
+
+@dataclass(frozen=True)
+class FinishedEpisode:
+    """One episode that ended in a rollout.
+
+    Attributes:
+        step: t, index in 0..T-1 of the rollout's step that ended it.
+        environment: index in 0..B-1 of the environment it ran in.
+        length: its number of steps, at least 1, those in earlier rollouts included.
+        episode_return: undiscounted sum of rewards.
+        costs: undiscounted sums of costs, [k].
+    """
+
+    step: int
+    environment: int
+    length: int
+    episode_return: float
+    costs: tuple[float, ...]
+
+
+class Collector:
+    """Steps a batch of environments with a policy.
+
+    Args:
+        environments: B environments of one task.
+        num_steps: T, steps a rollout takes in each environment, at least 1.
+    """
+
+    def __init__(self, environments: CMDPVectorEnv, *, num_steps: int) -> None:
+        if num_steps < 1:
+            raise ValueError(f"num_steps must be at least 1, got {num_steps}")
+        self._environments = environments
+        self._num_steps = num_steps
+        self._observations: npt.NDArray[np.float32] | None = None
+        num_envs, num_costs = environments.num_envs, environments.cmdp.num_costs
+        self._lengths = np.zeros(num_envs, dtype=np.int64)
+        self._returns = np.zeros(num_envs, dtype=np.float64)
+        self._costs = np.zeros((num_envs, num_costs), dtype=np.float64)
+
+    def reset(self, *, seed: int) -> None:
+        """Seed the environments and begin B new episodes."""
+        observations, _ = self._environments.reset(seed=seed)
+        self._observations = observation_rows(self._environments.cmdp.observation_space, observations)
+        self._lengths[:] = 0
+        self._returns[:] = 0.0
+        self._costs[:] = 0.0
+
+    def collect(
+        self, policy: Policy, generator: np.random.Generator
+    ) -> tuple[Rollout, tuple[FinishedEpisode, ...]]:
+        """Take T steps in each environment.
+
+        Args:
+            policy: what acts.
+            generator: the policy's randomness.
+
+        Returns:
+            The rollout, and the episodes that finished in it in the order (t, environment).
+
+        Raises:
+            RuntimeError: neither ``reset`` nor ``load_state_dict`` was called before.
+        """
+        if self._observations is None:
+            raise RuntimeError("a collector must be reset or restored before it collects")
+        environments, cmdp = self._environments, self._environments.cmdp
+        shape = (self._num_steps, environments.num_envs)
+        observations = np.empty((*shape, observation_size(cmdp.observation_space)), dtype=np.float32)
+        rewards = np.empty(shape, dtype=np.float64)
+        costs = np.empty((*shape, cmdp.num_costs), dtype=np.float64)
+        terminated = np.empty(shape, dtype=np.bool_)
+        truncated = np.empty(shape, dtype=np.bool_)
+        actions: npt.NDArray[Any] | None = None
+        final_observations: list[npt.NDArray[np.float32]] = []
+        episodes: list[FinishedEpisode] = []
+        current = self._observations
+        for step in range(self._num_steps):
+            chosen = policy.act(current, generator)
+            if actions is None:
+                actions = np.empty((self._num_steps, *chosen.shape), dtype=chosen.dtype)
+            observations[step] = current
+            actions[step] = chosen
+            following, rewards[step], terminated[step], truncated[step], info = environments.step(
+                environment_actions(cmdp.action_space, chosen)
+            )
+            costs[step] = info["cost"]
+            current = observation_rows(cmdp.observation_space, following)
+            ended = terminated[step] | truncated[step]
+            self._lengths += 1
+            self._returns += rewards[step]
+            self._costs += costs[step]
+            if ended.any():
+                truncated[step] &= ~terminated[step]
+                if truncated[step].any():
+                    final = info["final_obs"][truncated[step]]
+                    final_observations.append(observation_rows(cmdp.observation_space, final))
+                episodes += self._finish(step, ended)
+        self._observations = current
+        assert actions is not None  # T >= 1
+        rollout = Rollout(
+            observations=observations,
+            actions=actions,
+            rewards=rewards,
+            costs=costs,
+            terminated=terminated,
+            truncated=truncated,
+            final_observations=np.concatenate([observations[0, :0], *final_observations]),
+            last_observations=current,
+        )
+        return rollout, tuple(episodes)
+
+    def _finish(self, step: int, ended: npt.NDArray[np.bool_]) -> list[FinishedEpisode]:
+        """Hand out the sums of the episodes that ended, and begin new ones."""
+        which = np.flatnonzero(ended)
+        columns = (which, self._lengths[which], self._returns[which], self._costs[which])
+        episodes = [
+            FinishedEpisode(step, environment, length, episode_return, tuple(costs))
+            for environment, length, episode_return, costs in zip(
+                *(column.tolist() for column in columns), strict=True
+            )
+        ]
+        self._lengths[which] = 0
+        self._returns[which] = 0.0
+        self._costs[which] = 0.0
+        return episodes
+
+    def state_dict(self) -> dict[str, Any]:
+        """The current observations and the sums of the episodes under way."""
+        if self._observations is None:
+            raise RuntimeError("a collector has no state before it is reset")
+        return {
+            "observations": self._observations.copy(),
+            "lengths": self._lengths.copy(),
+            "returns": self._returns.copy(),
+            "costs": self._costs.copy(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: the state is of another number of environments or costs.
+        """
+        if state["costs"].shape != self._costs.shape:
+            raise ValueError(
+                f"the saved sums of costs have the shape {state['costs'].shape}, "
+                f"these environments need {self._costs.shape}"
+            )
+        self._observations = np.array(state["observations"], dtype=np.float32)
+        self._lengths = np.array(state["lengths"], dtype=np.int64)
+        self._returns = np.array(state["returns"], dtype=np.float64)
+        self._costs = np.array(state["costs"], dtype=np.float64)
+
+
+def episode_costs(episodes: tuple[FinishedEpisode, ...], num_costs: int) -> npt.NDArray[np.float64]:
+    """The costs of finished episodes as ``Agent.update`` takes them, [E, k]; E may be 0."""
+    return np.array([episode.costs for episode in episodes], dtype=np.float64).reshape(-1, num_costs)

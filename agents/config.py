@@ -1,0 +1,175 @@
+"""What can be set of each student, where the numbers come from, and the two presets.
+
+``recommended`` is every field's default. ``paper`` is safety-starter-agents' setting, which the paper took
+over unchanged; it assumes rollouts of 30,000 steps (``rollout_steps`` x ``num_envs`` of the trial). Options
+given beside ``preset`` override its values. Imports no torch, so that a grid is validated in a moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Width = Annotated[int, Field(ge=1, le=4096)]
+
+STARTER_AGENTS_SETTING: Mapping[str, Any] = {
+    "hidden_sizes": (256, 256),
+    "initialisation": "xavier",
+    "last_layer_scale": 1.0,
+    "reward_trace_decay": 0.97,
+    "cost_trace_decay": 0.97,
+    "critic_steps": 80,
+    "value_target": "reward-to-go",
+    "noise_form": "match-mixture",
+}
+
+
+class StudentConfig(BaseModel):
+    """Settings that all students with a policy and 1 + k critics share."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    paper: ClassVar[Mapping[str, Any]] = STARTER_AGENTS_SETTING
+
+    preset: Literal["recommended", "paper"] = Field(
+        default="recommended",
+        description="Where unset options come from: ours, or safety-starter-agents' as used in the paper.",
+    )
+    hidden_sizes: Annotated[tuple[Width, ...], Field(max_length=8)] = Field(
+        default=(64, 64),
+        description="Widths of the tanh layers of each network (ours; paper 256, 256).",
+    )
+    initialisation: Literal["orthogonal", "xavier"] = Field(
+        default="orthogonal", description="How weights begin (ours; paper xavier)."
+    )
+    last_layer_scale: Positive = Field(
+        default=0.01,
+        description="Factor on the policy's last initial weights, so that it begins nearly uniform "
+        "(Andrychowicz et al. 2021; paper 1).",
+    )
+    discount: Share = Field(default=0.99, description="gamma of the critics, per step (paper).")
+    reward_trace_decay: Share = Field(
+        default=0.95, description="lambda of the reward's advantages (Schulman et al. 2017; paper 0.97)."
+    )
+    cost_trace_decay: Share = Field(
+        default=0.95, description="lambda of the costs' advantages (as the reward's; paper 0.97)."
+    )
+    critic_learning_rate: Positive = Field(default=1e-3, description="Adam's, for the critics (paper).")
+    critic_steps: Count = Field(
+        default=40, description="Full-batch steps of the critics an update (paper 80)."
+    )
+    value_target: Literal["lambda-return", "reward-to-go"] = Field(
+        default="lambda-return",
+        description="What critics learn: advantage plus value (ours), or the bootstrapped discounted "
+        "reward-to-go (paper).",
+    )
+    target_kl: Positive = Field(
+        default=0.01, description="Size of the trust region, mean KL in nats an update (paper)."
+    )
+    noise_form: Literal["match-mixture", "temperature"] = Field(
+        default="match-mixture",
+        description="What policy noise does: make the policy as random as its mixture with a uniform one, or "
+        "divide logits (multiply standard deviations) by 1 / (1 - noise) (ours; the paper is silent).",
+    )
+    compaction: bool = Field(
+        default=True,
+        description="Evaluate networks once for each distinct observation of a rollout; exact, only faster.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in_preset(cls, options: Any) -> Any:
+        if isinstance(options, Mapping) and options.get("preset") == "paper":
+            return {**cls.paper, **options}
+        return options
+
+
+class PPOLagConfig(StudentConfig):
+    """Settings of ``ppo-lag``, PPO on the Lagrangian."""
+
+    paper: ClassVar[Mapping[str, Any]] = {
+        **STARTER_AGENTS_SETTING,
+        "policy_steps": 80,
+        "cost_advantages": "centred",
+        "penalty": "separate",
+        "multiplier_rule": "softplus-adam",
+        "multiplier_initial": 1.0,
+        "multiplier_step": 0.05,
+    }
+
+    policy_learning_rate: Positive = Field(default=3e-4, description="Adam's, for the policy (paper).")
+    policy_steps: Count = Field(
+        default=40, description="Full-batch steps of the policy an update, at most (ours; paper 80)."
+    )
+    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+    )
+    stop_kl_factor: Positive = Field(
+        default=1.2, description="Stop the policy's steps when the KL exceeds this times target_kl (paper)."
+    )
+    entropy_bonus: NonNegative = Field(
+        default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
+    )
+    cost_advantages: Literal["reward-scaled", "centred"] = Field(
+        default="reward-scaled",
+        description="Unit of the cost advantages: divided by the reward advantages' standard deviation, so "
+        "that the multiplier is that of the CMDP (ours), or as they are beside standardised rewards (paper).",
+    )
+    penalty: Literal["combined", "separate"] = Field(
+        default="combined",
+        description="Clip the surrogate of reward minus multiplied costs (ours) or the reward's (paper).",
+    )
+    multiplier_rule: Literal["projected", "softplus-adam", "pid"] = Field(
+        default="projected",
+        description="How multipliers move: projected dual ascent (ours), softplus with Adam (paper), or PID "
+        "(Stooke et al. 2020).",
+    )
+    multiplier_initial: NonNegative = Field(
+        default=0.0, description="First value of every multiplier (ours; paper 1)."
+    )
+    multiplier_step: Positive = Field(
+        default=0.02,
+        description="Step of the dual ascent, Adam's learning rate, or K_I; per unit of episode cost (ours; "
+        "paper 0.05).",
+    )
+    multiplier_proportional: NonNegative = Field(
+        default=0.1, description="K_P of the PID rule, per unit of episode cost (ours)."
+    )
+    multiplier_derivative: NonNegative = Field(
+        default=0.01, description="K_D of the PID rule, per unit of episode cost (ours)."
+    )
+    multiplier_maximum: Positive = Field(
+        default=1000.0,
+        description="The largest multiplier that projected ascent and PID give (ours; anti-wind-up).",
+    )
+    multiplier_reset: bool = Field(
+        default=False,
+        description="Begin a multiplier anew when its limit changes (ours); not for limits that always move.",
+    )
+
+    @model_validator(mode="after")
+    def _softplus_begins_above_zero(self) -> Self:
+        if self.multiplier_rule == "softplus-adam" and self.multiplier_initial <= 0.0:
+            raise ValueError(
+                f"multiplier_initial must be above 0 with the rule softplus-adam, "
+                f"got {self.multiplier_initial}"
+            )
+        return self
+
+
+class CPOConfig(StudentConfig):
+    """Settings of ``cpo``, constrained policy optimisation."""
+
+    damping: NonNegative = Field(
+        default=0.1, description="Multiple of the identity added to the Hessian of the KL (paper)."
+    )
+    conjugate_gradient_steps: Count = Field(default=10, description="Iterations for each direction (paper).")
+    backtrack_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.8, description="Factor on the step from one try of the line search to the next (paper)."
+    )
+    backtrack_tries: Count = Field(default=10, description="Tries of the line search (paper).")

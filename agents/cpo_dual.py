@@ -1,0 +1,164 @@
+"""The step of constrained policy optimisation, solved exactly in a few dimensions.
+
+Achiam et al. 2017 (equation 10) linearise objective and constraints about the present policy and bound the
+step by a trust region:
+
+    minimise g.x  subject to  b_i.x + c_i <= 0 for i = 1..k  and  x.H x / 2 <= delta,
+
+with g minus the gradient of the reward surrogate, b_i the gradient of cost surrogate i, H the Hessian of the
+mean KL and c_i how far constraint i is violated. **c is in the unit of the surrogates, cost per step**:
+c_i = (mean episode cost i - limit i) / mean episode length. Putting episode units beside b is a mistake of
+two well-known libraries.
+
+The optimum is x = -(v + sum_i nu_i w_i) / lam with v = H^-1 g, w_i = H^-1 b_i, so only the products
+q = g.v, r_i = g.w_i, S_ij = b_i.w_j matter. The paper and safety-starter-agents solve k = 1 by distinguishing
+cases; here the cases are the sets of binding constraints, for any small k. With the set A binding, x is the
+shortest step that meets A exactly, plus the rest of the trust region along the part of the gradient that
+leaves A alone:
+
+    m = c_A.S_AA^-1 c_A                 squared length of the shortest step that meets A,
+    p = q - r_A.S_AA^-1 r_A             squared length of the remaining gradient,
+    lam = sqrt(p / (2 delta - m)),  nu_A = S_AA^-1 (lam c_A - r_A).
+
+Each of the at most 2^k candidates is the best point of its face. Those that also meet the constraints outside
+A are feasible, and the optimum is among them: the best feasible candidate is the solution. For k = 1 that is
+nu = 0 or nu = (lam c - r) / s, lam = sqrt((q - r^2 / s) / (2 delta - c^2 / s)), as in the paper.
+
+If no candidate is feasible, no step within the trust region meets all constraints, and the step recovers:
+straight down the cost that is violated most, -w_i sqrt(2 delta / S_ii) (the paper's equation 14); "most" is
+measured by the length c_i / sqrt(S_ii) of the step that would mend it, whatever the costs' units.
+
+Letters: k constraints.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from recrl.environments.cmdp import Floats
+
+# A step of length 1 changes a cost surrogate by at most sqrt(S_ii); below this square, by next to nothing.
+NO_INFLUENCE = 1e-12
+# Squared lengths below this share of q are rounding errors of it.
+NO_GRADIENT = 1e-10
+# How far a constraint may be missed by rounding, as a share of what the trust region can change.
+FEASIBILITY_TOLERANCE = 1e-9
+
+
+class StepCase(IntEnum):
+    """Which problem the step solved."""
+
+    UNCONSTRAINED = 0  # no constraint binds: the trust-region policy optimisation step
+    CONSTRAINED = 1  # at least one constraint binds
+    RECOVERY = 2  # the trust region holds no feasible point
+
+
+@dataclass(frozen=True, eq=False)
+class StepProblem:
+    """The module's problem, reduced to products.
+
+    Attributes:
+        squared_gradient: q = g.H^-1 g, at least 0.
+        mixed: r_i = g.H^-1 b_i, [k].
+        gram: S_ij = b_i.H^-1 b_j, [k, k], symmetric and positive semidefinite.
+        violations: c_i, cost per step, [k]; negative where the constraint holds.
+        radius: delta, the largest mean KL, above 0.
+    """
+
+    squared_gradient: float
+    mixed: Floats
+    gram: Floats
+    violations: Floats
+    radius: float
+
+    def objective(self, solution: DualSolution) -> float:
+        """g.x of a step; the reward surrogate rises by its negative, to first order."""
+        weights = solution.constraint_weights
+        return -(solution.gradient_weight * self.squared_gradient + float(weights @ self.mixed))
+
+    def after(self, solution: DualSolution) -> Floats:
+        """b_i.x + c_i, how far each constraint is violated after a step, to first order, [k]."""
+        return (
+            self.violations - solution.gradient_weight * self.mixed - self.gram @ solution.constraint_weights
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DualSolution:
+    """A step x = -(gradient_weight v + sum_i constraint_weights_i w_i).
+
+    Attributes:
+        case: which problem was solved.
+        gradient_weight: of v; 1 / lam, or 0 in recovery.
+        constraint_weights: of the w_i, [k]; nu_i / lam.
+        multipliers: nu, [k], at least 0; NaN in recovery, where they have no meaning.
+        recovered: index of the constraint that recovery goes down, or None.
+    """
+
+    case: StepCase
+    gradient_weight: float
+    constraint_weights: Floats
+    multipliers: Floats
+    recovered: int | None
+
+
+def solve_dual(problem: StepProblem) -> DualSolution:
+    """The best step of the module's problem, or the recovery step.
+
+    A constraint that no step can influence (S_ii about 0) is left out, whether it is met or not.
+    """
+    usable = tuple(i for i in range(len(problem.violations)) if problem.gram[i, i] > NO_INFLUENCE)
+    best: DualSolution | None = None
+    least = np.inf
+    for size in range(len(usable) + 1):
+        for binding in itertools.combinations(usable, size):
+            candidate = _best_of_face(problem, binding)
+            if candidate is None or not _meets(problem, candidate, set(usable) - set(binding)):
+                continue
+            objective = problem.objective(candidate)
+            if objective < least:
+                best, least = candidate, objective
+    return best or _recovery(problem, usable)
+
+
+def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolution | None:
+    """The best step that meets the ``binding`` constraints exactly, or None if the trust region has none."""
+    index = list(binding)
+    block = problem.gram[np.ix_(index, index)]
+    bound, mixed = problem.violations[index], problem.mixed[index]
+    if index and np.linalg.cond(block) > 1.0 / NO_GRADIENT:
+        return None  # linearly dependent: a smaller set has the same face
+    to_meet, along = np.linalg.solve(block, np.stack([bound, mixed], axis=1)).T
+    slack = 2.0 * problem.radius - float(bound @ to_meet)
+    if slack < 0.0:
+        return None
+    remaining = problem.squared_gradient - float(mixed @ along)
+    has_gradient = remaining > NO_GRADIENT * problem.squared_gradient
+    gradient_weight = float(np.sqrt(slack / remaining)) if has_gradient else 0.0
+    weights, multipliers = np.zeros_like(problem.mixed), np.zeros_like(problem.mixed)
+    weights[index] = to_meet - gradient_weight * along
+    multipliers[index] = to_meet / gradient_weight - along if has_gradient else -along
+    case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
+    return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), None)
+
+
+def _meets(problem: StepProblem, solution: DualSolution, constraints: set[int]) -> bool:
+    """Whether a step meets some constraints: b_i.x + c_i <= 0, up to rounding."""
+    index = sorted(constraints)
+    reach = np.sqrt(2.0 * problem.radius * np.diag(problem.gram)[index])
+    return bool(np.all(problem.after(solution)[index] <= FEASIBILITY_TOLERANCE * reach))
+
+
+def _recovery(problem: StepProblem, usable: tuple[int, ...]) -> DualSolution:
+    """Straight down the most violated cost, to the edge of the trust region."""
+    index = list(usable)
+    lengths = problem.violations[index] / np.sqrt(np.diag(problem.gram)[index])
+    worst = usable[int(np.argmax(lengths))]
+    weights = np.zeros_like(problem.violations)
+    weights[worst] = np.sqrt(2.0 * problem.radius / problem.gram[worst, worst])
+    unknown = np.full_like(problem.violations, np.nan)
+    return DualSolution(StepCase.RECOVERY, 0.0, weights, unknown, worst)

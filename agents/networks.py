@@ -1,0 +1,281 @@
+"""Tanh multi-layer perceptrons, their parameters in one flat block, and Adam on it.
+
+Every network here is a *stack* of C separate networks of one shape, evaluated as one batched product: the
+1 + k critics of a CMDP cost hardly more than one. A policy is a stack of one.
+
+All parameters of a stack are views into one contiguous vector, and so are their gradients. Adam is then a
+handful of operations on two vectors, a trust-region step is ``parameters += step``, and a checkpoint is a
+single array. With networks this small, the number of calls is what an update costs.
+
+Letters: C networks, U rows, n inputs, P parameters.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+# Initialise one weight matrix [in, out] in place; biases start at 0.
+Initialiser = Callable[[Tensor, torch.Generator], None]
+
+
+def orthogonal(weight: Tensor, generator: torch.Generator) -> None:
+    """Orthogonal with gain sqrt 2 (Saxe et al. 2014), the usual choice of on-policy learners."""
+    torch.nn.init.orthogonal_(weight, gain=math.sqrt(2.0), generator=generator)
+
+
+def xavier(weight: Tensor, generator: torch.Generator) -> None:
+    """Uniform within sqrt(6 / (in + out)) (Glorot and Bengio 2010), as safety-starter-agents."""
+    torch.nn.init.xavier_uniform_(weight, generator=generator)
+
+
+INITIALISERS: dict[str, Initialiser] = {"orthogonal": orthogonal, "xavier": xavier}
+
+
+@dataclass(frozen=True)
+class NetworkForm:
+    """How the networks of a student are built.
+
+    Attributes:
+        hidden_sizes: widths of the tanh layers.
+        initialiser: draws each weight matrix.
+    """
+
+    hidden_sizes: tuple[int, ...]
+    initialiser: Initialiser
+
+
+class FlatParameters:
+    """Tensors that are views into one vector, as their gradients are into another.
+
+    Args:
+        shapes: of the tensors, in order.
+
+    Attributes:
+        values: all parameters, float32 [P]; written to in place.
+        gradient: of the last loss differentiated, [P]; overwritten by the next.
+        tensors: the views into ``values``.
+        gradients: the views into ``gradient``.
+    """
+
+    def __init__(self, shapes: Sequence[tuple[int, ...]]) -> None:
+        sizes = [math.prod(shape) for shape in shapes]
+        ends = list(itertools.accumulate(sizes))
+        places = list(zip(shapes, sizes, ends, strict=True))
+        self.values = torch.zeros(ends[-1])
+        self.gradient = torch.zeros(ends[-1])
+        self.tensors = [self.values[end - size : end].view(shape) for shape, size, end in places]
+        self.gradients = [self.gradient[end - size : end].view(shape) for shape, size, end in places]
+
+    def pieces(self, vector: Tensor) -> list[Tensor]:
+        """A vector of parameter changes, [P], as views of the parameters' shapes."""
+        ends = itertools.accumulate(tensor.numel() for tensor in self.tensors)
+        return [
+            vector[end - tensor.numel() : end].view(tensor.shape)
+            for tensor, end in zip(self.tensors, ends, strict=True)
+        ]
+
+    def to_numpy(self) -> npt.NDArray[np.float32]:
+        """A copy of all parameters, [P]."""
+        return self.values.numpy().copy()
+
+    def load(self, values: npt.NDArray[np.float32]) -> None:
+        """Take over saved parameters, [P].
+
+        Raises:
+            ValueError: they are of another network.
+        """
+        if values.shape != tuple(self.values.shape):
+            raise ValueError(
+                f"the saved network has {values.size} parameters, this one {self.values.numel()}: "
+                "was it built with other options?"
+            )
+        self.values.copy_(torch.from_numpy(np.asarray(values, dtype=np.float32)))
+
+
+class TanhStack:
+    """C separate multi-layer perceptrons with tanh between the layers and a linear last one.
+
+    Differentiated by hand, along a change of the parameters (``output_change``) and back to them
+    (``pull_back``): the two products with the Jacobian are the same few lines, and automatic differentiation
+    would spend more time on its book-keeping than these networks on their arithmetic.
+
+    Args:
+        parameters: the block whose first ``2 num_layers`` tensors, shaped as ``shapes`` says, it uses.
+        num_layers: linear layers of each network.
+    """
+
+    def __init__(self, parameters: FlatParameters, num_layers: int) -> None:
+        used = slice(0, 2 * num_layers)
+        self.weights, self.biases = parameters.tensors[used][0::2], parameters.tensors[used][1::2]
+        self._slopes = list(
+            zip(parameters.gradients[used][0::2], parameters.gradients[used][1::2], strict=True)
+        )
+
+    @staticmethod
+    def shapes(num_networks: int, sizes: Sequence[int]) -> list[tuple[int, ...]]:
+        """The shapes of the weights [C, in, out] and biases [C, 1, out], layer by layer.
+
+        Args:
+            num_networks: C.
+            sizes: widths from the inputs to the outputs.
+        """
+        return [
+            shape
+            for inputs, outputs in itertools.pairwise(sizes)
+            for shape in ((num_networks, inputs, outputs), (num_networks, 1, outputs))
+        ]
+
+    def initialise(self, initialiser: Initialiser, last_scale: float, generator: torch.Generator) -> None:
+        """Draw all weights; scale the last layer's by ``last_scale``; set the biases to 0."""
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            for network in weight:
+                initialiser(network, generator)
+            bias.zero_()
+        self.weights[-1].mul_(last_scale)
+
+    def activations(self, rows: Tensor) -> list[Tensor]:
+        """The inputs of every layer, then the outputs, each [C, U, width]; rows are [U, n]."""
+        layers = [rows.expand(len(self.weights[0]), *rows.shape)]
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            layers.append(torch.baddbmm(bias, layers[-1], weight).tanh_())
+        layers.append(torch.baddbmm(self.biases[-1], layers[-1], self.weights[-1]))
+        return layers
+
+    def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
+        """The derivative of the outputs along a change of the parameters: J times the change.
+
+        d h_{l+1} = (1 - h_{l+1}^2) (d h_l W_l + h_l dW_l + d b_l), from d h_0 = 0.
+
+        Args:
+            activations: as ``activations`` gave them at the present parameters.
+            change: dW, db of every layer in order, each of its parameter's shape.
+
+        Returns:
+            [C, U, out].
+        """
+        moved = torch.baddbmm(change[1], activations[0], change[0])
+        for layer in range(1, len(self.weights)):
+            moved.mul_(1.0 - activations[layer].square())
+            moved = torch.baddbmm(change[2 * layer + 1], moved, self.weights[layer]).baddbmm_(
+                activations[layer], change[2 * layer]
+            )
+        return moved
+
+    def pull_back(self, activations: Sequence[Tensor], slope: Tensor) -> None:
+        """The derivative of a loss by the parameters, J^T times that by the outputs, into the gradient block.
+
+        dL/dW_l = h_l^T s_l,  dL/db_l = sum over rows of s_l,  s_{l-1} = (1 - h_l^2) (s_l W_l^T).
+
+        Args:
+            activations: as ``activations`` gave them at the present parameters.
+            slope: dL / d outputs, [C, U, out].
+        """
+        for layer in range(len(self.weights) - 1, -1, -1):
+            by_weight, by_bias = self._slopes[layer]
+            torch.bmm(activations[layer].transpose(1, 2), slope, out=by_weight)
+            torch.sum(slope, dim=1, keepdim=True, out=by_bias)
+            if layer > 0:
+                slope = torch.bmm(slope, self.weights[layer].transpose(1, 2))
+                slope.mul_(1.0 - activations[layer].square())
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015, algorithm 1) on one flat block; equals ``torch.optim.Adam``.
+
+    m <- b1 m + (1 - b1) g;  v <- b2 v + (1 - b2) g^2;
+    x <- x - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps).
+
+    Written out because PyTorch's costs four times as much a step as these five operations, and its state
+    would have to be taken apart for a checkpoint.
+
+    Args:
+        parameters: the block to optimise.
+        learning_rate: above 0.
+    """
+
+    BETAS = (0.9, 0.999)
+    EPSILON = 1e-8
+
+    def __init__(self, parameters: FlatParameters, learning_rate: float) -> None:
+        self._parameters = parameters
+        self._learning_rate = learning_rate
+        self._first_moment = torch.zeros_like(parameters.values)
+        self._second_moment = torch.zeros_like(parameters.values)
+        self._steps = 0
+
+    def step(self) -> None:
+        """Descend along the block's gradient."""
+        gradient = self._parameters.gradient
+        self._steps += 1
+        self._first_moment.lerp_(gradient, 1.0 - self.BETAS[0])
+        self._second_moment.mul_(self.BETAS[1]).addcmul_(gradient, gradient, value=1.0 - self.BETAS[1])
+        rate = self._learning_rate / (1.0 - self.BETAS[0] ** self._steps)
+        correction = math.sqrt(1.0 - self.BETAS[1] ** self._steps)
+        scale = self._second_moment.sqrt().div_(correction).add_(self.EPSILON)
+        self._parameters.values.addcdiv_(self._first_moment, scale, value=-rate)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Both moments, [P], and the number of steps taken."""
+        return {
+            "first_moment": self._first_moment.numpy().copy(),
+            "second_moment": self._second_moment.numpy().copy(),
+            "steps": self._steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._first_moment.copy_(torch.from_numpy(np.asarray(state["first_moment"], dtype=np.float32)))
+        self._second_moment.copy_(torch.from_numpy(np.asarray(state["second_moment"], dtype=np.float32)))
+        self._steps = int(state["steps"])
+
+
+class Critics:
+    """The 1 + k value functions of a CMDP: of the reward, then of each cost.
+
+    Args:
+        num_observations: n.
+        num_costs: k.
+        form: of each network.
+        generator: the initialisation's randomness.
+    """
+
+    def __init__(
+        self, num_observations: int, num_costs: int, form: NetworkForm, generator: torch.Generator
+    ) -> None:
+        sizes = (num_observations, *form.hidden_sizes, 1)
+        self.parameters = FlatParameters(TanhStack.shapes(1 + num_costs, sizes))
+        self._stack = TanhStack(self.parameters, len(sizes) - 1)
+        self._stack.initialise(form.initialiser, 1.0, generator)
+
+    def values(self, rows: Tensor) -> npt.NDArray[np.float64]:
+        """The values of every row, [U, n] -> float64 [U, 1 + k]."""
+        return self._stack.activations(rows)[-1][..., 0].numpy().T.astype(np.float64)
+
+    def differentiate(self, rows: Tensor, row_weights: Tensor, targets: Tensor) -> Tensor:
+        """The squared errors of each critic, and their sum's gradient, which the block then holds.
+
+        L_c = sum_u w_u (V_c(u) - y_cu)^2. The critics share no parameter, so the gradient of the sum is each
+        one's own.
+
+        Args:
+            rows: [U, n].
+            row_weights: w, [U].
+            targets: y, [1 + k, U].
+
+        Returns:
+            L, [1 + k].
+        """
+        activations = self._stack.activations(rows)
+        errors = activations[-1][..., 0] - targets
+        weighted = errors * row_weights
+        self._stack.pull_back(activations, (2.0 * weighted)[..., None])
+        return (weighted * errors).sum(dim=1)

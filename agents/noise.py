@@ -1,0 +1,65 @@
+"""Adding exploration noise eps_pi to a policy (Algorithm 2, line 9), which the paper leaves open.
+
+The noise is put into the *parameters*, once, and the student goes on learning on-policy from there. Mixing
+the policy with a uniform one instead would have to be carried through every later gradient, and does not
+free a saturated softmax: its gradients are about 1e-8.
+
+``match-mixture`` makes the policy as random as the mixture (1 - eps) pi + eps uniform would be, and no
+policy less random than it is. ``temperature`` divides the logits by 1 / (1 - eps), or multiplies the
+standard deviations by it.
+
+Letters: N observations, A actions, m action components, eps = eps_pi.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recrl.environments.cmdp import Floats
+
+BISECTIONS = 60
+
+
+def off_greedy_mass(logits: Floats) -> float:
+    """Mean probability of not taking the most likely action, logits [N, A], in [0, 1 - 1/A]."""
+    shifted = logits - logits.max(axis=1, keepdims=True)
+    return float(np.mean(1.0 - 1.0 / np.exp(shifted).sum(axis=1)))
+
+
+def matching_scale(logits: Floats, noise: float) -> float:
+    """The factor s in [0, 1] on the logits at which the policy is as random as the eps-mixture.
+
+    Solves off_greedy_mass(s logits) = (1 - eps) off_greedy_mass(logits) + eps (1 - 1/A), by bisection. The
+    left side falls in s, so there is one solution, and s <= 1: noise never sharpens a policy.
+
+    Args:
+        logits: of the present policy, [N, A].
+        noise: eps in (0, 1].
+    """
+    num_actions = logits.shape[1]
+    target = (1.0 - noise) * off_greedy_mass(logits) + noise * (1.0 - 1.0 / num_actions)
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if off_greedy_mass(middle * logits) > target:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+def matching_log_std(log_std: Floats, half_ranges: Floats, noise: float) -> Floats:
+    """log_std at which each action component varies as much as the eps-mixture around the same mean.
+
+    sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + eps h^2 / 3): h^2 / 3 is the variance of a uniform action on
+    an interval of half-range h. (The mixture's own greater spread, from the distance between the mean and
+    the interval's middle, is left out: it would depend on the observation.)
+
+    Args:
+        log_std: of the present policy, [m].
+        half_ranges: h, half the length of the action interval, [m]; 1 where it is unbounded.
+        noise: eps in (0, 1].
+    """
+    variance = np.exp(2.0 * log_std)
+    mixed = (1.0 - noise) * variance + noise * half_ranges**2 / 3.0
+    return 0.5 * np.log(np.maximum(variance, mixed))

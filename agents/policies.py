@@ -1,0 +1,228 @@
+"""Stochastic policies: a tanh network with a categorical or a diagonal Gaussian head.
+
+Acting is plain NumPy on the parameters' own memory: at 16 observations, PyTorch's overhead would cost more
+than the arithmetic. Learning is PyTorch. The probabilities that learning compares with are computed by
+PyTorch too, at the start of an update, so that the ratio of an unchanged policy is exactly 1.
+
+Letters: U rows, B observations, n observation components, A actions, m action components, P parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium.spaces import Box, Discrete
+from torch import Tensor
+
+from recrl.agents.distributions import Categorical, Distribution, Gaussian
+from recrl.agents.networks import FlatParameters, NetworkForm, TanhStack
+from recrl.agents.noise import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.spaces import action_size
+
+# safety-starter-agents' and the usual start of a Gaussian policy's spread.
+INITIAL_LOG_STD = -0.5
+
+
+class StochasticPolicy:
+    """pi(a | s); categorical for Discrete actions, diagonal Gaussian for Box.
+
+    The Gaussian's log_std does not depend on the state; it is the last m of the parameters.
+
+    Args:
+        num_observations: n.
+        action_space: of one environment.
+        form: of the network.
+        last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
+        generator: the initialisation's randomness.
+
+    Attributes:
+        parameters: all of them, in one block.
+        stack: the network.
+    """
+
+    def __init__(
+        self,
+        num_observations: int,
+        action_space: gymnasium.Space[Any],
+        form: NetworkForm,
+        last_scale: float,
+        generator: torch.Generator,
+    ) -> None:
+        num_outputs = action_size(action_space)
+        sizes = (num_observations, *form.hidden_sizes, num_outputs)
+        shapes = TanhStack.shapes(1, sizes)
+        self._is_categorical = isinstance(action_space, Discrete)
+        if not self._is_categorical:
+            shapes.append((num_outputs,))
+        self.parameters = FlatParameters(shapes)
+        self.stack = TanhStack(self.parameters, len(sizes) - 1)
+        self.stack.initialise(form.initialiser, last_scale, generator)
+        self._weights = [weight.numpy()[0] for weight in self.stack.weights]
+        self._biases = [bias.numpy()[0] for bias in self.stack.biases]
+        if isinstance(action_space, Box):
+            self.log_std.fill_(INITIAL_LOG_STD)
+            half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
+            self._half_ranges = np.where(np.isfinite(half), half, 1.0)
+
+    @property
+    def log_std(self) -> Tensor:
+        """The Gaussian's log standard deviations, [m]."""
+        return self.parameters.tensors[-1]
+
+    def outputs(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Logits or means of B observations, [B, n] -> [B, A] or [B, m]; no autograd."""
+        hidden = observations
+        for weight, bias in zip(self._weights[:-1], self._biases[:-1], strict=True):
+            hidden = hidden @ weight
+            hidden += bias
+            np.tanh(hidden, out=hidden)
+        outputs: npt.NDArray[np.float32] = hidden @ self._weights[-1] + self._biases[-1]
+        return outputs
+
+    def sample(
+        self, observations: npt.NDArray[np.float32], generator: np.random.Generator
+    ) -> npt.NDArray[Any]:
+        """Draw actions for B observations [B, n]: int64 [B] by inversion, or float32 [B, m]."""
+        outputs = self.outputs(observations)
+        if not self._is_categorical:
+            spread = np.exp(self.log_std.numpy())
+            outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
+            return outputs
+        cumulative = np.exp(outputs - outputs.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
+        thresholds = generator.random(len(outputs)) * cumulative[:, -1]
+        # A threshold may round up to the whole mass, so the last action is what is left.
+        actions: npt.NDArray[np.int64] = (cumulative[:, :-1] <= thresholds[:, None]).sum(axis=1)
+        return actions
+
+    def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
+        """The most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
+        outputs = self.outputs(observations)
+        return outputs.argmax(axis=1) if self._is_categorical else outputs
+
+    def distribution(self, rows: Tensor) -> Distribution:
+        """The action distributions at U rows, [U, n]; not differentiable, see ``evaluate``."""
+        return self._head(self.stack.activations(rows)[-1][0], self.parameters.tensors)
+
+    def evaluate(self, rows: Tensor) -> PolicyEvaluation:
+        """The action distributions at U rows, [U, n], of which a loss can be differentiated."""
+        activations = self.stack.activations(rows)
+        outputs = activations[-1][0].requires_grad_()
+        leaves = [outputs]
+        if not self._is_categorical:
+            leaves.append(self.log_std.clone().requires_grad_())
+        return PolicyEvaluation(self, activations, leaves, self._head(outputs, leaves))
+
+    def _head(self, outputs: Tensor, tensors: Sequence[Tensor]) -> Distribution:
+        """The distributions that outputs, [U, A] or [U, m], stand for; a log_std is the last tensor."""
+        if self._is_categorical:
+            return Categorical(torch.log_softmax(outputs, dim=1))
+        return Gaussian(outputs, tensors[-1])
+
+    def add_noise(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
+        """Make the policy more random, once; ``recrl.agents.noise`` says how.
+
+        Args:
+            noise: eps_pi in (0, 1].
+            observations: where its randomness is measured, [N, n].
+            form: ``match-mixture`` or ``temperature``.
+
+        Returns:
+            ``noise_scale``, the factor on the last layer (categorical) or on the mean standard deviation
+            (Gaussian), and ``randomness_before`` and ``_after``, the mean off-greedy mass or the mean
+            standard deviation.
+        """
+        if self._is_categorical:
+            return self._soften(noise, observations, form)
+        return self._widen(noise, form)
+
+    def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
+        logits = self.outputs(observations).astype(np.float64)
+        scale = 1.0 - noise if form == "temperature" else matching_scale(logits, noise)
+        self.stack.weights[-1].mul_(scale)
+        self.stack.biases[-1].mul_(scale)
+        return {
+            "noise_scale": scale,
+            "randomness_before": off_greedy_mass(logits),
+            "randomness_after": off_greedy_mass(scale * logits),
+        }
+
+    def _widen(self, noise: float, form: str) -> dict[str, float]:
+        before = self.log_std.numpy().astype(np.float64)
+        if form == "temperature":
+            after = before - np.log(max(1.0 - noise, 1e-3))
+        else:
+            after = matching_log_std(before, self._half_ranges, noise)
+        self.log_std.copy_(torch.from_numpy(after))
+        mean_before, mean_after = float(np.exp(before).mean()), float(np.exp(after).mean())
+        return {
+            "noise_scale": mean_after / mean_before,
+            "randomness_before": mean_before,
+            "randomness_after": mean_after,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyEvaluation:
+    """A policy evaluated at some rows; valid until its parameters change.
+
+    The part between the network's outputs and a loss is differentiated automatically, so that a student may
+    write any loss of the distribution; the network itself is ``TanhStack``'s to differentiate.
+
+    Attributes:
+        policy: what was evaluated.
+        activations: of its network.
+        leaves: the outputs, and a Gaussian's log_std: what losses are differentiated by.
+        distribution: at the rows; a differentiable function of the leaves.
+    """
+
+    policy: StochasticPolicy
+    activations: list[Tensor]
+    leaves: list[Tensor]
+    distribution: Distribution
+
+    def gradient(self, loss: Tensor, *, retain_graph: bool = False) -> Tensor:
+        """The gradient of a scalar loss by all parameters, [P]: the policy's gradient block."""
+        slopes = torch.autograd.grad(loss, self.leaves, retain_graph=retain_graph)
+        self.policy.stack.pull_back(self.activations, slopes[0][None])
+        if len(slopes) > 1:
+            self.policy.parameters.gradients[-1].copy_(slopes[1])
+        return self.policy.parameters.gradient
+
+
+class FisherMetric:
+    """The metric of the trust region: the Hessian of the mean KL at the present parameters, plus damping.
+
+    H v = J^T F J v + damping v, with J the Jacobian of the network's outputs and F the Fisher metric on
+    them, averaged over the samples. At the parameters that collected the samples this *is* the Hessian of
+    the mean KL: the term it leaves out has the gradient of the KL as a factor, which is 0 there. It costs
+    one forward and one backward sweep a product, a third of differentiating twice.
+
+    Args:
+        policy: at the parameters of the metric; they must not change while it is used.
+        rows: the distinct observations, [U, n].
+        row_weights: share of the samples at each row, [U], summing to 1.
+        damping: multiple of the identity added, at least 0.
+    """
+
+    def __init__(self, policy: StochasticPolicy, rows: Tensor, row_weights: Tensor, damping: float) -> None:
+        self._policy = policy
+        self._row_weights = row_weights[:, None]
+        self._damping = damping
+        self._activations = policy.stack.activations(rows)
+        self._distribution = policy.distribution(rows)
+
+    def __call__(self, vector: Tensor) -> Tensor:
+        """H times a vector of parameter changes, [P] -> [P]; overwrites the policy's gradient block."""
+        stack, parameters = self._policy.stack, self._policy.parameters
+        change = parameters.pieces(vector)
+        moved = stack.output_change(self._activations, change)[0]
+        stack.pull_back(self._activations, (self._row_weights * self._distribution.fisher(moved))[None])
+        if len(change) > 2 * len(stack.weights):
+            parameters.gradients[-1].copy_(2.0 * change[-1])  # the Fisher metric of log_std is 2
+        return parameters.gradient + self._damping * vector

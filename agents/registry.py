@@ -1,0 +1,87 @@
+"""Every student by name: its settings, and how to build it.
+
+A name is one of ``AGENTS``, an entry point in the group ``recrl.agents``, or an import path
+``package.module:attribute``; what the last two lead to is an ``AgentEntry``. Importing this imports no torch:
+a student's own module is loaded when one is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from recrl.agents.agent import Agent
+from recrl.agents.config import CPOConfig, PPOLagConfig
+from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.plugins import load_attribute, resolve
+
+
+@dataclass(frozen=True)
+class AgentEntry:
+    """How to build one student.
+
+    Attributes:
+        summary: one sentence for people who choose a student.
+        config: a frozen pydantic model of its options.
+        make: callable (cmdp, config, seed) -> Agent, or the import path of one.
+    """
+
+    summary: str
+    config: type[BaseModel]
+    make: str | Callable[[CMDPSpec, Any, np.random.SeedSequence], Agent]
+
+
+AGENTS: dict[str, AgentEntry] = {
+    "ppo-lag": AgentEntry(
+        "PPO on the Lagrangian, with a choice of multiplier rules.",
+        PPOLagConfig,
+        "recrl.agents.ppo_lag:make_ppo_lag",
+    ),
+    "cpo": AgentEntry(
+        "Constrained policy optimisation: a trust-region step that keeps the constraints.",
+        CPOConfig,
+        "recrl.agents.cpo:make_cpo",
+    ),
+}
+
+
+def find_agent(name: str) -> AgentEntry:
+    """The student called ``name``.
+
+    Raises:
+        UnknownNameError: nobody provides it; the message names the nearest known student.
+        ValueError: what the name leads to is not an AgentEntry.
+    """
+    found = resolve(name, kind="agent", group="recrl.agents", ours=AGENTS)
+    if not isinstance(found, AgentEntry):
+        raise ValueError(f"agent {name!r} must be an AgentEntry, got {type(found).__name__}")
+    return found
+
+
+def agent_config(name: str, options: Mapping[str, Any]) -> BaseModel:
+    """The validated options of a student, preset and defaults filled in; ``model_dump`` of it is canonical.
+
+    Raises:
+        UnknownNameError: nobody provides the student.
+        pydantic.ValidationError: all mistakes in the options at once.
+    """
+    return find_agent(name).config.model_validate(dict(options))
+
+
+def make_agent(name: str, cmdp: CMDPSpec, options: Mapping[str, Any], seed: np.random.SeedSequence) -> Agent:
+    """A fresh student for a task; the same seed gives every student with the same networks the same policy.
+
+    Args:
+        name: a name of ours, an entry point's name, or ``package.module:attribute``.
+        cmdp: what the task fixes.
+        options: the student's settings.
+        seed: of its initial parameters and of whatever randomness it needs later.
+    """
+    entry = find_agent(name)
+    make = load_attribute(entry.make) if isinstance(entry.make, str) else entry.make
+    agent: Agent = make(cmdp, agent_config(name, options), seed)
+    return agent

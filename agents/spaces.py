@@ -1,0 +1,73 @@
+"""What spaces students can handle, and how observations and actions cross between them and tasks.
+
+Observations become float32 rows: ``Discrete`` one-hot, ``Box``, ``MultiBinary`` and whatever else is an
+array of numbers flattened. Actions are ``Discrete`` (categorical policies) or ``Box`` (Gaussian policies).
+
+Letters: B environments, n observation components, m action components.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.spaces import Box, Discrete, MultiBinary
+
+from recrl.agents.errors import UnsupportedSpaceError
+
+
+def observation_size(space: gymnasium.Space[Any]) -> int:
+    """The number of components of an observation row, n.
+
+    Raises:
+        UnsupportedSpaceError: the space is neither Discrete nor Box nor MultiBinary.
+    """
+    if isinstance(space, Discrete):
+        return int(space.n)
+    if isinstance(space, Box | MultiBinary):
+        return math.prod(space.shape)
+    raise UnsupportedSpaceError(f"observation space must be Discrete, Box or MultiBinary, got {space}")
+
+
+def observation_rows(space: gymnasium.Space[Any], observations: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """B observations of ``space``, [B, ...], as float32 rows, [B, n].
+
+    >>> observation_rows(Discrete(3), np.array([2, 0])).tolist()
+    [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    """
+    if isinstance(space, Discrete):
+        rows = np.zeros((len(observations), int(space.n)), dtype=np.float32)
+        rows[np.arange(len(observations)), observations - space.start] = 1.0
+        return rows
+    return np.asarray(observations, dtype=np.float32).reshape(len(observations), -1)
+
+
+def action_size(space: gymnasium.Space[Any]) -> int:
+    """The number of actions of a Discrete space, or of components, m, of a Box.
+
+    Raises:
+        UnsupportedSpaceError: the space is neither Discrete nor a Box of floats.
+    """
+    if isinstance(space, Discrete):
+        return int(space.n)
+    if isinstance(space, Box) and np.issubdtype(space.dtype, np.floating):
+        return math.prod(space.shape)
+    raise UnsupportedSpaceError(f"action space must be Discrete or a Box of floats, got {space}")
+
+
+def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """What the task is given for B actions of a student, int64 [B] or float32 [B, m].
+
+    Discrete actions are shifted to the space's first one; Gaussian ones are clipped to the bounds of the
+    Box. The student learns from the unclipped actions, whose density it knows.
+    """
+    if isinstance(space, Discrete):
+        shifted: npt.NDArray[np.int64] = actions + space.start
+        return shifted
+    assert isinstance(space, Box)
+    shaped = actions.reshape(len(actions), *space.shape)
+    clipped: npt.NDArray[Any] = np.clip(shaped, space.low, space.high).astype(space.dtype)
+    return clipped
