@@ -96,8 +96,8 @@ def nearest(name: str, known: list[str]) -> str:
 
 
 def _unknown_key(key: str, known: list[str]) -> str:
-    listed = f" (known: {', '.join(known)})" if known else ""
-    return f"unknown key{nearest(key, known)}{listed}"
+    hint = nearest(key, known) or (f" (known: {', '.join(known)})" if known else "")
+    return f"unknown key{hint}"
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
