@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
 from recrl.environments.vector import CMDPVectorEnv
+from recrl.orchestrator.checkpoint import decode, encode
 
 NUM_ENVS = 3
 SHORT_HORIZON = 12
@@ -169,32 +170,12 @@ def test_a_restored_environment_continues_with_equal_bytes(name: str) -> None:
     kept = copy.deepcopy(state)
     uninterrupted = [as_bytes(step) for step in run(environment, actions[5:])]
     restored = build(name)  # in another process there would have been no reset either
-    restored.load_state_dict(state)
+    restored.load_state_dict(decode(encode(state), source="a checkpoint"))
     assert [as_bytes(step) for step in run(restored, actions[5:])] == uninterrupted
     again = build(name)
     again.reset(seed=99)
     again.load_state_dict(kept)
     assert [as_bytes(step) for step in run(again, actions[5:])] == uninterrupted
-
-
-def test_the_state_is_a_tree_of_plain_values(name: str) -> None:
-    environment = build(name)
-    environment.reset(seed=0)
-
-    def check(value: Any) -> None:
-        if isinstance(value, dict):
-            assert all(isinstance(key, str) for key in value)
-            for child in value.values():
-                check(child)
-        elif isinstance(value, list):
-            for child in value:
-                check(child)
-        elif isinstance(value, np.ndarray):
-            assert value.dtype != object
-        else:
-            assert value is None or type(value) in (bool, int, float, str), value
-
-    check(environment.state_dict())
 
 
 def test_a_state_of_another_number_of_environments_is_refused(name: str) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.plugins import UnknownNameError, load_attribute
-from recrl.environments.registry import TASKS, Task, find_task, make_vector, optimal_return, task_options
+from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
 from recrl.environments.river_maps import MAPS, parse_map
 from recrl.environments.vectorize import SyncCMDPVectorEnv
 
@@ -29,6 +31,15 @@ def test_everything_a_task_refers_to_exists_and_explains_itself(name: str) -> No
     assert model.model_config["extra"] == "forbid"
     for field_name, field in model.model_fields.items():
         assert (field.description or "").endswith("."), field_name
+
+
+def test_building_rivergrid_imports_nothing_slow() -> None:
+    program = (
+        "import sys; from recrl.environments.registry import make_vector; make_vector('rivergrid-1a', 1); "
+        "print(sorted({'scipy', 'minigrid', 'pygame', 'torch', 'mujoco'} & set(sys.modules)))"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ran.stdout == "[]\n"
 
 
 def test_an_unknown_task_is_named_with_its_nearest_known_one() -> None:
@@ -101,13 +112,6 @@ def test_a_users_callable_is_a_task_by_its_import_path() -> None:
     _, rewards, _, _, info = environment.step(np.array([0, 1, 2]))
     assert rewards.tolist() == [-0.1] * 3
     assert info["cost"].tolist() == [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0]]
-
-
-MINE = Task(
-    summary="A user's task.",
-    options="recrl.environments.two_state:TwoStateOptions",
-    make=lambda name, num_envs, options: make_vector("two-state", num_envs, options=options.model_dump()),
-)
 
 
 def test_a_users_task_is_found_by_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
