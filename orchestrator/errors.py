@@ -29,3 +29,11 @@ class SweepBusyError(RecrlError):
 
 class TeacherUnavailableError(RecrlError):
     """The teacher did not answer; nothing is lost, the trial can be resumed."""
+
+
+class ClusterError(RecrlError):
+    """Ray cannot be started or reached, or lacks what a trial asks for."""
+
+
+class TrackingError(RecrlError):
+    """MLflow cannot be used in the way that was asked for; training does not depend on it."""

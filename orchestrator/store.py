@@ -7,6 +7,7 @@
         lock                    held by the one process that runs the sweep
         figures/                what ``recrl-sweep figures`` drew
         mlflow.db, mlartifacts/ the default MLflow store
+        mirror/                 how far MLflow has been told, for each store it was told to
         trials/<task>__<agent>__<method>__s<seed>__<id>/
             spec.json           the TrialSpec
             state.json          the TrialRecord: status, progress, lease, committed file lengths
@@ -171,6 +172,11 @@ class SweepStore:
     def mlflow_artifacts(self) -> Path:
         """The default place of MLflow's artifacts."""
         return self.folder / "mlartifacts"
+
+    @property
+    def mirror_folder(self) -> Path:
+        """How far MLflow has been told; may be deleted at any time."""
+        return self.folder / "mirror"
 
     def trial(self, spec: TrialSpec) -> TrialStore:
         """The trial's folder; it need not exist yet."""

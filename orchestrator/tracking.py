@@ -1,0 +1,790 @@
+"""The MLflow view of a sweep: a one-way mirror of its files that may be away without anyone waiting for it.
+
+The only module that imports mlflow, and never in a trial's process: ``start_mirror`` makes one pass after the
+other in a process of its own, politely scheduled. One experiment for a sweep's name (``recrl/<name>``), one
+parent run for the sweep (a note, and figures as artifacts; no metrics, so that no chart shows it), one child
+run for a trial. What a run shows is in ``tracking_points``. Run states are true:
+
+    the trial's files say                                       the run is
+    waiting, never started                                      not there; the parent's note counts it
+    waiting to be resumed                                       SCHEDULED during a launch, KILLED after it
+    running                                                     RUNNING
+    running, but its process is gone, or silent for 5 minutes   KILLED
+    complete                                                    FINISHED
+    failed                                                      FAILED, with the tag ``recrl.error``
+
+A run that goes on after an end is RUNNING again; its old end time stays until the next end, as MLflow's
+client has no way to clear it.
+
+Why nothing is lost and nothing is there twice: only committed rows are sent. How far a trial has been sent is
+in a position file of its own, written after MLflow's reply. Killed between the two, the next pass sends the
+same points again, with the timestamps of their rows, and MLflow keeps one of each. A lost or damaged position
+means that everything is sent again, into the run that bears the trial's tag. Should a trial's file have been
+cut back behind its position (its newest checkpoint was damaged), MLflow holds points that no longer are: the
+run is deleted and a new one is made from the files, as for every run in ``sync(rebuild=True)``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import hashlib
+import json
+import os
+import select
+import shlex
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
+from recrl.orchestrator.tracking_points import (
+    Point,
+    Row,
+    Summary,
+    final_points,
+    note,
+    params,
+    points,
+    rows_after,
+    thinned,
+)
+
+if TYPE_CHECKING:
+    from mlflow.tracking import MlflowClient
+
+BATCH = 1_000  # metrics of a request; MLflow takes no more, and a row costs least in a full one
+MAX_ERROR = 5_000  # characters of a failed trial's error
+STALE_SECONDS = 300.0  # a heartbeat comes after every update, and updates of big networks take a minute
+POLITENESS = 10  # added to the mirror's nice value: about a tenth of a core that a trial also wants
+LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is away
+ORPHAN_SECONDS = 15.0  # trials outlive a killed driver by some seconds; the last pass waits for them
+VIEW = "recrl"  # key of the prepared chart view
+
+# Read by mlflow when it is imported. A lost server must cost seconds, not MLflow's own four minutes; the
+# mirror tries again by itself. A user's own settings stand.
+ENVIRONMENT = {
+    "DO_NOT_TRACK": "true",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+    "MLFLOW_LOGGING_LEVEL": "CRITICAL",
+    "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+}
+
+# The UI's own state, in its own words (MLflow 3.17; undocumented, so a link without it must do as well).
+VIEW_STATE = {
+    "groupBy": {
+        "aggregateFunction": "average",
+        "groupByKeys": [{"mode": "param", "groupByData": name} for name in ("task", "agent", "method")],
+    },
+    "runsHiddenMode": "SHOW_ALL",
+    "selectedColumns": [
+        *(f"params.`{name}`" for name in ("task", "agent", "method", "seed")),
+        *(f"metrics.`{name}`" for name in ("summary/deploy_return", "summary/deploy_cost_0")),
+    ],
+}
+
+
+@dataclass(frozen=True)
+class SyncReport:
+    """What one pass did.
+
+    Attributes:
+        trials: trials that have begun.
+        behind: those of them that MLflow does not show as their files are.
+        points: points sent.
+        problem: one line saying what kept MLflow from being up to date, or empty.
+        finished_at: when the pass ended, seconds since 1970.
+        experiment_id: the sweep's experiment, or empty if MLflow could not be reached.
+        parent_run_id: the sweep's run, likewise.
+    """
+
+    trials: int = 0
+    behind: int = 0
+    points: int = 0
+    problem: str = ""
+    finished_at: float = 0.0
+    experiment_id: str = ""
+    parent_run_id: str = ""
+
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether MLflow showed all there was to show."""
+        return not self.problem and not self.behind
+
+
+def tracking_uri(store: SweepStore, given: str | None) -> str:
+    """Where MLflow keeps the sweep: a database in the sweep's folder unless the user names a place.
+
+    Args:
+        store: the sweep.
+        given: a server's address or a database's, as MLflow takes them, or None.
+
+    Raises:
+        TrackingError: MLflow has no such kind of store.
+    """
+    if given is None:
+        return f"sqlite:///{store.mlflow_database}"
+    scheme, separator, rest = given.partition("://")
+    if scheme == "sqlite" and rest.startswith("/") and len(rest) > 1:
+        return f"sqlite:///{Path(rest.removeprefix('/')).absolute()}"
+    if separator and rest and scheme.partition("+")[0] in ("http", "https", "postgresql", "mysql", "mssql"):
+        return given
+    raise TrackingError(
+        "the tracking address must be http(s)://host:port, sqlite:///file.db or another database that MLflow "
+        f"takes (postgresql, mysql, mssql), got {given!r}"
+    )
+
+
+def sync(store: SweepStore, uri: str, *, rebuild: bool = False) -> SyncReport:
+    """Bring MLflow up to date with the sweep's files, once; does nothing where nothing is new.
+
+    Args:
+        store: the sweep.
+        uri: of ``tracking_uri``.
+        rebuild: delete what MLflow has of the sweep and send everything anew, the drawn figures included.
+
+    Returns:
+        What was done, or why it could not be: nothing is raised when MLflow is away.
+    """
+    with _alone(store, uri):
+        report, _ = _pass(store, uri, None, live=False, rebuild=rebuild)
+        return report
+
+
+def log_figures(store: SweepStore, uri: str, paths: Sequence[Path]) -> SyncReport:
+    """Show figures and tables as artifacts of the sweep's run, in the folder ``figures``.
+
+    Returns:
+        The report of the pass that was made with it.
+    """
+    with _alone(store, uri):
+        report, view = _pass(store, uri, None, live=False)
+        if view is None:
+            return report
+        try:
+            view.send_figures(paths)
+        except Exception as error:
+            return replace(report, problem=_one_line(error))
+        return report
+
+
+def last_report(store: SweepStore, uri: str) -> SyncReport | None:
+    """The report of the last pass that ended, in whatever process; None if there was none."""
+    try:
+        return SyncReport(**json.loads((_folder(store, uri) / "report.json").read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+@dataclass(frozen=True)
+class Position:
+    """How far a trial has been sent.
+
+    Attributes:
+        run_id: the run that shows it.
+        offset: the byte of ``updates.csv`` behind the last row sent.
+        last_row: that row; if the file says otherwise, it was cut back and written anew.
+        shown: the status, attempt, committed bytes and error that the run shows.
+        artifacts: name, size and time of the files sent.
+        summary: the means a complete trial ended with.
+    """
+
+    run_id: str
+    offset: int = 0
+    last_row: str = ""
+    shown: Mapping[str, Any] = field(default_factory=dict)
+    artifacts: Sequence[str] = ()
+    summary: Mapping[str, float] = field(default_factory=dict)
+
+    def fits(self, data: bytes) -> bool:
+        """Whether the committed rows still are those that were sent."""
+        return data[self.offset - len(self.last_row) : self.offset] == self.last_row.encode()
+
+
+class _View:
+    """MLflow's side of a sweep, in memory between the passes of one process."""
+
+    def __init__(self, store: SweepStore, uri: str, *, rebuild: bool = False) -> None:
+        self.store = store
+        self.client = _connect(uri)
+        self._uri = uri
+        self._folder = _folder(store, uri)
+        self._sweep_tags = {"recrl.sweep": store.name, "recrl.sweep_id": _sweep_id(store)}
+        self.experiment_id = self._find_experiment()
+        self._runs = self._find_runs()
+        if rebuild:
+            for run_id in self._runs.values():
+                self._delete_run(run_id)
+            for path in self._folder.glob("trial-*.json"):
+                path.unlink()
+            self._runs = {}
+        self._positions: dict[str, Position] = {}
+        self._parent_shown: Mapping[str, Any] = {}
+        self.parent_run_id = self._runs.get("") or self._create_parent()
+        if rebuild and store.figures_folder.is_dir():
+            self.send_figures(sorted(path for path in store.figures_folder.iterdir() if path.is_file()))
+
+    def show_trial(self, trial: TrialStore, *, live: bool) -> int:
+        """Bring the trial's run up to date; returns the number of points sent."""
+        from mlflow.entities import Metric  # noqa: PLC0415  (mlflow takes seconds to import)
+
+        record = trial.record()
+        status = run_status(record, live=live)
+        committed = record.committed.get(trial.updates_path.name, 0)
+        shown = {"status": status, "attempt": record.attempt, "committed": committed, "error": record.error}
+        position = self._position(trial, record)
+        if position.shown == shown:
+            return 0
+        data = _head(trial.updates_path, committed)
+        if len(data) < committed:
+            return 0  # the file is being cut back at this moment; the next pass sees how it went
+        if not position.fits(data):
+            self._delete_run(position.run_id)
+            position = Position(self._create_run(trial, record))
+        new_points, position = _new_points(trial, data, position)
+        if status == "FINISHED" and position.last_row:
+            last = final_points(trial.updates(), trial.evaluation(), _last_row(data, position))
+            summary = {point.key: point.value for point in last if point.key.startswith("summary/")}
+            new_points, position = [*new_points, *last], replace(position, summary=summary)
+        metrics = [Metric(point.key, point.value, point.milliseconds, point.step) for point in new_points]
+        for start in range(0, len(metrics), BATCH):
+            self.client.log_batch(position.run_id, metrics=metrics[start : start + BATCH])
+        position = self._send_artifacts(trial, record, position)
+        self._send_state(record, status, position)
+        self._save(trial, replace(position, shown=shown))
+        return len(metrics)
+
+    def show_sweep(self, *, live: bool) -> None:
+        """Bring the parent run up to date: its note, its status and the grid."""
+        from mlflow.entities import RunTag  # noqa: PLC0415
+
+        records = {trial.folder.name: trial.record() for trial in self.store.trials()}
+        started = {name: record for name, record in records.items() if record.attempt}
+        names = {spec.folder_name for spec in self.store.specs()} | set(records)
+        statuses = Counter(run_status(record, live=live) for record in started.values())
+        counts = {
+            "complete": statuses["FINISHED"],
+            "failed": statuses["FAILED"],
+            "running": statuses["RUNNING"],
+            "stopped": statuses["KILLED"] + statuses["SCHEDULED"],
+            "not started": len(names) - len(started),
+        }
+        status = _sweep_status(counts, live=live)
+        grid = self.store.grid_path
+        changed = grid.stat().st_mtime_ns if grid.exists() else 0
+        shown = {"status": status, "counts": counts, "grid": changed}
+        if shown == self._parent_shown:
+            return
+        text = note(self.store.name, counts, self._summaries())
+        self.client.log_batch(self.parent_run_id, tags=[RunTag("mlflow.note.content", text)])
+        if changed != self._parent_shown.get("grid", 0):
+            self.client.log_artifact(self.parent_run_id, str(grid))
+        if status != self._parent_shown.get("status"):
+            last = max((record.heartbeat for record in started.values()), default=time.time())
+            self._set_status(self.parent_run_id, status, last)
+        self._parent_shown = shown
+
+    def send_figures(self, paths: Sequence[Path]) -> None:
+        """Add files to the parent run."""
+        for path in paths:
+            self.client.log_artifact(self.parent_run_id, str(path), "figures")
+
+    def _summaries(self) -> list[Summary]:
+        summaries = []
+        for trial in self.store.trials():
+            position = self._positions.get(trial.folder.name)
+            if position and position.summary:
+                spec = trial.spec
+                group = (spec.task.label, spec.agent.label, spec.method.label)
+                summaries.append(Summary(group, position.summary))
+        return summaries
+
+    def _find_experiment(self) -> str:
+        name = f"recrl/{self.store.name}"
+        tags = {
+            "mlflow.experimentKind": "custom_model_development",
+            f"mlflow.sharedViewState.{VIEW}": json.dumps(VIEW_STATE),
+        }
+        experiment = self.client.get_experiment_by_name(name)
+        if experiment is None:
+            # A server knows where it keeps artifacts; a bare database would take the current folder.
+            place = None if _is_server(self._uri) else self.store.mlflow_artifacts.as_uri()
+            return str(self.client.create_experiment(name, artifact_location=place, tags=tags))
+        if experiment.lifecycle_stage != "active":
+            self.client.restore_experiment(experiment.experiment_id)
+        for key, value in tags.items():
+            if experiment.tags.get(key) != value:
+                self.client.set_experiment_tag(experiment.experiment_id, key, value)
+        return str(experiment.experiment_id)
+
+    def _find_runs(self) -> dict[str, str]:
+        """Run by trial id, and the parent by the empty id; the oldest where there are several."""
+        runs: dict[str, str] = {}
+        token: str | None = None
+        while True:
+            page = self.client.search_runs(
+                [self.experiment_id],
+                filter_string=f"tags.`recrl.sweep_id` = '{self._sweep_tags['recrl.sweep_id']}'",
+                order_by=["attributes.start_time ASC"],
+                page_token=token,
+            )
+            for run in page:
+                runs.setdefault(run.data.tags.get("recrl.trial_id", ""), run.info.run_id)
+            token = page.token
+            if not token:
+                return runs
+
+    def _create_parent(self) -> str:
+        records = (trial.record() for trial in self.store.trials())
+        begun = min((record.started_at for record in records if record.attempt), default=time.time())
+        run = self.client.create_run(
+            self.experiment_id,
+            start_time=_milliseconds(begun),
+            run_name=self.store.name,
+            tags={**self._sweep_tags, "recrl.kind": "sweep"},
+        )
+        return str(run.info.run_id)
+
+    def _create_run(self, trial: TrialStore, record: TrialRecord) -> str:
+        from mlflow.entities import Param  # noqa: PLC0415
+
+        spec = trial.spec
+        tags = {
+            **self._sweep_tags,
+            "recrl.kind": "trial",
+            "recrl.trial_id": spec.trial_id,
+            "recrl.group": f"{spec.task.label} {spec.agent.label} {spec.method.label}",
+            "mlflow.parentRunId": self.parent_run_id,
+        }
+        run = self.client.create_run(
+            self.experiment_id, start_time=_milliseconds(record.started_at), run_name=spec.title, tags=tags
+        )
+        run_id = str(run.info.run_id)
+        self._runs[spec.trial_id] = run_id
+        self.client.log_batch(run_id, params=[Param(key, value) for key, value in params(spec).items()])
+        return run_id
+
+    def _delete_run(self, run_id: str) -> None:
+        """Take a run out of sight; ``mlflow gc`` removes it for good."""
+        self.client.delete_run(run_id)
+
+    def _position(self, trial: TrialStore, record: TrialRecord) -> Position:
+        """How far the trial has been sent, as far as MLflow still has the run."""
+        name = trial.folder.name
+        if name not in self._positions:
+            position = _read_position(self._position_path(trial))
+            run_id = self._runs.get(trial.spec.trial_id)
+            if position is None or position.run_id != run_id:
+                position = Position(run_id or self._create_run(trial, record))
+            self._positions[name] = position
+        return self._positions[name]
+
+    def _position_path(self, trial: TrialStore) -> Path:
+        return self._folder / f"trial-{trial.folder.name}.json"
+
+    def _save(self, trial: TrialStore, position: Position) -> None:
+        write_json(self._position_path(trial), asdict(position))
+        self._positions[trial.folder.name] = position
+
+    def _send_state(self, record: TrialRecord, status: str, position: Position) -> None:
+        from mlflow.entities import RunTag  # noqa: PLC0415
+
+        tags = {
+            "recrl.status": record.status,
+            "recrl.attempt": str(record.attempt),
+            "recrl.host": record.host,
+            "recrl.error": record.error[:MAX_ERROR],
+        }
+        self.client.log_batch(position.run_id, tags=[RunTag(key, tags[key]) for key in tags if tags[key]])
+        if position.shown.get("error") and not record.error:
+            self.client.delete_tag(position.run_id, "recrl.error")
+        if position.shown.get("status") != status:
+            self._set_status(position.run_id, status, record.heartbeat)
+
+    def _set_status(self, run_id: str, status: str, end: float) -> None:
+        if status in ("RUNNING", "SCHEDULED"):
+            self.client.update_run(run_id, status=status)
+        else:
+            self.client.set_terminated(run_id, status, end_time=_milliseconds(end))
+
+    def _send_artifacts(self, trial: TrialStore, record: TrialRecord, position: Position) -> Position:
+        """Send the trial's small files, and at the end what it learnt; each as often as it changes."""
+        paths = [trial.spec_path, trial.provenance_path]
+        if record.status is TrialState.COMPLETE:
+            paths += [trial.evaluation_path, trial.events_path, *trial.checkpoints()[:1]]
+        if record.status is TrialState.FAILED:
+            paths += [trial.error_path]
+        sent = list(position.artifacts)
+        for path in paths:
+            with suppress(FileNotFoundError):
+                stat = path.stat()
+                mark = f"{path.name} {stat.st_size} {stat.st_mtime_ns}"
+                if mark not in sent and stat.st_size:
+                    self.client.log_artifact(position.run_id, str(path))
+                    sent.append(mark)
+        return replace(position, artifacts=sent)
+
+
+def run_status(record: TrialRecord, *, live: bool) -> str:
+    """What MLflow calls the state of a trial that has begun.
+
+    Args:
+        record: of the trial; ``attempt`` is at least 1.
+        live: whether a launch is there that will resume what waits.
+    """
+    match record.status:
+        case TrialState.COMPLETE:
+            return "FINISHED"
+        case TrialState.FAILED:
+            return "FAILED"
+        case TrialState.RUNNING:
+            return "KILLED" if _is_lost(record) else "RUNNING"
+        case TrialState.WAITING:
+            return "SCHEDULED" if live else "KILLED"
+
+
+def _sweep_status(counts: Mapping[str, int], *, live: bool) -> str:
+    if live or counts["running"]:
+        return "RUNNING"
+    if counts["failed"]:
+        return "FAILED"
+    return "KILLED" if counts["stopped"] + counts["not started"] else "FINISHED"
+
+
+def _is_lost(record: TrialRecord) -> bool:
+    """Whether a trial that says it runs no longer does, as far as one can tell from here."""
+    if record.host == socket.gethostname():
+        try:
+            os.kill(record.pid, 0)  # signal 0 only asks
+        except ProcessLookupError:
+            return True
+        except PermissionError:
+            pass  # somebody else's process, so it is there
+    return time.time() - record.heartbeat > STALE_SECONDS
+
+
+def _new_points(trial: TrialStore, data: bytes, position: Position) -> tuple[list[Point], Position]:
+    """The points behind a position, and the position behind them."""
+    found: list[Point] = []
+    end = position.offset
+    for end, row in thinned(rows_after(data, position.offset), trial.spec.num_updates):  # noqa: B007
+        found += points(row, trial.spec)
+    start = data.rfind(b"\n", 0, max(0, end - 1)) + 1
+    return found, replace(position, offset=end, last_row=data[start:end].decode())
+
+
+def _last_row(data: bytes, position: Position) -> Row:
+    return next(row for _, row in rows_after(data, position.offset - len(position.last_row.encode())))
+
+
+def _read_position(path: Path) -> Position | None:
+    """The position in a file; None if there is none, or none that makes sense."""
+    try:
+        position = Position(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+    kinds = (str, int, str, dict, list, dict)
+    values = (getattr(position, name) for name in Position.__dataclass_fields__)
+    return position if all(map(isinstance, values, kinds)) else None
+
+
+def _pass(
+    store: SweepStore, uri: str, view: _View | None, *, live: bool, rebuild: bool = False
+) -> tuple[SyncReport, _View | None]:
+    """One pass over the sweep; whatever MLflow raises ends up in the report.
+
+    Returns:
+        The report, and the view to make the next pass with: None if MLflow has to be asked anew.
+    """
+    trials = [trial for trial in store.trials() if trial.record().attempt]
+    sent, done, problems = 0, 0, []
+    away = False
+    try:
+        view = view or _View(store, uri, rebuild=rebuild)
+        for trial in trials:
+            try:
+                sent += view.show_trial(trial, live=live)
+                done += 1
+            except Exception as error:
+                problems.append(f"{trial.folder.name}: {_one_line(error)}")
+                if _is_away(error):
+                    raise
+        view.show_sweep(live=live)
+    except Exception as error:
+        away = True
+        problems = problems or [_one_line(error)]
+    report = SyncReport(
+        trials=len(trials),
+        behind=len(trials) - done,
+        points=sent,
+        problem=problems[0] if problems else "",
+        finished_at=time.time(),
+        experiment_id=view.experiment_id if view else "",
+        parent_run_id=view.parent_run_id if view else "",
+    )
+    write_json(_folder(store, uri) / "report.json", asdict(report))
+    return report, None if away or problems else view
+
+
+def _is_away(error: Exception) -> bool:
+    """Whether asking MLflow for the next trial would fail in the same way."""
+    from mlflow.exceptions import MlflowException  # noqa: PLC0415
+
+    about_the_trial = ("INVALID_PARAMETER_VALUE", "BAD_REQUEST", "RESOURCE_DOES_NOT_EXIST")
+    return isinstance(error, MlflowException) and error.error_code not in about_the_trial
+
+
+def _connect(uri: str) -> MlflowClient:
+    """A client for a store that is there, or has just been made.
+
+    Raises:
+        Exception: whatever mlflow raises if the store cannot be used.
+    """
+    for key, value in ENVIRONMENT.items():
+        os.environ.setdefault(key, value)
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415
+
+    if uri.startswith("sqlite:///"):
+        path = Path(uri.removeprefix("sqlite:///"))
+        if not path.exists():
+            # Fifty migrations, not in one transaction: killed in their midst they would leave half a
+            # database for ever. So they run beside.
+            path.parent.mkdir(parents=True, exist_ok=True)
+            beside = path.with_name(f".{path.name}.{os.getpid()}")
+            beside.unlink(missing_ok=True)
+            MlflowClient(f"sqlite:///{beside}").search_experiments(max_results=1)
+            beside.replace(path)
+        elif _head(path, 16) != b"SQLite format 3\0":
+            raise TrackingError(f"{path}: not a sqlite database; delete it to have it made anew")
+    return MlflowClient(uri)
+
+
+@contextmanager
+def _alone(store: SweepStore, uri: str) -> Iterator[None]:
+    """Wait until no other process tells this store about this sweep; two would make every run twice."""
+    folder = _folder(store, uri)
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _folder(store: SweepStore, uri: str) -> Path:
+    """The positions for one MLflow store; the address itself may hold a password."""
+    return store.mirror_folder / hashlib.sha256(uri.encode()).hexdigest()[:10]
+
+
+def _sweep_id(store: SweepStore) -> str:
+    """Ten hex digits: sweeps of one name, made at different times, are different sweeps."""
+    try:
+        created = str(json.loads(store.info_path.read_text()).get("created", ""))
+    except FileNotFoundError:
+        created = ""
+    return hashlib.sha256(f"{store.name}\n{created}".encode()).hexdigest()[:10]
+
+
+def _head(path: Path, length: int) -> bytes:
+    if length == 0:
+        return b""
+    with path.open("rb") as file:
+        return file.read(length)
+
+
+def _is_server(uri: str) -> bool:
+    return uri.startswith(("http://", "https://"))
+
+
+def _milliseconds(seconds: float) -> int:
+    return round(seconds * 1000)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:500]
+
+
+@dataclass
+class Mirror:
+    """The process that keeps MLflow up to date during a launch; it ends when its parent does."""
+
+    process: subprocess.Popen[bytes]
+
+    def stop(self, timeout: float) -> bool:
+        """Ask for a last pass and wait for it; whatever it does not manage, the next ``sync`` does.
+
+        Args:
+            timeout: seconds, at least 0; then the process is killed.
+
+        Returns:
+            Whether MLflow is up to date.
+        """
+        if self.process.stdin:
+            self.process.stdin.close()
+        try:
+            return self.process.wait(timeout) == 0
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            return False
+
+
+def start_mirror(store: SweepStore, uri: str, *, interval_seconds: float) -> Mirror:
+    """Keep MLflow up to date from a process of its own, until ``Mirror.stop`` or until this process dies.
+
+    Args:
+        store: the sweep.
+        uri: of ``tracking_uri``.
+        interval_seconds: between two passes, above 0; longer while MLflow is away.
+    """
+    folder = _folder(store, uri)
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "recrl.orchestrator.tracking", str(store.folder)]
+    with (folder / "log.txt").open("ab") as log:
+        process = subprocess.Popen(
+            [*command, "--interval", str(interval_seconds), "--parent", str(os.getpid())],
+            # In the environment and not among the arguments, which other users can see.
+            env={**ENVIRONMENT, **os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C is for the launch, which then says when to stop
+        )
+    return Mirror(process)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Mirror a sweep until standard input closes; the process of ``start_mirror``."""
+    parser = argparse.ArgumentParser(prog="python -m recrl.orchestrator.tracking", description=main.__doc__)
+    parser.add_argument("folder", type=Path, help="the sweep's folder")
+    parser.add_argument("--interval", type=float, required=True, help="seconds between two passes")
+    parser.add_argument("--parent", type=int, required=True, help="the process to end with")
+    arguments = parser.parse_args(argv)
+    os.nice(POLITENESS)
+    store = SweepStore(arguments.folder.parent, arguments.folder.name)
+    uri = os.environ["MLFLOW_TRACKING_URI"]
+    view: _View | None = None
+    wait, over_since = arguments.interval, 0.0
+    while True:
+        with _alone(store, uri):
+            report, view = _pass(store, uri, view, live=not over_since)
+        if report.problem:
+            print(f"{time.strftime('%F %T')} {report.problem}", flush=True)
+        if over_since and (
+            report.problem or not _any_runs(store) or time.time() - over_since > ORPHAN_SECONDS
+        ):
+            return 0 if report.is_up_to_date else 1
+        wait = min(2 * wait, LONGEST_WAIT_SECONDS) if report.problem else arguments.interval
+        if over_since:
+            time.sleep(1.0)
+        elif _is_over(arguments.parent, wait):
+            over_since = time.time()
+
+
+def _any_runs(store: SweepStore) -> bool:
+    records = (trial.record() for trial in store.trials())
+    return any(record.status is TrialState.RUNNING and not _is_lost(record) for record in records)
+
+
+def _is_over(parent: int, seconds: float) -> bool:
+    """Wait; whether standard input was closed or the parent died meanwhile."""
+    readable, _, _ = select.select([sys.stdin], [], [], seconds)
+    return bool(readable) or os.getppid() != parent
+
+
+def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
+    """The command that shows the sweep in a browser, on this machine only.
+
+    A database gets a server of one process, without MLflow's job runner (2.5 GB of memory by default, 0.5
+    GB so); a server has its own pages.
+    """
+    if _is_server(uri):
+        return [sys.executable, "-m", "webbrowser", "-t", ui_url(store, uri)]
+    settings = [
+        f"{key}={value}"
+        for key, value in ENVIRONMENT.items()
+        if "SERVER" in key or "TRACK" in key or "TELEMETRY" in key
+    ]
+    server = [sys.executable, "-m", "mlflow", "server", "--backend-store-uri", uri]
+    return ["env", *settings, *server, "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+
+
+def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
+    """The page of the sweep's charts, grouped by task, student and method."""
+    address = uri.rstrip("/") if _is_server(uri) else f"http://127.0.0.1:{port}"
+    report = last_report(store, uri)
+    if report is None or not report.experiment_id:
+        return address
+    return (
+        f"{address}/#/experiments/{report.experiment_id}/runs?viewStateShareKey={VIEW}&compareRunsMode=CHART"
+    )
+
+
+@dataclass
+class UI:
+    """MLflow's UI.
+
+    Attributes:
+        url: the page to open.
+        process: the server, or None if it was there already.
+    """
+
+    url: str
+    process: subprocess.Popen[bytes] | None
+
+    def close(self) -> None:
+        """End the server that was started."""
+        if self.process:
+            self.process.terminate()
+            self.process.wait()
+
+
+def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 120.0) -> UI:
+    """Start MLflow's server on this machine's own address and wait until it answers.
+
+    Args:
+        store: the sweep.
+        uri: of ``tracking_uri``; for a server's address nothing is started.
+        port: of 127.0.0.1.
+        timeout: seconds until it must answer.
+
+    Raises:
+        TrackingError: the port is taken, or the server does not start.
+    """
+    url = ui_url(store, uri, port=port)
+    if _is_server(uri):
+        return UI(url, None)
+    with socket.socket() as probe:
+        if probe.connect_ex(("127.0.0.1", port)) == 0:
+            raise TrackingError(f"port {port} of 127.0.0.1 is taken by another program; choose another port")
+    command = ui_command(store, uri, port=port)
+    log_path = _folder(store, uri) / "ui.txt"
+    log_path.parent.mkdir(parents=True, exist_ok=True)
+    with log_path.open("wb") as log:
+        ui = UI(url, subprocess.Popen(command, stdout=log, stderr=log))
+    end = time.monotonic() + timeout
+    while time.monotonic() < end and ui.process and ui.process.poll() is None:
+        with suppress(urllib.error.URLError, ConnectionError, TimeoutError):
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5.0).close()
+            return ui
+        time.sleep(0.2)
+    ui.close()
+    raise TrackingError(
+        f"MLflow's server did not start; its output is in {log_path}, the command was {shlex.join(command)}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
