@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from recrl.orchestrator.errors import ClusterError, GridError, RecrlError, SweepBusyError
+from recrl.orchestrator.errors import ClusterError, GridError, RecrlError, SweepBusyError, TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 
 DESCRIPTION = """\
@@ -97,6 +97,9 @@ def parser() -> argparse.ArgumentParser:
     user_interface = _command(commands, "ui", "open MLflow's pages about a sweep, on this machine only")
     _add_sweep(user_interface)
     _add_tracking(user_interface)
+    user_interface.add_argument(
+        "--port", type=int, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)"
+    )
 
     sync = _command(commands, "sync", "bring MLflow up to the files, for example after it was unreachable")
     _add_sweep(sync)
@@ -145,7 +148,7 @@ def main(given: Sequence[str] | None = None) -> int:
 def _code_of(error: RecrlError) -> ExitCode:
     if isinstance(error, SweepBusyError):
         return ExitCode.BUSY
-    return ExitCode.CANNOT_RUN if isinstance(error, ClusterError) else ExitCode.WRONG_INPUT
+    return ExitCode.CANNOT_RUN if isinstance(error, ClusterError | TrackingError) else ExitCode.WRONG_INPUT
 
 
 def _parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser:
@@ -201,7 +204,8 @@ def _add_tracking(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--tracking-uri",
         metavar="URI",
-        help="an MLflow store or server; by default MLFLOW_TRACKING_URI, or a database in the sweep's folder",
+        help="an MLflow server (http://host:port) or database (sqlite:///file.db); "
+        "by default one in the sweep's folder",
     )
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import shlex
-import subprocess
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from pathlib import Path
 from rich.console import Console
 
 from recrl.orchestrator import display
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid
@@ -25,7 +24,18 @@ from recrl.orchestrator.plan import Plan, estimate, make_plan, trials_at_once
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.sweep import Mirror, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.tracking import (
+    last_report,
+    log_figures,
+    open_ui,
+    start_mirror,
+    sync,
+    tracking_uri,
+)
 from recrl.orchestrator.validation import nearest
+
+DEFAULT_ROOT = Path("runs")
+MIRROR_INTERVAL_SECONDS = 5.0
 
 Command = Callable[[argparse.Namespace, Console], ExitCode]
 
@@ -58,7 +68,11 @@ def run_plan(arguments: argparse.Namespace, console: Console) -> ExitCode:
 def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Work on everything in the grid that is not complete."""
     grid, store = _grid_and_store(arguments)
+    only = _only(arguments.only)
+    executor = _executor(grid, arguments)
+    uri = tracking_uri(store, arguments.tracking_uri) if arguments.mlflow else None
     stop = threading.Event()
+    drawn: list[Path] = []
 
     def watch(plan: Plan) -> None:
         _say_plan(plan, grid, arguments, console)
@@ -69,7 +83,7 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     def finish(after: SweepProgress) -> None:
         shown.close()
         if arguments.figures and not stop.is_set() and after.counts[Standing.COMPLETE]:
-            _draw(store, console)
+            drawn.extend(_draw(store, console))
 
     def say_stopping() -> None:
         _say(console, "Stopping: running trials save where they are. Once more to stop at once.")
@@ -78,14 +92,19 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
         result = launch(
             grid,
             store,
-            _executor(grid, arguments),
+            executor,
             stop=stop,
-            only=_only(arguments.only),
+            only=only,
             retry_failed=arguments.retry_failed,
-            start_mirror=_start_mirror(arguments),
+            start_mirror=_mirror_to(uri) if uri else None,
             watch=watch,
             finish=finish,
         )
+        if uri and drawn:
+            log_figures(store, uri, drawn)
+    _say(console, f"Results    {_short(store.folder)}")
+    if uri:
+        _say_mirrored(store, uri, arguments, console)
     return _say_result(result, store, arguments, console)
 
 
@@ -109,25 +128,28 @@ def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
 
 def run_ui(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Open MLflow's pages about a sweep, on this machine only."""
-    from recrl.orchestrator.tracking import tracking_uri, ui_command  # noqa: PLC0415  (imports mlflow)
-
     store = _store(arguments)
-    command = ui_command(store, tracking_uri(store, arguments.tracking_uri))
-    _say(console, f"Starting: {shlex.join(command)}")
-    _say(console, "Ctrl-C ends it.")
-    with contextlib.suppress(KeyboardInterrupt):
-        return ExitCode.OK if subprocess.call(command) == 0 else ExitCode.CANNOT_RUN
+    ui = open_ui(store, tracking_uri(store, arguments.tracking_uri), port=arguments.port)
+    _say(console, f"Open {ui.url}")
+    if ui.process is not None:
+        _say(console, "Ctrl-C ends it.")
+        try:
+            ui.process.wait()
+        except KeyboardInterrupt:
+            ui.close()
     return ExitCode.OK
 
 
 def run_sync(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Bring MLflow up to the files."""
-    from recrl.orchestrator.tracking import sync, tracking_uri  # noqa: PLC0415  (imports mlflow)
-
     store = _store(arguments)
     uri = tracking_uri(store, arguments.tracking_uri)
-    sync(store, uri, rebuild=arguments.rebuild)
-    _say(console, f"{store.name} is in {uri}")
+    report = sync(store, uri, rebuild=arguments.rebuild)
+    if not report.is_up_to_date:
+        raise TrackingError(
+            f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}"
+        )
+    _say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     return ExitCode.OK
 
 
@@ -184,19 +206,16 @@ def _executor(grid: GridSpec, arguments: argparse.Namespace) -> Executor:
     )
 
 
-def _start_mirror(arguments: argparse.Namespace) -> Callable[[SweepStore], Mirror] | None:
-    if not arguments.mlflow:
-        return None
-    from recrl.orchestrator.tracking import start_mirror, tracking_uri  # noqa: PLC0415  (imports mlflow)
-
-    return lambda store: start_mirror(store, tracking_uri(store, arguments.tracking_uri))
+def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
+    return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
 
 
-def _draw(store: SweepStore, console: Console) -> None:
+def _draw(store: SweepStore, console: Console) -> list[Path]:
     from recrl.analysis.report import draw  # noqa: PLC0415  (imports matplotlib)
 
-    draw(store, store.figures_folder)
+    drawn = draw(store, store.figures_folder)
     _say(console, f"Figures    {_short(store.figures_folder)}")
+    return drawn
 
 
 def _say_plan(plan: Plan, grid: GridSpec, arguments: argparse.Namespace, console: Console) -> None:
@@ -217,14 +236,27 @@ def _say_failures(now: SweepProgress, store: SweepStore, console: Console) -> No
         _say(console, line)
 
 
+def _say_mirrored(store: SweepStore, uri: str, arguments: argparse.Namespace, console: Console) -> None:
+    """Say where MLflow's view is and how to open it, and whether it is up to date."""
+    place = [store.name]
+    if arguments.root != DEFAULT_ROOT:
+        place += ["--root", str(arguments.root)]
+    if arguments.tracking_uri:
+        place += ["--tracking-uri", arguments.tracking_uri]
+    where = uri if arguments.tracking_uri else _short(store.mlflow_database)
+    _say(console, f"MLflow     {where}")
+    _say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
+    report = last_report(store, uri)
+    if report is None or not report.is_up_to_date:
+        problem = f" ({report.problem})" if report and report.problem else ""
+        again = shlex.join(["recrl-sweep", "sync", *place])
+        _say(console, f"           MLflow is not up to date{problem}; nothing is lost: {again}")
+
+
 def _say_result(
     result: SweepResult, store: SweepStore, arguments: argparse.Namespace, console: Console
 ) -> ExitCode:
-    """Say what came of a launch, where it is, and how to go on."""
-    _say(console, f"Results    {_short(store.folder)}")
-    if arguments.mlflow:
-        root = "" if arguments.root == Path("runs") else f" --root {shlex.quote(str(arguments.root))}"
-        _say(console, f"MLflow     recrl-sweep ui {store.name}{root}")
+    """Say what came of a launch, and how to go on."""
     _say(console, f"{store.name}: {display.status_sentence(result.progress)}")
     _say_failures(result.progress, store, console)
     again = shlex.join(["recrl-sweep", *arguments.given])
@@ -234,10 +266,8 @@ def _say_result(
         _say(console, f"Stopped; nothing is lost. Go on with: {again}")
         return ExitCode.STOPPED
     if result.failed:
-        _say(
-            console,
-            f"Try what failed again with: {again}{'' if arguments.retry_failed else ' --retry-failed'}",
-        )
+        retry = again if arguments.retry_failed else f"{again} --retry-failed"
+        _say(console, f"Try what failed again with: {retry}")
     else:
         _say(console, f"Not everything could be finished. Go on with: {again}")
     return ExitCode.TRIALS_FAILED

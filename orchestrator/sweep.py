@@ -25,12 +25,20 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
 from recrl.orchestrator.store import SweepStore, write_atomically, write_json
 
+# How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
+MIRROR_SECONDS = 120.0
+HASTY_MIRROR_SECONDS = 10.0
+
 
 class Mirror(Protocol):
     """Something that shows the sweep elsewhere while it runs."""
 
-    def stop(self) -> None:
-        """Show what is left, and end."""
+    def stop(self, timeout: float) -> bool:
+        """Show what is left, and end; says whether everything is shown.
+
+        Args:
+            timeout: seconds it may take, at least 0.
+        """
         ...
 
 
@@ -42,11 +50,13 @@ class SweepResult:
         plan: what there was to do.
         progress: where the chosen trials stand now.
         stopped: whether it was asked to stop before its end.
+        mirrored: whether the mirror shows everything; None if there was none.
     """
 
     plan: Plan
     progress: SweepProgress
     stopped: bool
+    mirrored: bool | None
 
     @property
     def failed(self) -> tuple[TrialProgress, ...]:
@@ -92,18 +102,22 @@ def launch(
         if watch is not None:
             watch(plan)
         mirror = start_mirror(store) if start_mirror is not None else None
+        patience = HASTY_MIRROR_SECONDS
+        mirrored: bool | None = None
         try:
             try:
                 executor.run(plan.to_do, store, stop)
             finally:
                 _leave_none_running(plan.to_do, store)
-            result = SweepResult(plan, progress(chosen, store), stopped=stop.is_set())
+            after = progress(chosen, store)
             if finish is not None:
-                finish(result.progress)
+                finish(after)
+            if not stop.is_set():
+                patience = MIRROR_SECONDS
         finally:
             if mirror is not None:
-                mirror.stop()
-    return result
+                mirrored = mirror.stop(patience)
+    return SweepResult(plan, after, stopped=stop.is_set(), mirrored=mirrored)
 
 
 @contextmanager
@@ -135,10 +149,10 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
 def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) -> None:
     """Say in the sweep's folder what it is."""
     try:
-        created_at = json.loads(store.info_path.read_text())["created_at"]
+        created = json.loads(store.info_path.read_text())["created"]
     except FileNotFoundError:
-        created_at = time.time()
-    info = {"name": grid.name, "created_at": created_at, "launched_at": time.time(), **collect()}
+        created = time.time()
+    info = {"name": grid.name, "created": created, "launched": time.time(), **collect()}
     write_json(store.info_path, info)
     write_atomically(store.grid_path, grid.text)
     lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs)
