@@ -1,4 +1,4 @@
-"""RiverGrid (paper, section 6.1 and figure 1): a grid world in which the short way leads through a river.
+"""RiverGrid (paper, section 5 and figure 1): a grid world in which the short way leads through a river.
 
 Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), float32 [width + height + 4].
 Action: Discrete(3), MiniGrid's first three: 0 turn left, 1 turn right, 2 forward (into a wall: stay).
@@ -6,8 +6,9 @@ Reward: -0.1 a step; +10 instead on the step that reaches a goal.
 Cost: ``river`` 1 for every time step that ends on a river tile, turning and bumping there included; on demand
     ``turns`` 1 for every turn, which makes a task with two constraints whose optimum is still exact.
 Termination: at a goal; truncated after ``horizon`` steps (200).
-Source: the paper, for rewards and actions; its figure is not in its text, so the maps are ours, such that
-    every statement about them holds (``recrl.environments.river_maps``). The horizon is ours.
+Source: the paper's section 5 for the idea, the limits and the cost (time steps in the water). It gives
+    neither maps (its figure is not in its text) nor rewards nor a horizon: those are ours, such that every
+    statement of the paper about the two instances holds (``recrl.environments.river_maps``).
 
 Deterministic: seeding is accepted and changes nothing. ``RiverGridVectorEnv`` steps tables;
 ``recrl.environments.river_minigrid`` is the same CMDP on MiniGrid, step for step equal under test.
