@@ -30,22 +30,36 @@ class TeacherKind:
     """What a teacher's name stands for; a user's entry point or import path leads to one of these.
 
     Attributes:
+        summary: one sentence for people who choose a curriculum.
         config: the pydantic model of its options.
         make: builds it; may rely on options that ``config`` has accepted.
     """
 
+    summary: str
     config: type[BaseModel]
     make: Callable[[TeacherSpec], Teacher]
 
 
 TEACHERS: dict[str, TeacherKind] = {
-    "none": TeacherKind(NoConfig, none_teacher),
-    "step": TeacherKind(NoConfig, step_teacher),
-    "unconstrained": TeacherKind(NoConfig, unconstrained_teacher),
-    "linear": TeacherKind(DecayConfig, partial(decay_teacher, decay=linear)),
-    "cosine": TeacherKind(DecayConfig, partial(decay_teacher, decay=cosine)),
-    "exponential": TeacherKind(DecayConfig, partial(decay_teacher, decay=exponential)),
-    "dynamic": TeacherKind(DynamicConfig, DynamicTeacher),
+    "none": TeacherKind("No curriculum: d_d from the start.", NoConfig, none_teacher),
+    "step": TeacherKind("A control: d_t until B, then d_d at once.", NoConfig, step_teacher),
+    "unconstrained": TeacherKind(
+        "A control: no limit until B, whatever d_t is, then d_d at once.", NoConfig, unconstrained_teacher
+    ),
+    "linear": TeacherKind(
+        "CLiC_L: from d_t to d_d in a straight line.", DecayConfig, partial(decay_teacher, decay=linear)
+    ),
+    "cosine": TeacherKind(
+        "CLiC_C: from d_t to d_d, slowly at first.", DecayConfig, partial(decay_teacher, decay=cosine)
+    ),
+    "exponential": TeacherKind(
+        "CLiC_E: from d_t to d_d, fast at first.", DecayConfig, partial(decay_teacher, decay=exponential)
+    ),
+    "dynamic": TeacherKind(
+        "CLiC_D: lower limits for a student that keeps them, noise for one that is stuck.",
+        DynamicConfig,
+        DynamicTeacher,
+    ),
 }
 
 

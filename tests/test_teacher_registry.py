@@ -13,10 +13,10 @@ from recrl.environments.plugins import UnknownNameError
 from recrl.teachers.dynamic import PAPER, DynamicConfig
 from recrl.teachers.registry import TEACHERS, TeacherKind, make_teacher, teacher_config
 from recrl.teachers.static import NoConfig, step_teacher
-from recrl.teachers.teacher import TeacherSpec
+from recrl.teachers.teacher import Lesson, TeacherSpec
 
 # What a user's module offers under an import path.
-MINE = TeacherKind(NoConfig, step_teacher)
+MINE = TeacherKind("d_t, then d_d.", NoConfig, step_teacher)
 
 
 def spec(name: str, **options: Any) -> TeacherSpec:
@@ -103,8 +103,36 @@ def test_the_paper_preset_fills_in_what_is_not_given() -> None:
 
 def test_teachers_import_neither_torch_nor_gymnasium() -> None:
     code = (
-        "import sys, recrl.teachers.registry\n"
+        "import sys, recrl.teachers.registry, recrl.teachers.bounds\n"
         "print(sorted({'torch', 'gymnasium', 'minigrid', 'ray', 'mlflow'} & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("train", "deploy", "train_steps", "message"),
+    [
+        (
+            (5.0,),
+            (5.0, 1.0),
+            1,
+            "train_limits and deploy_limits must have one entry per cost, got 1 and 2",
+        ),
+        ((4.0,), (5.0,), 1, "train_limits must be at least deploy_limits (d_t >= d_d), got 4.0 < 5.0"),
+        ((5.0,), (5.0,), 0, "train_steps must be at least 1, got 0"),
+    ],
+)
+def test_a_spec_that_makes_no_sense_is_refused(
+    train: tuple[float, ...], deploy: tuple[float, ...], train_steps: int, message: str
+) -> None:
+    with pytest.raises(ValueError) as error:
+        TeacherSpec("linear", {}, CostLimits(train), CostLimits(deploy), train_steps)
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize("noise", [-0.1, 1.1])
+def test_noise_beyond_its_range_is_refused(noise: float) -> None:
+    with pytest.raises(ValueError) as error:
+        Lesson(CostLimits((5.0,)), noise)
+    assert str(error.value) == f"policy noise must lie in [0, 1], got {noise}"

@@ -1,0 +1,225 @@
+"""What a curriculum may cost at worst: Lemma 1 and Proposition 1 of the paper (section 5.2), and the inverse.
+
+CPO bounds by how much one update may overshoot its limit (Lemma 1). Summed over the updates of a training
+phase, under the limits D(b) of a curriculum, this bounds what the whole phase costs (Proposition 1). Turned
+round, it says which d_t a budget of cumulative cost allows.
+
+*What is summed.* The paper counts one episode to a policy, b = 1 ... B. Here b counts the policies, n of
+them; a trial that collects E episodes with each costs E times as much.
+
+*When the clock is read.* In Algorithm 1 policy b learns under p = b / n (``end``): the first limit is already
+below d_t, and the last one is d_d. A trial sets the limit before it collects (``start``): p = (b - 1) / n,
+and the first limit is d_t. The sum is then larger by D(0) - D(1) = d_t - d_d.
+
+*The paper's sum.* Its proof has sum D(b) = B (d_d + d_t) / 2 for the linear curriculum. The sum of Algorithm
+1's limits is less, by (d_t - d_d) / 2, so Proposition 1 holds; a trial's is more, by as much.
+
+*Discounted or not.* Lemma 1 is about the discounted cost, sum gamma^t c_t. Limits in this package are on the
+undiscounted cost of an episode, for which the like is proved below (``undiscounted_excess``). Never add one
+kind to the other.
+
+The bounds hold for updates that solve CPO's problem under a finite limit. Recovery steps, updates that
+noise was added to, and those over which an infinite d_t is measured are not covered.
+
+Letters: d_t, d_d training and deployment limit of one cost, d a limit in force, n the number of policies,
+p in [0, 1] progress, w(p) the weight of d_t in D = d_d + w (d_t - d_d), delta the bound on (or the measured)
+mean KL divergence of an update, eps = max_s |E_{a ~ new policy} A_C(s, a)|, gamma the discount, H the
+horizon.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from recrl.teachers.static import Decay, cosine, exponential, hold, limit_at, linear
+
+# When a policy's progress is read: p = b / n (Algorithm 1) or p = (b - 1) / n (a trial).
+Clock = Literal["start", "end"]
+
+# The curricula that have a bound before they have run. The limits of ``dynamic`` are unknown but at most d_t,
+# as those of ``step``.
+DECAYS: dict[str, Decay] = {
+    "step": hold,
+    "dynamic": hold,
+    "linear": linear,
+    "cosine": cosine,
+    "exponential": exponential,
+}
+
+# integral_0^1 w(p) dp
+MEAN_WEIGHTS: dict[str, float] = {
+    "none": 0.0,
+    "step": 1.0,
+    "dynamic": 1.0,
+    "linear": 1 / 2,
+    "cosine": 2 / math.pi,
+    "exponential": (math.e - 2) / (math.e - 1),
+}
+
+# sum_{b=1}^n w(b / n) as a function of n
+_WEIGHT_SUMS: dict[str, Callable[[int], float]] = {
+    "none": lambda n: 0.0,
+    "step": lambda n: n - 1.0,
+    "dynamic": lambda n: n - 1.0,
+    "linear": lambda n: (n - 1) / 2,
+    "cosine": lambda n: (1 / math.tan(math.pi / (4 * n)) - 1) / 2,
+    "exponential": lambda n: 1 / math.expm1(1 / n) - n / (math.e - 1),
+}
+
+
+def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
+    """By how much one update's discounted cost may exceed its limit (Lemma 1).
+
+    sqrt(2 delta) gamma eps / (1 - gamma)^2, from J_C(pi_{b+1}) <= d + this.
+
+    Args:
+        kl: delta, at least 0.
+        advantage: eps, of the discounted costs, at least 0.
+        discount: gamma, in [0, 1).
+
+    >>> discounted_excess(0.02, 5.0, discount=0.5)
+    2.0
+    """
+    return math.sqrt(2 * kl) * discount * advantage / (1 - discount) ** 2
+
+
+def undiscounted_excess(kl: float, advantage: float, *, horizon: int) -> float:
+    """By how much one update's undiscounted episode cost may exceed its limit.
+
+    sqrt(2 delta) H (H - 1) eps: Lemma 1 for episodes of at most H steps without discounting; ours, not the
+    paper's. J_C(new) - J_C(old) is the sum over t of E A_t under the new policy's states. Replace them by the
+    old policy's, which is what CPO constrains: the state distributions at t differ (in L1) by at most
+    2 sum_{j<t} E TV(new, old), TV <= sqrt(KL / 2) (Pinsker), and |E A_t| <= eps. Sum over t = 1 ... H - 1.
+
+    Args:
+        kl: delta, mean over the steps of the old policy's episodes, at least 0.
+        advantage: eps, of the undiscounted costs that remain in the episode, at least 0.
+        horizon: H, at least 1.
+
+    >>> undiscounted_excess(0.02, 3.0, horizon=5)
+    12.0
+    """
+    return math.sqrt(2 * kl) * horizon * (horizon - 1) * advantage
+
+
+def worst_case_cost(limit: float, excess: float) -> float:
+    """Lemma 1: J_C(pi_{b+1}) <= d + excess, discounted or not as the excess is."""
+    return limit + excess
+
+
+def summed_limits(
+    curriculum: str, train_limit: float, deploy_limit: float, *, policies: int, clock: Clock
+) -> float:
+    """The sum of a curriculum's limits, sum_b D(b), by adding them up.
+
+    Args:
+        curriculum: a key of ``MEAN_WEIGHTS``; for ``dynamic`` an upper bound.
+        train_limit: d_t, finite.
+        deploy_limit: d_d, at most d_t.
+        policies: n, at least 1.
+        clock: when progress is read.
+    """
+    _require_bound(curriculum)
+    if curriculum == "none":
+        return policies * deploy_limit
+    first = 1 if clock == "end" else 0
+    return math.fsum(
+        limit_at(b / policies, train_limit, deploy_limit, DECAYS[curriculum])
+        for b in range(first, policies + first)
+    )
+
+
+def weight_sum(curriculum: str, *, policies: int, clock: Clock) -> float:
+    """The sum of the weights of d_t, sum_b w(p_b), in closed form.
+
+    With p_b = b / n: linear (n - 1) / 2; cosine (cot(pi / 4n) - 1) / 2; exponential
+    1 / (e^(1/n) - 1) - n / (e - 1); step n - 1. With p_b = (b - 1) / n one more, w(0) - w(1) = 1.
+
+    >>> weight_sum("linear", policies=4, clock="end")  # 3/4 + 2/4 + 1/4 + 0
+    1.5
+    """
+    _require_bound(curriculum)
+    at_start = 1.0 if clock == "start" and curriculum != "none" else 0.0
+    return _WEIGHT_SUMS[curriculum](policies) + at_start
+
+
+def cumulative_bound(
+    curriculum: str, train_limit: float, deploy_limit: float, *, excesses: Sequence[float], clock: Clock
+) -> float:
+    """What a training phase may cost: sum_b (D(b) + excess_b), exactly summed in closed form.
+
+    Args:
+        curriculum: a key of ``MEAN_WEIGHTS``.
+        train_limit: d_t, finite.
+        deploy_limit: d_d, at most d_t.
+        excesses: of each policy, [n], n >= 1; all discounted or all undiscounted.
+        clock: when progress is read.
+
+    Returns:
+        A bound on the sum over the n policies of their expected cost per episode.
+    """
+    weights = weight_sum(curriculum, policies=len(excesses), clock=clock)
+    return len(excesses) * deploy_limit + weights * (train_limit - deploy_limit) + math.fsum(excesses)
+
+
+def proposition_1(
+    curriculum: str, train_limit: float, deploy_limit: float, *, excesses: Sequence[float]
+) -> float:
+    """Proposition 1, for every curriculum: n (d_d + (d_t - d_d) integral w) + sum_b excess_b.
+
+    For the linear one, n (d_d + d_t) / 2 + sum_b excess_b as in the paper. The weights fall, so their sum at
+    p = b / n is at most n times the integral: it bounds ``cumulative_bound`` with the clock ``end``, not with
+    ``start``.
+
+    Args:
+        curriculum: a key of ``MEAN_WEIGHTS``.
+        train_limit: d_t, finite.
+        deploy_limit: d_d, at most d_t.
+        excesses: of each policy, [n], n >= 1.
+
+    >>> proposition_1("linear", 100.0, 20.0, excesses=[0.5, 0.5])
+    121.0
+    """
+    _require_bound(curriculum)
+    mean_limit = deploy_limit + MEAN_WEIGHTS[curriculum] * (train_limit - deploy_limit)
+    return len(excesses) * mean_limit + math.fsum(excesses)
+
+
+def largest_train_limit(
+    curriculum: str, budget: float, deploy_limit: float, *, excesses: Sequence[float], clock: Clock
+) -> float:
+    """The largest d_t whose ``cumulative_bound`` is within a budget: its inverse.
+
+    d_t = d_d + (budget - n d_d - sum_b excess_b) / sum_b w(p_b); infinite where d_t does not matter.
+
+    Args:
+        curriculum: a key of ``MEAN_WEIGHTS``.
+        budget: cumulative cost that is allowed, of the same kind as the excesses.
+        deploy_limit: d_d.
+        excesses: of each policy, [n], n >= 1.
+        clock: when progress is read.
+
+    Raises:
+        ValueError: not even d_t = d_d is within the budget.
+
+    >>> largest_train_limit("linear", 281.0, 20.0, excesses=[0.25] * 4, clock="start")
+    100.0
+    """
+    weights = weight_sum(curriculum, policies=len(excesses), clock=clock)
+    least = len(excesses) * deploy_limit + math.fsum(excesses)
+    if budget < least:
+        raise ValueError(
+            f"budget must be at least {least:g}, the bound for d_t = d_d = {deploy_limit:g} over "
+            f"{len(excesses)} policies, got {budget:g}"
+        )
+    return math.inf if weights == 0.0 else deploy_limit + (budget - least) / weights
+
+
+def _require_bound(curriculum: str) -> None:
+    """Raise ValueError if nothing is known of the curriculum's limits before it has run."""
+    if curriculum not in MEAN_WEIGHTS:
+        raise ValueError(
+            f"only {', '.join(MEAN_WEIGHTS)} have a bound before they have run, got {curriculum!r}"
+        )

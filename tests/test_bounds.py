@@ -1,0 +1,223 @@
+"""Lemma 1, Proposition 1 and their inverse: by hand, against plain sums, and on random CMDPs."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recrl.environments.cmdp import CostLimits, Floats
+from recrl.teachers.bounds import (
+    MEAN_WEIGHTS,
+    Clock,
+    cumulative_bound,
+    discounted_excess,
+    largest_train_limit,
+    proposition_1,
+    summed_limits,
+    undiscounted_excess,
+    weight_sum,
+    worst_case_cost,
+)
+from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import ProgressReport, TeacherSpec
+
+CLOCKS: tuple[Clock, ...] = ("start", "end")
+
+
+def test_lemma_1_by_hand() -> None:
+    assert discounted_excess(0.02, 3.0, discount=0.5) == pytest.approx(0.2 * 0.5 * 3 / 0.25)
+    assert worst_case_cost(25.0, discounted_excess(0.02, 3.0, discount=0.5)) == pytest.approx(26.2)
+
+
+def test_an_update_that_changes_nothing_exceeds_nothing() -> None:
+    assert discounted_excess(0.0, 3.0, discount=0.99) == 0.0
+    assert undiscounted_excess(0.0, 3.0, horizon=200) == 0.0
+    assert undiscounted_excess(0.02, 3.0, horizon=1) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "at_end"),
+    [
+        ("none", 80.0),
+        ("linear", 80.0 + 60.0 + 40.0 + 20.0),
+        ("step", 3 * 100.0 + 20.0),
+        ("dynamic", 3 * 100.0 + 20.0),
+        # 4 * 20 + 80 * (cos 22.5 + cos 45 + cos 67.5 degrees)
+        ("cosine", 80.0 + 80.0 * (0.9238795 + 0.7071068 + 0.3826834)),
+        # (80 * (0.7788008 + 0.6065307 + 0.4723666) + 3 * (20 - 36.7879441)) / 0.6321206 + 20
+        ("exponential", 175.43239),
+    ],
+)
+def test_limits_from_100_to_20_over_four_policies_by_hand(curriculum: str, at_end: float) -> None:
+    sums = {
+        clock: cumulative_bound(curriculum, 100.0, 20.0, excesses=[0.0] * 4, clock=clock) for clock in CLOCKS
+    }
+    assert sums["end"] == pytest.approx(at_end, abs=1e-4)
+    assert sums["start"] - sums["end"] == pytest.approx(0.0 if curriculum == "none" else 80.0)
+
+
+def test_proposition_1_as_the_paper_has_it() -> None:
+    excesses = [0.5, 1.0, 1.5, 2.0]
+    assert proposition_1("linear", 100.0, 20.0, excesses=excesses) == 4 * (20 + 100) / 2 + 5.0
+
+
+def test_proposition_1_exceeds_the_linear_sum_by_half_the_difference_of_the_limits() -> None:
+    excesses = [0.5, 1.0, 1.5, 2.0]
+    exact = cumulative_bound("linear", 100.0, 20.0, excesses=excesses, clock="end")
+    assert proposition_1("linear", 100.0, 20.0, excesses=excesses) - exact == (100 - 20) / 2
+    exact = cumulative_bound("linear", 100.0, 20.0, excesses=excesses, clock="start")
+    assert proposition_1("linear", 100.0, 20.0, excesses=excesses) - exact == -(100 - 20) / 2
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+@pytest.mark.parametrize("curriculum", MEAN_WEIGHTS)
+@settings(max_examples=50, deadline=None)
+@given(deploy=st.floats(0.0, 50.0), relaxed=st.floats(0.0, 500.0), policies=st.integers(1, 400))
+def test_closed_forms_are_the_sums(
+    curriculum: str, clock: Clock, deploy: float, relaxed: float, policies: int
+) -> None:
+    closed = cumulative_bound(curriculum, deploy + relaxed, deploy, excesses=[0.0] * policies, clock=clock)
+    summed = summed_limits(curriculum, deploy + relaxed, deploy, policies=policies, clock=clock)
+    assert closed == pytest.approx(summed, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("curriculum", MEAN_WEIGHTS)
+@pytest.mark.parametrize("policies", [1, 2, 10, 333])
+def test_proposition_1_lies_between_the_two_clocks(curriculum: str, policies: int) -> None:
+    early, late = (weight_sum(curriculum, policies=policies, clock=clock) for clock in ("start", "end"))
+    assert late - 1e-9 <= policies * MEAN_WEIGHTS[curriculum] <= early + 1e-9
+
+
+@pytest.mark.parametrize("curriculum", ["none", "step", "linear", "cosine", "exponential"])
+def test_the_clock_of_a_trial_is_that_of_its_teacher(curriculum: str) -> None:
+    teacher = make_teacher(TeacherSpec(curriculum, {}, CostLimits((100.0,)), CostLimits((20.0,)), 700))
+    lesson, state = teacher.start()
+    limits = [lesson.limits[0]]
+    for update in range(1, 7):
+        lesson, state = teacher.step(state, ProgressReport(update, 100 * update, ()))
+        limits.append(lesson.limits[0])
+    assert sum(limits) == pytest.approx(
+        cumulative_bound(curriculum, 100.0, 20.0, excesses=[0.0] * 7, clock="start")
+    )
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+@pytest.mark.parametrize("curriculum", ["step", "linear", "cosine", "exponential", "dynamic"])
+def test_the_inverse_spends_the_budget_exactly(curriculum: str, clock: Clock) -> None:
+    excesses = [0.1 * b for b in range(50)]
+    train_limit = largest_train_limit(curriculum, 4000.0, 20.0, excesses=excesses, clock=clock)
+    assert cumulative_bound(curriculum, train_limit, 20.0, excesses=excesses, clock=clock) == pytest.approx(
+        4000.0
+    )
+    assert train_limit > 20.0
+
+
+def test_a_budget_without_slack_allows_d_d_only() -> None:
+    assert largest_train_limit("linear", 81.0, 20.0, excesses=[0.25] * 4, clock="end") == 20.0
+
+
+def test_d_t_does_not_matter_without_a_curriculum() -> None:
+    assert largest_train_limit("none", 81.0, 20.0, excesses=[0.25] * 4, clock="end") == math.inf
+
+
+def test_a_budget_below_that_of_d_d_is_refused() -> None:
+    with pytest.raises(ValueError) as error:
+        largest_train_limit("linear", 50.0, 20.0, excesses=[0.25] * 4, clock="end")
+    assert str(error.value) == (
+        "budget must be at least 81, the bound for d_t = d_d = 20 over 4 policies, got 50"
+    )
+
+
+def test_a_curriculum_without_a_bound_is_refused() -> None:
+    with pytest.raises(ValueError) as error:
+        proposition_1("unconstrained", 100.0, 20.0, excesses=[0.0])
+    assert str(error.value) == (
+        "only none, step, dynamic, linear, cosine, exponential have a bound before they have run, "
+        "got 'unconstrained'"
+    )
+
+
+@dataclass(frozen=True)
+class FiniteCMDP:
+    """Transitions [S, A, S], costs [S, A], first states [S], an old policy and a new one, both [S, A]."""
+
+    transitions: Floats
+    costs: Floats
+    first: Floats
+    old: Floats
+    new: Floats
+
+    @classmethod
+    def random(cls, seed: int) -> "FiniteCMDP":
+        """Four states, three actions; the new policy is the old one moved by a random amount."""
+        generator = np.random.default_rng(seed)
+        old, other = generator.dirichlet(np.ones(3), size=(2, 4))
+        mix = generator.choice([0.003, 0.03, 0.3])
+        return cls(
+            generator.dirichlet(np.full(4, 0.3), size=(4, 3)),
+            generator.random((4, 3)) * (generator.random((4, 3)) < 0.5),
+            generator.dirichlet(np.ones(4)),
+            old,
+            (1 - mix) * old + mix * other,
+        )
+
+    @property
+    def kl(self) -> Floats:
+        """KL(new || old), [S]."""
+        divergence: Floats = np.sum(self.new * np.log(self.new / self.old), axis=1)
+        return divergence
+
+    def moves(self, policy: Floats) -> Floats:
+        """The state transitions under a policy, [S, S]."""
+        moves: Floats = np.einsum("sa,sat->st", policy, self.transitions)
+        return moves
+
+
+@pytest.mark.parametrize("discount", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("seed", range(20))
+def test_lemma_1_holds_on_random_cmdps(seed: int, discount: float) -> None:
+    cmdp = FiniteCMDP.random(seed)
+
+    def values(policy: Floats) -> Floats:
+        per_state = np.sum(policy * cmdp.costs, axis=1)
+        solved: Floats = np.linalg.solve(np.eye(4) - discount * cmdp.moves(policy), per_state)
+        return solved
+
+    old_values = values(cmdp.old)
+    visits = np.linalg.solve(np.eye(4) - discount * cmdp.moves(cmdp.old).T, cmdp.first)  # sums to 1/(1-gamma)
+    advantages = cmdp.costs + discount * cmdp.transitions @ old_values - old_values[:, None]
+    drift = np.sum(cmdp.new * advantages, axis=1)
+    limit = cmdp.first @ old_values + visits @ drift  # the constraint of (2), active
+    excess = discounted_excess(
+        float((1 - discount) * visits @ cmdp.kl), float(np.abs(drift).max()), discount=discount
+    )
+    assert cmdp.first @ values(cmdp.new) <= worst_case_cost(float(limit), excess) + 1e-12
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 5, 30])
+@pytest.mark.parametrize("seed", range(20))
+def test_the_undiscounted_bound_holds_on_random_cmdps(seed: int, horizon: int) -> None:
+    cmdp = FiniteCMDP.random(seed)
+
+    def values(policy: Floats) -> Floats:
+        """Cost that remains from each step on, [H + 1, S]."""
+        remaining = np.zeros((horizon + 1, 4))
+        for t in reversed(range(horizon)):
+            remaining[t] = np.sum(policy * (cmdp.costs + cmdp.transitions @ remaining[t + 1]), axis=1)
+        return remaining
+
+    old_values = values(cmdp.old)
+    limit = cmdp.first @ old_values[0]
+    states, largest, mean_kl = cmdp.first, 0.0, 0.0
+    for t in range(horizon):
+        advantages = cmdp.costs + cmdp.transitions @ old_values[t + 1] - old_values[t][:, None]
+        drift = np.sum(cmdp.new * advantages, axis=1)
+        limit = limit + states @ drift
+        largest = max(largest, float(np.abs(drift).max()))
+        mean_kl += float(states @ cmdp.kl) / horizon
+        states = states @ cmdp.moves(cmdp.old)
+    excess = undiscounted_excess(mean_kl, largest, horizon=horizon)
+    assert cmdp.first @ values(cmdp.new)[0] <= worst_case_cost(float(limit), excess) + 1e-12
