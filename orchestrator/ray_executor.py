@@ -1,0 +1,419 @@
+"""Trials on Ray: Tune hands them to worker processes on one machine or many, and the files keep the truth.
+
+Tune is a scheduler that may die. Every run is a fresh Tune experiment over the specs it is given (never
+``Tuner.restore``); a Tune trial is one recrl trial, from wherever its own newest checkpoint stands; and Tune
+learns nothing of it but that it ended. A worker process runs one trial after the other, because a trial's
+result depends on its spec alone, and importing torch anew costs as much as a small trial.
+
+What fails, and what happens: a worker or its node dies, and Tune starts the trial again, up to
+``max_failures`` times; a trial's own code raises, and it is FAILED in its files and not tried again; the
+driver dies, and its workers with it.
+
+Assumes that every node sees the results folder under the same path. Leaves out growing with an elastic
+cluster beyond ``max_concurrent``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import secrets
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import ray
+from ray import tune
+from ray.exceptions import AuthenticationError, RayTaskError
+from ray.tune.search import BasicVariantGenerator
+
+from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.store import SweepStore
+from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
+
+STOP_QUESTION_SECONDS = 0.5
+OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
+LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
+
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_AIR_NEW_OUTPUT": "0",  # the new output speaks at verbosity 0, the old one does not
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    "TUNE_DISABLE_SIGINT_HANDLER": "1",  # the stop event is the one way to stop
+    "TUNE_GLOBAL_CHECKPOINT_S": "1e9",  # nobody restores Tune's own state
+    "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
+    "TUNE_WARN_THRESHOLD_S": "60",
+}
+WORKER = {
+    "OMP_NUM_THREADS": "1",
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+}
+
+logger = logging.getLogger("recrl.sweep")
+
+
+@dataclass(frozen=True)
+class RayExecutor:
+    """Runs trials side by side on Ray; an ``Executor``.
+
+    Attributes:
+        num_cpus: cores of the cluster that is started on this machine; all of them if None.
+        address: an existing cluster (``auto``, ``host:port``) to use instead.
+        cpus_per_trial: cores a trial takes, above 0; may be a fraction.
+        gpus_per_trial: GPUs a trial takes, at least 0; may be a fraction.
+        max_concurrent: trials at once, at least 1; if None, as many as fit when the run begins.
+        teacher: ``service`` for one actor that teaches the whole sweep, ``inline`` for a teacher in every
+            worker. The results are the same.
+        max_failures: how often a trial whose process died is started again, at least 0.
+        commit_seconds: wall seconds between a trial's checkpoints, above 0.
+    """
+
+    num_cpus: int | None = None
+    address: str | None = None
+    cpus_per_trial: float = 1.0
+    gpus_per_trial: float = 0.0
+    max_concurrent: int | None = None
+    teacher: Literal["service", "inline"] = "service"
+    max_failures: int = 3
+    commit_seconds: float = 20.0
+
+    def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
+        """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if it is.
+
+        Raises:
+            ClusterError: Ray cannot be started or reached, or lacks what one trial asks for.
+        """
+        if not specs or stop.is_set():
+            return
+        with _environment(QUIET | WORKER), self._cluster(), StopFile.open(store.folder) as stop_file:
+            self._run_on_cluster(specs, store, stop, stop_file)
+
+    def _cluster(self) -> AbstractContextManager[None]:
+        if ray.is_initialized():
+            return nullcontext()
+        return existing_cluster(self.address) if self.address else local_cluster(self.num_cpus)
+
+    def _run_on_cluster(
+        self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event, stop_file: StopFile
+    ) -> None:
+        queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
+        watch = _Watch(stop, stop_file, queue, store)
+        service_name = f"teacher-{secrets.token_hex(8)}" if self.teacher == "service" else ""
+        service = start_teacher_service(service_name) if service_name else None
+        with tempfile.TemporaryDirectory(prefix="recrl-tune-", ignore_cleanup_errors=True) as scratch:
+            tuner = tune.Tuner(
+                tune.with_resources(TuneTrial, {"cpu": self.cpus_per_trial, "gpu": self.gpus_per_trial}),
+                param_space={
+                    "spec": tune.grid_search([json.dumps(spec.to_json()) for spec in specs]),
+                    "sweep": str(store.folder),
+                    "stop_file": str(stop_file.path),
+                    "teacher_service": service_name,
+                    "commit_seconds": self.commit_seconds,
+                },
+                tune_config=tune.TuneConfig(
+                    search_alg=queue,
+                    reuse_actors=True,
+                    trial_name_creator=_tune_trial_id,
+                    trial_dirname_creator=_tune_trial_id,
+                ),
+                run_config=tune.RunConfig(
+                    storage_path=scratch,
+                    name="sweep",
+                    verbose=0,
+                    callbacks=[watch],
+                    stop=_StopWhenIdle(watch),
+                    failure_config=tune.FailureConfig(max_failures=self.max_failures),
+                    checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
+                ),
+            )
+            with _own_signal_handlers():
+                tuner.fit()
+        del service  # Ray ends an actor that nobody holds
+
+    def _slots(self) -> int:
+        """How many trials may run at once."""
+        resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        cpus, gpus = resources.get("CPU", 0.0), resources.get("GPU", 0.0)
+        fitting = [cpus / self.cpus_per_trial]
+        if self.gpus_per_trial:
+            fitting.append(gpus / self.gpus_per_trial)
+        slots = int(min(fitting) + 1e-9)
+        if self.address:  # an existing cluster may grow
+            return self.max_concurrent or max(1, slots)
+        if slots < 1:
+            raise ClusterError(
+                f"a trial asks for {self.cpus_per_trial:g} cores and {self.gpus_per_trial:g} GPUs, "
+                f"this cluster has {cpus:g} and {gpus:g}; ask for less or add machines"
+            )
+        return min(slots, self.max_concurrent or slots)
+
+
+class TuneTrial(tune.Trainable):
+    """A worker process, as Tune sees it; each of its trials is one long step.
+
+    Tune hears of a trial only at its end: a report blocks until the driver has taken it, and whoever wants
+    to know more reads the files.
+    """
+
+    def setup(self, config: dict[str, Any]) -> None:
+        """Get ready for the first trial."""
+        import torch  # noqa: PLC0415  (the driver, which imports this module too, does without)
+
+        torch.set_num_threads(1)
+        self._take(config)
+
+    def reset_config(self, new_config: dict[str, Any]) -> bool:
+        """Get ready for the next trial, in the same process."""
+        self._take(new_config)
+        return True
+
+    def step(self) -> dict[str, Any]:
+        """Run the trial to its end or until the sweep is stopped.
+
+        Raises:
+            TeacherUnavailableError: the teacher is gone; Tune tries the trial again.
+        """
+        from recrl.orchestrator.trial import run_recorded  # noqa: PLC0415  (imports torch)
+
+        if not self._stop_file.is_set():
+            run_recorded(
+                self._spec,
+                self._store.trial(self._spec),
+                should_stop=self._stop_file.is_set,
+                teacher=self._teacher,
+                commit_seconds=self._commit_seconds,
+            )
+        return {"done": True}
+
+    def _take(self, config: Mapping[str, Any]) -> None:
+        self._spec = TrialSpec.from_json(json.loads(config["spec"]))
+        sweep = Path(config["sweep"])
+        self._store = SweepStore(sweep.parent, sweep.name)
+        self._stop_file = StopFile(Path(config["stop_file"]))
+        self._commit_seconds: float = config["commit_seconds"]
+        name = config["teacher_service"]
+        self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
+
+
+class StopFile:
+    """How one run of a sweep tells its workers, on any node, to checkpoint and stop.
+
+    The file is empty as long as they are to go on; they stop when it says anything, or is gone. It is there
+    from the beginning because a network file system may remember for a minute that a file is absent,
+    whereas opening one asks the server.
+
+    Attributes:
+        path: the file, in the sweep's folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._answer = False
+        self._asked_at = float("-inf")
+
+    @classmethod
+    @contextmanager
+    def open(cls, folder: Path) -> Iterator[StopFile]:
+        """The stop file of a new run; whatever may be left of earlier runs is told to stop."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in folder.glob("stop-*"):
+            old.unlink(missing_ok=True)
+        stop_file = cls(folder / f"stop-{secrets.token_hex(4)}")
+        stop_file.path.touch()
+        try:
+            yield stop_file
+        finally:
+            stop_file.path.unlink(missing_ok=True)
+
+    def set(self) -> None:
+        """Tell the workers to stop."""
+        self.path.write_text("stop\n")
+
+    def is_set(self) -> bool:
+        """Whether to stop; looks at the file every ``STOP_QUESTION_SECONDS`` at most."""
+        if not self._answer and time.monotonic() >= self._asked_at + STOP_QUESTION_SECONDS:
+            self._asked_at = time.monotonic()
+            try:
+                self._answer = bool(self.path.read_bytes())
+            except FileNotFoundError:
+                self._answer = True
+        return self._answer
+
+
+class _Watch(tune.Callback):
+    """What the driver does beside scheduling: passes the stop event on, and records trials given up."""
+
+    def __init__(
+        self, stop: threading.Event, stop_file: StopFile, queue: BasicVariantGenerator, store: SweepStore
+    ) -> None:
+        self._stop = stop
+        self._stop_file = stop_file
+        self._queue = queue
+        self._store = store
+        self.stopped_and_idle = False
+
+    def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        """Look at the stop event; Tune calls this ten times a second or more."""
+        if self._stop.is_set():
+            if not self._queue.is_finished():
+                self._queue.set_finished()  # type: ignore[no-untyped-call]
+            self._stop_file.set()
+            self.stopped_and_idle = all(trial.status != "RUNNING" for trial in trials)
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Say that Tune starts a trial again."""
+        spec = TrialSpec.from_json(json.loads(trial.config["spec"]))
+        logger.warning("%s: its process failed; it starts again from its last checkpoint", spec.title)
+
+    def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
+        error = trial.get_pickled_error()
+        cause = error.cause if isinstance(error, RayTaskError) else error
+        files = self._store.trial(TrialSpec.from_json(json.loads(trial.config["spec"])))
+        if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
+            files.set_status(
+                TrialState.FAILED,
+                error=f"its process failed {trial.num_failures} times, "
+                f"the last time by {type(cause).__name__}: {_first_line(cause)}",
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Nothing: Tune pickles its callbacks to restore them, which nobody does, and events cannot be."""
+        return {}
+
+
+class _StopWhenIdle(tune.Stopper):
+    """Ends the experiment once the sweep is stopped and the last running trial has come to its end."""
+
+    def __init__(self, watch: _Watch) -> None:
+        self._watch = watch
+
+    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
+        return False
+
+    def stop_all(self) -> bool:
+        return self._watch.stopped_and_idle
+
+
+@contextmanager
+def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
+    """A Ray cluster on this machine, for as long as the context lasts, that strangers cannot use.
+
+    Ray listens on all interfaces whatever one asks for: its token keeps others out. Ray opens its own folder
+    to everybody on the machine: the one around it, which also holds the token, is only this user's.
+
+    Args:
+        num_cpus: cores it may use, at least 1; all of the machine's if None.
+
+    Raises:
+        ClusterError: Ray does not start.
+    """
+    with tempfile.TemporaryDirectory(
+        prefix="recrl-", dir=_short_folder(), ignore_cleanup_errors=True
+    ) as folder:
+        token_path = Path(folder, "token")
+        with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
+            file.write(_token())
+        with _environment(QUIET | WORKER | {"RAY_AUTH_TOKEN_PATH": str(token_path)}):
+            for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
+                os.environ.pop(name, None)  # Ray looks at its mode only where it sets it itself
+            with _connection(
+                "cannot start Ray on this machine",
+                address="local",
+                num_cpus=num_cpus,
+                include_dashboard=False,
+                object_store_memory=OBJECT_STORE_BYTES,
+                _temp_dir=f"{folder}/ray",
+            ):
+                yield
+
+
+@contextmanager
+def existing_cluster(address: str) -> Iterator[None]:
+    """A connection to a Ray cluster that somebody else runs.
+
+    Args:
+        address: ``auto`` or ``host:port``.
+
+    Raises:
+        ClusterError: there is none, or it does not know our token.
+    """
+    with _connection(
+        f"cannot use the Ray cluster at {address}", address=address, runtime_env={"env_vars": WORKER}
+    ):
+        yield
+
+
+@contextmanager
+def _connection(failure: str, **settings: Any) -> Iterator[None]:
+    try:
+        try:
+            # No public switch keeps Ray from printing a paragraph about every dead process.
+            ray._private.worker._worker_logs_enabled = False
+            with _own_signal_handlers():
+                ray.init(log_to_driver=False, logging_level=logging.ERROR, **settings)
+        except AuthenticationError as error:
+            raise ClusterError(
+                f"{failure}: it does not accept our token; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH "
+                "to the cluster's token file before starting"
+            ) from error
+        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+            raise ClusterError(f"{failure}: {_first_line(error)}") from error
+        yield
+    finally:
+        ray.shutdown()
+
+
+@contextmanager
+def _environment(changes: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables for a while; whatever is changed meanwhile is undone, also by Ray."""
+    before = dict(os.environ)
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+@contextmanager
+def _own_signal_handlers() -> Iterator[None]:
+    """Undo what Ray and Tune do to this process's signal handlers."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@cache
+def _token() -> str:
+    """This process's token for the clusters it starts: Ray reads a process's token only once."""
+    return secrets.token_hex(32)
+
+
+def _short_folder() -> str:
+    folder = tempfile.gettempdir()
+    return folder if len(folder) <= LONGEST_SOCKET_FOLDER - len("/recrl-12345678/ray") else "/tmp"
+
+
+def _tune_trial_id(trial: Any) -> str:
+    return str(trial.trial_id)
+
+
+def _first_line(error: BaseException | None) -> str:
+    return next(iter(str(error).splitlines()), "")

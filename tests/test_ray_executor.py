@@ -1,0 +1,262 @@
+"""A sweep on Ray leaves the bytes of an inline one, whoever is killed or stopped on the way."""
+
+import os
+import re
+import signal
+import stat
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+
+from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
+from recrl.orchestrator.executors import InlineExecutor
+from recrl.orchestrator.ray_executor import RayExecutor, StopFile, local_cluster
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.store import SweepStore
+from recrl.orchestrator.teacher_service import RayTeacher, start_teacher_service
+from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, TeacherSpec
+
+# Ray's driver leaves its log files and sockets to the garbage collector.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+LINEAR = TrialSpec(
+    task=Choice("two-state", {"horizon": 10}),
+    agent=Choice("ppo-lag", {"hidden_sizes": [8]}),
+    method=Choice("linear"),
+    train_limits=CostLimits((9.0,)),
+    deploy_limits=CostLimits((3.0,)),
+    train_steps=11 * 40,
+    deploy_steps=40,
+    num_envs=4,
+    rollout_steps=10,
+    evaluation_episodes=4,
+    seed=0,
+)
+DYNAMIC = replace(LINEAR, method=Choice("dynamic", {"window": 2}), agent=Choice("cpo", {"hidden_sizes": [8]}))
+SWEEP = (LINEAR, DYNAMIC, replace(LINEAR, seed=1), replace(DYNAMIC, seed=1))
+LONG = replace(LINEAR, train_steps=150 * 40, seed=2)
+BROKEN = replace(LINEAR, method=Choice("linear", {"windw": 8}))
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[None]:
+    with local_cluster(num_cpus=2):
+        yield
+
+
+@pytest.fixture(scope="module")
+def inline(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
+    """The undisturbed trials, one after the other in this process."""
+    store = SweepStore(tmp_path_factory.mktemp("inline"), "sweep")
+    InlineExecutor().run((*SWEEP, LONG), store, threading.Event())
+    return store
+
+
+def assert_equal_bytes(specs: Sequence[TrialSpec], store: SweepStore, expected: SweepStore) -> None:
+    for spec in specs:
+        ours, theirs = store.trial(spec), expected.trial(spec)
+        assert ours.record().status is TrialState.COMPLETE
+        assert ours.episodes_path.read_bytes() == theirs.episodes_path.read_bytes()
+        assert ours.events_path.read_bytes() == theirs.events_path.read_bytes()
+        assert ours.evaluation_path.read_bytes() == theirs.evaluation_path.read_bytes()
+
+
+@contextmanager
+def once(condition: Callable[[], bool], act: Callable[[], object]) -> Iterator[None]:
+    """Do something beside the body of the context, as soon as a condition holds."""
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.is_set():
+            if condition():
+                act()
+                return
+            over.wait(0.02)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.mark.usefixtures("cluster")
+def test_equal_bytes_in_reused_workers_and_one_failure_stops_nobody(
+    tmp_path: Path, inline: SweepStore, capfd: pytest.CaptureFixture[str]
+) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    RayExecutor().run((BROKEN, *SWEEP), store, threading.Event())
+    assert_equal_bytes(SWEEP, store, inline)
+    assert len({store.trial(spec).record().pid for spec in SWEEP}) <= 2
+    failed = store.trial(BROKEN).record()
+    assert failed.status is TrialState.FAILED
+    assert failed.attempt == 1
+    assert failed.error.startswith("ValidationError: ")
+    assert [path.name for path in store.folder.iterdir()] == ["trials"]
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_stopped_sweep_is_finished_by_the_next_run_with_other_workers(
+    tmp_path: Path, inline: SweepStore
+) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    stop = threading.Event()
+    stopped_at: list[float] = []
+
+    def ask_to_stop() -> None:
+        stopped_at.append(time.monotonic())
+        stop.set()
+
+    with once(lambda: store.trial(LONG).record().update >= 20, ask_to_stop):
+        RayExecutor().run((LONG, *SWEEP), store, stop)
+    assert time.monotonic() - stopped_at[0] < 20.0
+    record = store.trial(LONG).record()
+    assert record.status is TrialState.WAITING
+    assert 20 <= record.update < LONG.num_updates
+    left = [spec for spec in (*reversed(SWEEP), LONG) if not store.trial(spec).record().status.is_finished]
+    RayExecutor(max_concurrent=1, teacher="inline").run(left, store, threading.Event())
+    assert_equal_bytes((LONG, *SWEEP), store, inline)
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_killed_worker_and_a_killed_teacher_leave_no_trace(tmp_path: Path, inline: SweepStore) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    killed: list[int] = []
+
+    def kill() -> None:
+        [service] = ray.util.list_named_actors(all_namespaces=True)
+        teacher = ray.get_actor(service["name"], namespace=service["namespace"])
+        os.kill(process_of(teacher), signal.SIGKILL)
+        killed.append(store.trial(LONG).record().pid)
+        os.kill(killed[0], signal.SIGKILL)
+
+    with once(lambda: store.trial(LONG).record().update >= 40, kill):
+        RayExecutor(commit_seconds=0.1).run([LONG], store, threading.Event())
+    assert killed
+    assert store.trial(LONG).record().attempt == 2
+    assert store.trial(LONG).record().pid not in killed
+    assert_equal_bytes([LONG], store, inline)
+
+
+def process_of(actor: Any) -> int:
+    process = ray.get(actor.__ray_call__.remote(lambda _: os.getpid()))
+    assert isinstance(process, int)
+    return process
+
+
+def lessons(teacher: Teacher, reports: Sequence[ProgressReport]) -> Iterator[Lesson]:
+    lesson, state = teacher.start()
+    yield lesson
+    for report in reports:
+        lesson, state = teacher.step(state, report)
+        yield lesson
+
+
+def curriculum(cost: float) -> tuple[TeacherSpec, list[ProgressReport]]:
+    """A dynamic teacher and 20 updates of 4 episodes that cost the same: it converges and steps down."""
+    spec = TeacherSpec("dynamic", {"window": 2}, CostLimits((9.0,)), CostLimits((3.0,)), train_steps=800)
+    reports = [
+        ProgressReport(
+            update=update,
+            env_steps=40 * update,
+            episodes=tuple(
+                EpisodeStats(
+                    index=4 * update - 4 + episode,
+                    phase=Phase.TRAINING,
+                    end_step=40 * update,
+                    length=10,
+                    episode_return=5.0,
+                    costs=(cost,),
+                    limits=CostLimits((9.0,)),
+                    noise=0.0,
+                )
+                for episode in range(4)
+            ),
+        )
+        for update in range(1, 21)
+    ]
+    return spec, reports
+
+
+@pytest.mark.usefixtures("cluster")
+def test_inline_own_shared_and_killed_teachers_give_identical_limits() -> None:
+    expected = [list(lessons(make_teacher(spec), reports)) for spec, reports in map(curriculum, (6.0, 4.0))]
+    assert len({lesson.limits for lesson in expected[0]}) > 2
+
+    def own(cost: float) -> list[Lesson]:
+        spec, reports = curriculum(cost)
+        return list(lessons(RayTeacher(spec, start_teacher_service(f"own-{cost}")), reports))
+
+    assert [own(6.0), own(4.0)] == expected
+
+    service = start_teacher_service("shared")
+    pupils = [lessons(RayTeacher(spec, service), reports) for spec, reports in map(curriculum, (6.0, 4.0))]
+    shared: list[tuple[Lesson, ...]] = []
+    for update, pair in enumerate(zip(*pupils, strict=True)):
+        shared.append(pair)
+        if update == 10:
+            os.kill(process_of(service), signal.SIGKILL)
+    assert shared == list(zip(*expected, strict=True))
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_teachers_own_error_comes_through_and_a_lost_teacher_is_told_apart() -> None:
+    spec, reports = curriculum(6.0)
+    service = start_teacher_service("lost")
+    teacher = RayTeacher(spec, service, patience_seconds=0.1)
+    _, state = teacher.start()
+    with pytest.raises(ValueError) as inline_error:
+        make_teacher(spec).step(state, reports[5])
+    with pytest.raises(type(inline_error.value), match=f"^{re.escape(str(inline_error.value))}$"):
+        teacher.step(state, reports[5])
+    ray.kill(service)
+    with pytest.raises(TeacherUnavailableError, match=r"has not answered for 0\.1 seconds"):
+        teacher.step(state, reports[0])
+
+
+@pytest.mark.usefixtures("cluster")
+def test_what_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        ClusterError,
+        match=r"^a trial asks for 3 cores and 0 GPUs, this cluster has 2 and 0; ask for less or add ",
+    ):
+        RayExecutor(cpus_per_trial=3).run(SWEEP, SweepStore(tmp_path, "sweep"), threading.Event())
+
+
+@pytest.mark.usefixtures("cluster")
+def test_only_this_user_can_read_the_clusters_token() -> None:
+    token = Path(os.environ["RAY_AUTH_TOKEN_PATH"])
+    assert os.environ["RAY_AUTH_MODE"] == "token"
+    assert stat.S_IMODE(token.stat().st_mode) == 0o600
+    assert stat.S_IMODE(token.parent.stat().st_mode) == 0o700
+
+
+@pytest.mark.usefixtures("cluster")
+def test_rays_signal_handlers_do_not_replace_ours() -> None:
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_stop_file_tells_its_own_run_and_all_earlier_ones(tmp_path: Path) -> None:
+    with StopFile.open(tmp_path) as earlier:
+        assert not StopFile(earlier.path).is_set()
+        with StopFile.open(tmp_path) as stop_file:
+            assert StopFile(earlier.path).is_set()
+            assert not StopFile(stop_file.path).is_set()
+            stop_file.set()
+            assert StopFile(stop_file.path).is_set()
+    assert list(tmp_path.iterdir()) == []
