@@ -286,12 +286,15 @@ def short_steps(steps: float) -> str:
 
 
 def _panel_title(trials: pd.DataFrame, updates: pd.DataFrame, *, separator: str = ": ") -> str:
-    """Task, number of seeds (a range, if methods differ) and steps."""
-    counts = updates.groupby("method", observed=True)["seed"].nunique()
-    low, high = int(counts.min()), int(counts.max())
-    seeds = f"{high}" if low == high else f"{low}–{high}"
+    """Task, number of seeds (a range, if not every method has as many at the end) and steps."""
+    seeds = updates.groupby("method", observed=True)["seed"]
+    ended = updates[updates["end_step"] >= trials["total_steps"].max()]
+    finished = ended.groupby("method", observed=True)["seed"].nunique()
+    high = int(seeds.nunique().max())
+    low = min(int(finished.get(method, 0)) for method in seeds.nunique().index)
+    count = f"{high}" if low == high else f"{low}–{high}"
     task, total = trials["task"].iloc[0], short_steps(float(trials["total_steps"].max()))
-    return f"{task}{separator}{seeds} seed{'s' if high > 1 else ''}, {total} steps"
+    return f"{task}{separator}{count} seed{'s' if high > 1 else ''}, {total} steps"
 
 
 def _column_titles(num_costs: int) -> list[str]:

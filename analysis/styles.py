@@ -109,13 +109,14 @@ def save(figure: Figure, folder: Path, stem: str) -> list[Path]:
     """Write a figure as PDF (vector) and PNG (200 dpi); equal figures give equal bytes.
 
     Args:
-        figure: drawn within ``context``.
+        figure: made within ``context``.
         folder: made if it is not there.
         stem: of the two file names.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pdf, png = folder / f"{stem}.pdf", folder / f"{stem}.png"
     blank = {"Creator": "recrl", "Producer": None, "CreationDate": None}
-    figure.savefig(pdf, metadata=blank)
-    figure.savefig(png, dpi=PNG_DPI, metadata={"Software": None})
+    with context():  # ticks are only made now
+        figure.savefig(pdf, metadata=blank)
+        figure.savefig(png, dpi=PNG_DPI, metadata={"Software": None})
     return [pdf, png]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recrl.analysis.frames import Sweep, load
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialWriter
@@ -178,5 +179,11 @@ def made_up_sweep(tmp_path: Path) -> Callable[..., SweepStore]:
 
 @pytest.fixture(scope="session")
 def finished_sweep(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
-    """A complete sweep: 2 tasks, 2 agents, 5 methods, 3 seeds."""
-    return MadeUpSweep().write(tmp_path_factory.mktemp("runs"))
+    """A complete sweep on disk: 2 tasks, 2 agents, 3 methods, 3 seeds."""
+    return MadeUpSweep(methods=("none", "linear", "dynamic")).write(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="session")
+def finished(finished_sweep: SweepStore) -> Sweep:
+    """The frames of ``finished_sweep``."""
+    return load(finished_sweep)
