@@ -95,7 +95,7 @@ class DualSolution:
         case: which problem was solved.
         gradient_weight: of v; 1 / lam, or 0 in recovery.
         constraint_weights: of the w_i, [k]; nu_i / lam.
-        multipliers: nu, [k], at least 0; NaN in recovery, where they have no meaning.
+        multipliers: nu, [k], at least 0; NaN where lam is infinite and in recovery.
         recovered: index of the constraint that recovery goes down, or None.
     """
 
@@ -141,7 +141,10 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
     gradient_weight = float(np.sqrt(slack / remaining)) if has_gradient else 0.0
     weights, multipliers = np.zeros_like(problem.mixed), np.zeros_like(problem.mixed)
     weights[index] = to_meet - gradient_weight * along
-    multipliers[index] = to_meet / gradient_weight - along if has_gradient else -along
+    if not has_gradient:
+        multipliers[index] = -along  # lam = 0
+    else:  # lam is infinite where the face has only one point
+        multipliers[index] = to_meet / gradient_weight - along if gradient_weight > 0.0 else np.nan
     case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
     return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), None)
 

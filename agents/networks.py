@@ -164,7 +164,7 @@ class TanhStack:
         """
         moved = torch.baddbmm(change[1], activations[0], change[0])
         for layer in range(1, len(self.weights)):
-            moved.mul_(1.0 - activations[layer].square())
+            moved.addcmul_(moved * activations[layer], activations[layer], value=-1.0)
             moved = torch.baddbmm(change[2 * layer + 1], moved, self.weights[layer]).baddbmm_(
                 activations[layer], change[2 * layer]
             )
@@ -185,7 +185,7 @@ class TanhStack:
             torch.sum(slope, dim=1, keepdim=True, out=by_bias)
             if layer > 0:
                 slope = torch.bmm(slope, self.weights[layer].transpose(1, 2))
-                slope.mul_(1.0 - activations[layer].square())
+                slope.addcmul_(slope * activations[layer], activations[layer], value=-1.0)
 
 
 class Adam:

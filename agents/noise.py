@@ -18,6 +18,8 @@ import numpy as np
 from recrl.environments.cmdp import Floats
 
 BISECTIONS = 60
+# Off-greedy masses closer than this are equal; a uniform policy is then left as it is.
+ROUNDING = 1e-12
 
 
 def off_greedy_mass(logits: Floats) -> float:
@@ -41,7 +43,7 @@ def matching_scale(logits: Floats, noise: float) -> float:
     low, high = 0.0, 1.0
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        if off_greedy_mass(middle * logits) > target:
+        if off_greedy_mass(middle * logits) >= target - ROUNDING:
             low = middle
         else:
             high = middle

@@ -12,7 +12,10 @@ from torch import Tensor
 
 from recrl.agents.networks import FlatParameters
 
+# Of a system scaled to a right-hand side of length 1.
 CONVERGED_SQUARED_RESIDUAL = 1e-10
+# A right-hand side shorter than this is nothing but rounding.
+VANISHED = 1e-15
 
 
 def conjugate_gradient(metric: Callable[[Tensor], Tensor], target: Tensor, *, iterations: int) -> Tensor:
@@ -26,13 +29,15 @@ def conjugate_gradient(metric: Callable[[Tensor], Tensor], target: Tensor, *, it
     Returns:
         x, [P].
     """
+    length = float(torch.linalg.vector_norm(target))
     solution = torch.zeros_like(target)
-    residual = target.clone()
+    if length < VANISHED:
+        return solution
+    residual = target / length  # squares of a saturated policy's gradients leave the range of float32
     direction = residual.clone()
     squared = float(torch.dot(residual, residual))
-    enough = CONVERGED_SQUARED_RESIDUAL * squared
     for _ in range(iterations):
-        if squared <= enough:
+        if squared <= CONVERGED_SQUARED_RESIDUAL:
             break
         product = metric(direction)
         step = squared / float(torch.dot(direction, product))
@@ -40,7 +45,7 @@ def conjugate_gradient(metric: Callable[[Tensor], Tensor], target: Tensor, *, it
         residual.sub_(product, alpha=step)
         previous, squared = squared, float(torch.dot(residual, residual))
         direction.mul_(squared / previous).add_(residual)
-    return solution
+    return solution.mul_(length)
 
 
 def backtrack(

@@ -1,0 +1,186 @@
+"""What every student promises, whatever its algorithm (``recrl.agents.agent.Agent``)."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recrl.agents.agent import Agent, Rollout
+from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
+from recrl.agents.errors import DivergedError
+from recrl.agents.registry import AGENTS, make_agent
+from recrl.environments.cmdp import Floats
+from recrl.environments.registry import make_vector
+from recrl.orchestrator.checkpoint import decode, encode
+
+TASKS = {"two-state": 3.0, "two-state-2": 3.0, "continuous-bandit": 2.5}
+OPTIONS = {"hidden_sizes": [16, 16], "critic_steps": 5}
+FINITE, SEVERAL_UPDATES = 3.0, 4
+
+
+class Lessons:
+    """A student with its task, advanced update by update."""
+
+    def __init__(self, agent: str, task: str, options: dict[str, Any] | None = None) -> None:
+        environments = make_vector(task, 4)
+        self.num_costs = environments.cmdp.num_costs
+        self.agent: Agent = make_agent(
+            agent, environments.cmdp, OPTIONS | (options or {}), np.random.SeedSequence(7)
+        )
+        self.collector = Collector(environments, num_steps=20)
+        self.collector.reset(seed=1)
+        self.generator = np.random.default_rng(2)
+
+    def collect(self) -> tuple[Rollout, tuple[FinishedEpisode, ...]]:
+        return self.collector.collect(self.agent, self.generator)
+
+    def limits(self, value: float = FINITE) -> Floats:
+        return np.full(self.num_costs, value)
+
+    def update(self, limit: float = FINITE) -> dict[str, float]:
+        rollout, episodes = self.collect()
+        return self.agent.update(rollout, episode_costs(episodes, self.num_costs), self.limits(limit))
+
+
+def flattened(tree: Any) -> list[Any]:
+    """The leaves of a state, arrays as bytes."""
+    if isinstance(tree, dict):
+        return [leaf for key in sorted(tree) for leaf in (key, *flattened(tree[key]))]
+    return [tree.tobytes() if isinstance(tree, np.ndarray) else tree]
+
+
+every_agent = pytest.mark.parametrize("agent", AGENTS)
+every_task = pytest.mark.parametrize("task", TASKS)
+
+
+@every_agent
+@every_task
+def test_every_update_returns_the_same_metrics_and_no_infinity(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    keys = set()
+    for limit in (FINITE, math.inf, 0.0, 100.0):
+        metrics = lessons.update(limit)
+        assert not any(math.isinf(value) for value in metrics.values())
+        keys.add(tuple(sorted(metrics)))
+    rollout, _ = lessons.collect()
+    none_finished = lessons.agent.update(rollout, np.empty((0, lessons.num_costs)), lessons.limits())
+    keys.add(tuple(sorted(none_finished)))
+    assert len(keys) == 1
+    for index in range(lessons.num_costs):
+        assert {f"multiplier_{index}", f"cost_gap_{index}", f"value_loss_cost_{index}"} <= set(none_finished)
+    assert {"kl", "entropy", "policy_steps", "surrogate_reward", "value_loss_reward"} <= set(none_finished)
+
+
+@every_agent
+@every_task
+def test_resumed_is_uninterrupted_bit_for_bit(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    for _ in range(SEVERAL_UPDATES):
+        lessons.update()
+    resumed = Lessons(agent, task)
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    for _ in range(SEVERAL_UPDATES):
+        rollout, episodes = lessons.collect()
+        costs = episode_costs(episodes, lessons.num_costs)
+        expected = lessons.agent.update(rollout, costs, lessons.limits())
+        found = resumed.agent.update(rollout, costs, lessons.limits())
+        assert repr(found) == repr(expected)
+    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
+
+
+@every_agent
+def test_equal_seeds_give_equal_bytes(agent: str) -> None:
+    first, second = Lessons(agent, "two-state"), Lessons(agent, "two-state")
+    for lessons in (first, second):
+        for _ in range(SEVERAL_UPDATES):
+            lessons.update()
+    assert flattened(first.agent.state_dict()) == flattened(second.agent.state_dict())
+
+
+def test_every_student_begins_with_the_same_policy() -> None:
+    policies = [Lessons(agent, "two-state").agent.state_dict()["policy"] for agent in AGENTS]
+    for policy in policies[1:]:
+        np.testing.assert_array_equal(policy, policies[0])
+
+
+@every_agent
+@every_task
+def test_the_state_is_a_copy(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    state = lessons.agent.state_dict()
+    before = flattened(state)
+    lessons.update()
+    assert flattened(state) == before
+
+
+@every_agent
+@every_task
+def test_actions_have_the_shape_and_type_of_the_seam(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    rollout, _ = lessons.collect()
+    observations = rollout.observations[0]
+    for actions in (
+        lessons.agent.act(observations, np.random.default_rng(0)),
+        lessons.agent.act_greedily(observations),
+    ):
+        gaussian = task == "continuous-bandit"
+        assert actions.shape == ((4, 1) if gaussian else (4,))
+        assert actions.dtype == np.dtype(np.float32 if gaussian else np.int64)
+
+
+@every_agent
+@every_task
+def test_the_student_knows_no_limit_of_its_own(agent: str, task: str) -> None:
+    one, other = Lessons(agent, task), Lessons(agent, task)
+    rollout, episodes = one.collect()
+    costs = episode_costs(episodes, one.num_costs)
+    one.agent.update(rollout, costs, one.limits(1.0))
+    other.agent.update(rollout, costs, other.limits(2.0))
+    one.agent.load_state_dict(other.agent.state_dict())
+    assert repr(one.agent.update(rollout, costs, one.limits(2.0))) == repr(
+        other.agent.update(rollout, costs, other.limits(2.0))
+    )
+
+
+@every_agent
+@every_task
+def test_noise_returns_the_same_metrics_and_keeps_the_student_learning(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    lessons.update()
+    rollout, _ = lessons.collect()
+    rows = rollout.observations.reshape(-1, rollout.observations.shape[-1])
+    keys = {tuple(lessons.agent.add_noise(noise, rows)) for noise in (0.1, 1.0)}
+    assert keys == {("noise_scale", "randomness_before", "randomness_after")}
+    assert math.isfinite(lessons.update()["kl"])
+
+
+@every_agent
+def test_a_reward_that_is_not_a_number_is_named(agent: str) -> None:
+    lessons = Lessons(agent, "two-state")
+    rollout, episodes = lessons.collect()
+    rewards = rollout.rewards.copy()
+    rewards[0, 0] = math.nan
+    with pytest.raises(DivergedError, match="rewards and costs must be finite, got 1 of 160 that are not"):
+        lessons.agent.update(replace(rollout, rewards=rewards), episode_costs(episodes, 1), lessons.limits())
+
+
+@every_agent
+def test_parameters_that_diverge_are_named(agent: str) -> None:
+    lessons = Lessons(agent, "two-state")
+    state = lessons.agent.state_dict()
+    state["critics"] = np.full_like(state["critics"], np.nan)
+    lessons.agent.load_state_dict(state)
+    with pytest.raises(DivergedError, match="must be finite, got"):
+        lessons.update()
+
+
+@every_agent
+@pytest.mark.parametrize("task", ["two-state", "two-state-2"])
+def test_evaluating_repeated_observations_once_changes_only_the_speed(agent: str, task: str) -> None:
+    compact, plain = Lessons(agent, task), Lessons(agent, task, {"compaction": False})
+    for _ in range(2):
+        found, expected = compact.update(), plain.update()
+        for key, value in expected.items():
+            assert found[key] == pytest.approx(value, rel=2e-3, abs=2e-4, nan_ok=True), key

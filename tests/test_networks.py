@@ -1,0 +1,139 @@
+"""Networks differentiated by hand against PyTorch's automatic differentiation, and Adam against PyTorch's."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from recrl.agents.networks import (
+    INITIALISERS,
+    Adam,
+    Critics,
+    FlatParameters,
+    NetworkForm,
+    TanhStack,
+    orthogonal,
+    xavier,
+)
+
+SIZES = (3, 5, 4, 2)
+
+
+@pytest.fixture
+def double_precision() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def stack_of(num_networks: int, seed: int = 0) -> tuple[FlatParameters, TanhStack]:
+    parameters = FlatParameters(TanhStack.shapes(num_networks, SIZES))
+    stack = TanhStack(parameters, len(SIZES) - 1)
+    stack.initialise(orthogonal, 1.0, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed + 1)
+    for bias in stack.biases:
+        bias.normal_(generator=generator)
+    return parameters, stack
+
+
+def random_rows(count: int = 7, size: int = 3) -> Tensor:
+    return torch.randn(count, size, generator=torch.Generator().manual_seed(5))
+
+
+def one_by_one(flat: Tensor, parameters: FlatParameters, rows: Tensor) -> Tensor:
+    """The outputs of each network evaluated on its own, as a differentiable function of all parameters."""
+    tensors = parameters.pieces(flat)
+    outputs = []
+    for network in range(len(tensors[0])):
+        hidden = rows
+        for layer in range(0, len(tensors), 2):
+            hidden = hidden @ tensors[layer][network] + tensors[layer + 1][network]
+            if layer < len(tensors) - 2:
+                hidden = torch.tanh(hidden)
+        outputs.append(hidden)
+    return torch.stack(outputs)
+
+
+@pytest.mark.usefixtures("double_precision")
+@pytest.mark.parametrize("num_networks", [1, 3])
+def test_a_stack_is_its_networks_evaluated_one_by_one(num_networks: int) -> None:
+    parameters, stack = stack_of(num_networks)
+    rows = random_rows()
+    torch.testing.assert_close(stack.activations(rows)[-1], one_by_one(parameters.values, parameters, rows))
+
+
+@pytest.mark.usefixtures("double_precision")
+@pytest.mark.parametrize("num_networks", [1, 3])
+def test_both_products_with_the_jacobian_are_automatic_differentiations(num_networks: int) -> None:
+    parameters, stack = stack_of(num_networks)
+    rows = random_rows()
+    change = torch.randn(len(parameters.values), generator=torch.Generator().manual_seed(2))
+    slope = torch.randn(num_networks, 7, 2, generator=torch.Generator().manual_seed(3))
+    jacobian = torch.autograd.functional.jacobian(  # type: ignore[no-untyped-call]
+        lambda flat: one_by_one(flat, parameters, rows), parameters.values
+    )
+    activations = stack.activations(rows)
+    moved = stack.output_change(activations, parameters.pieces(change))
+    torch.testing.assert_close(moved, jacobian @ change)
+    stack.pull_back(activations, slope)
+    torch.testing.assert_close(parameters.gradient, torch.einsum("cuo,cuop->p", slope, jacobian))
+
+
+@pytest.mark.usefixtures("double_precision")
+def test_the_critics_gradient_is_that_of_their_weighted_squared_errors() -> None:
+    critics = Critics(3, 1, NetworkForm((5, 4), xavier), torch.Generator().manual_seed(0))
+    rows = random_rows()
+    weights = torch.arange(1.0, 8.0) / 28.0
+    targets = torch.randn(2, 7, generator=torch.Generator().manual_seed(1))
+    flat = critics.parameters.values.clone().requires_grad_()
+    values = one_by_one(flat, critics.parameters, rows)[..., 0]
+    expected = ((values - targets).square() * weights).sum(dim=1)
+    losses = critics.differentiate(rows, weights, targets)
+    torch.testing.assert_close(losses, expected.detach())
+    torch.testing.assert_close(critics.parameters.gradient, torch.autograd.grad(expected.sum(), flat)[0])
+
+
+def test_adam_is_pytorchs() -> None:
+    parameters, _ = stack_of(2)
+    reference = torch.nn.Parameter(parameters.values.clone())
+    expected, ours = torch.optim.Adam([reference], lr=0.01), Adam(parameters, 0.01)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(30):
+        gradient = torch.randn(len(reference), generator=generator)
+        reference.grad = gradient.clone()
+        parameters.gradient.copy_(gradient)
+        expected.step()
+        ours.step()
+    torch.testing.assert_close(parameters.values, reference.detach(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", INITIALISERS)
+def test_the_generator_alone_decides_the_weights(name: str) -> None:
+    weights = [torch.empty(4, 6) for _ in range(3)]
+    for weight, seed in zip(weights, (1, 1, 2), strict=True):
+        INITIALISERS[name](weight, torch.Generator().manual_seed(seed))
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+def test_orthogonal_weights_have_gain_root_two() -> None:
+    weight = torch.empty(4, 6)
+    orthogonal(weight, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(weight @ weight.T, 2.0 * torch.eye(4))
+
+
+def test_xavier_weights_are_uniform_within_their_bound() -> None:
+    weight = torch.empty(200, 100)
+    xavier(weight, torch.Generator().manual_seed(0))
+    bound = (6.0 / 300.0) ** 0.5
+    assert float(weight.abs().max()) <= bound
+    assert float(weight.std()) == pytest.approx(bound / 3.0**0.5, rel=0.02)
+
+
+def test_parameters_of_another_network_are_refused() -> None:
+    parameters, _ = stack_of(1)
+    message = "the saved network has 3 parameters, this one 54: was it built with other options\\?"
+    with pytest.raises(ValueError, match=message):
+        parameters.load(np.zeros(3, dtype=np.float32))
