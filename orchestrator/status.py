@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -11,8 +13,9 @@ from enum import StrEnum
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialRecord
 
-# A trial says every few seconds that it lives; one that has been silent for so long has died.
-SILENCE_SECONDS = 60.0
+# A trial says after its updates that it lives, and an update of big networks takes a minute or two; one that
+# has been silent for so long has died.
+SILENCE_SECONDS = 300.0
 
 
 class Standing(StrEnum):
@@ -116,7 +119,7 @@ def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None
 
 
 def standing_of(record: TrialRecord, *, now: float) -> Standing:
-    """Where a trial stands at a time: its status, unless its silence says otherwise."""
+    """Where a trial stands at a time: its status, unless it died without a word."""
     match record.status:
         case TrialState.COMPLETE:
             return Standing.COMPLETE
@@ -126,4 +129,17 @@ def standing_of(record: TrialRecord, *, now: float) -> Standing:
             return Standing.STOPPED if record.attempt else Standing.WAITING
         case TrialState.RUNNING:
             silent = now - record.heartbeat > SILENCE_SECONDS
-            return Standing.INTERRUPTED if silent else Standing.RUNNING
+            return Standing.INTERRUPTED if silent or _has_no_process(record) else Standing.RUNNING
+
+
+def _has_no_process(record: TrialRecord) -> bool:
+    """Whether the trial's process was on this machine and is gone."""
+    if record.host != socket.gethostname():
+        return False
+    try:
+        os.kill(record.pid, 0)  # signal 0 only asks
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        pass  # somebody else's process, so it is there
+    return False

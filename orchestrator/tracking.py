@@ -48,6 +48,7 @@ from typing import TYPE_CHECKING, Any
 
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.status import Standing, standing_of
 from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
 from recrl.orchestrator.tracking_points import (
     Point,
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
 
 BATCH = 1_000  # metrics of a request; MLflow takes no more, and a row costs least in a full one
 MAX_ERROR = 5_000  # characters of a failed trial's error
-STALE_SECONDS = 300.0  # a heartbeat comes after every update, and updates of big networks take a minute
 POLITENESS = 10  # added to the mirror's nice value: about a tenth of a core that a trial also wants
 LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is away
 ORPHAN_SECONDS = 15.0  # trials outlive a killed driver by some seconds; the last pass waits for them
@@ -88,13 +88,26 @@ ENVIRONMENT = {
 VIEW_STATE = {
     "groupBy": {
         "aggregateFunction": "average",
-        "groupByKeys": [{"mode": "param", "groupByData": name} for name in ("task", "agent", "method")],
+        "groupByKeys": [{"mode": "tag", "groupByData": "recrl.group"}],
     },
     "runsHiddenMode": "SHOW_ALL",
     "selectedColumns": [
         *(f"params.`{name}`" for name in ("task", "agent", "method", "seed")),
         *(f"metrics.`{name}`" for name in ("summary/deploy_return", "summary/deploy_cost_0")),
     ],
+    "compareRunCharts": [],
+    "compareRunSections": [
+        {
+            "uuid": f"recrl-{name}",
+            "name": name,
+            "display": True,
+            "isReordered": False,
+            "deleted": False,
+            "isGenerated": True,
+        }
+        for name in ("train", "curriculum", "deploy", "summary", "evaluation", "student", "perf")
+    ],
+    "isAccordionReordered": True,
 }
 
 
@@ -155,7 +168,7 @@ def sync(store: SweepStore, uri: str, *, rebuild: bool = False) -> SyncReport:
     Args:
         store: the sweep.
         uri: of ``tracking_uri``.
-        rebuild: delete what MLflow has of the sweep and send everything anew, the drawn figures included.
+        rebuild: delete what MLflow has of the sweep and send everything anew.
 
     Returns:
         What was done, or why it could not be: nothing is raised when MLflow is away.
@@ -229,14 +242,27 @@ class _View:
         if rebuild:
             for run_id in self._runs.values():
                 self._delete_run(run_id)
-            for path in self._folder.glob("trial-*.json"):
-                path.unlink()
+            for path in (self._parent_path, *self._folder.glob("trial-*.json")):
+                path.unlink(missing_ok=True)
             self._runs = {}
         self._positions: dict[str, Position] = {}
-        self._parent_shown: Mapping[str, Any] = {}
-        self.parent_run_id = self._runs.get("") or self._create_parent()
-        if rebuild and store.figures_folder.is_dir():
-            self.send_figures(sorted(path for path in store.figures_folder.iterdir() if path.is_file()))
+        found = self._runs.get("")
+        parent = _read_position(self._parent_path)
+        if parent is None or parent.run_id != found:
+            parent = Position(found or self._create_parent())
+        self._parent = parent
+        if found is None:  # somebody may have deleted the parent alone
+            for run_id in self._runs.values():
+                self.client.set_tag(run_id, "mlflow.parentRunId", parent.run_id)
+
+    @property
+    def parent_run_id(self) -> str:
+        """The sweep's own run."""
+        return self._parent.run_id
+
+    @property
+    def _parent_path(self) -> Path:
+        return self._folder / "sweep.json"
 
     def show_trial(self, trial: TrialStore, *, live: bool) -> int:
         """Bring the trial's run up to date; returns the number of points sent."""
@@ -263,45 +289,40 @@ class _View:
         metrics = [Metric(point.key, point.value, point.milliseconds, point.step) for point in new_points]
         for start in range(0, len(metrics), BATCH):
             self.client.log_batch(position.run_id, metrics=metrics[start : start + BATCH])
-        position = self._send_artifacts(trial, record, position)
+        position = self._send_results(trial, record, position)
         self._send_state(record, status, position)
         self._save(trial, replace(position, shown=shown))
         return len(metrics)
 
     def show_sweep(self, *, live: bool) -> None:
-        """Bring the parent run up to date: its note, its status and the grid."""
+        """Bring the parent run up to date: its note, its status, the grid and the figures."""
         from mlflow.entities import RunTag  # noqa: PLC0415
 
         records = {trial.folder.name: trial.record() for trial in self.store.trials()}
-        started = {name: record for name, record in records.items() if record.attempt}
-        names = {spec.folder_name for spec in self.store.specs()} | set(records)
-        statuses = Counter(run_status(record, live=live) for record in started.values())
-        counts = {
-            "complete": statuses["FINISHED"],
-            "failed": statuses["FAILED"],
-            "running": statuses["RUNNING"],
-            "stopped": statuses["KILLED"] + statuses["SCHEDULED"],
-            "not started": len(names) - len(started),
+        records |= {
+            spec.folder_name: TrialRecord() for spec in self.store.specs() if spec.folder_name not in records
         }
+        counts = Counter(standing_of(record, now=time.time()) for record in records.values())
         status = _sweep_status(counts, live=live)
-        grid = self.store.grid_path
-        changed = grid.stat().st_mtime_ns if grid.exists() else 0
-        shown = {"status": status, "counts": counts, "grid": changed}
-        if shown == self._parent_shown:
-            return
-        text = note(self.store.name, counts, self._summaries())
-        self.client.log_batch(self.parent_run_id, tags=[RunTag("mlflow.note.content", text)])
-        if changed != self._parent_shown.get("grid", 0):
-            self.client.log_artifact(self.parent_run_id, str(grid))
-        if status != self._parent_shown.get("status"):
-            last = max((record.heartbeat for record in started.values()), default=time.time())
-            self._set_status(self.parent_run_id, status, last)
-        self._parent_shown = shown
+        position = self._parent
+        text = note(self.store.name, {standing: counts[standing] for standing in Standing}, self._summaries())
+        if position.shown.get("note") != text:
+            self.client.log_batch(position.run_id, tags=[RunTag("mlflow.note.content", text)])
+        if position.shown.get("status") != status:
+            last = max((record.heartbeat for record in records.values()), default=0.0)
+            self._set_status(position.run_id, status, last or time.time())
+        position = self._send_files(position, [self.store.grid_path, self.store.info_path])
+        if self.store.figures_folder.is_dir():
+            position = self._send_files(position, sorted(self.store.figures_folder.iterdir()), "figures")
+        position = replace(position, shown={"note": text, "status": status})
+        if position != self._parent:
+            write_json(self._parent_path, asdict(position))
+            self._parent = position
 
     def send_figures(self, paths: Sequence[Path]) -> None:
         """Add files to the parent run."""
-        for path in paths:
-            self.client.log_artifact(self.parent_run_id, str(path), "figures")
+        self._parent = self._send_files(self._parent, paths, "figures")
+        write_json(self._parent_path, asdict(self._parent))
 
     def _summaries(self) -> list[Summary]:
         summaries = []
@@ -367,7 +388,7 @@ class _View:
             **self._sweep_tags,
             "recrl.kind": "trial",
             "recrl.trial_id": spec.trial_id,
-            "recrl.group": f"{spec.task.label} {spec.agent.label} {spec.method.label}",
+            "recrl.group": f"{spec.method.label}, {spec.agent.label}, {spec.task.label}",
             "mlflow.parentRunId": self.parent_run_id,
         }
         run = self.client.create_run(
@@ -387,9 +408,9 @@ class _View:
         name = trial.folder.name
         if name not in self._positions:
             position = _read_position(self._position_path(trial))
-            run_id = self._runs.get(trial.spec.trial_id)
-            if position is None or position.run_id != run_id:
-                position = Position(run_id or self._create_run(trial, record))
+            found = self._runs.get(trial.spec.trial_id)
+            if position is None or position.run_id != found:
+                position = Position(found or self._create_run(trial, record))
             self._positions[name] = position
         return self._positions[name]
 
@@ -421,20 +442,24 @@ class _View:
         else:
             self.client.set_terminated(run_id, status, end_time=_milliseconds(end))
 
-    def _send_artifacts(self, trial: TrialStore, record: TrialRecord, position: Position) -> Position:
-        """Send the trial's small files, and at the end what it learnt; each as often as it changes."""
+    def _send_results(self, trial: TrialStore, record: TrialRecord, position: Position) -> Position:
+        """Send the trial's small files, and at the end what it learnt."""
         paths = [trial.spec_path, trial.provenance_path]
         if record.status is TrialState.COMPLETE:
             paths += [trial.evaluation_path, trial.events_path, *trial.checkpoints()[:1]]
         if record.status is TrialState.FAILED:
             paths += [trial.error_path]
+        return self._send_files(position, paths)
+
+    def _send_files(self, position: Position, paths: Sequence[Path], folder: str | None = None) -> Position:
+        """Add those of the files that are there, not empty, and not sent as they are now."""
         sent = list(position.artifacts)
         for path in paths:
             with suppress(FileNotFoundError):
                 stat = path.stat()
                 mark = f"{path.name} {stat.st_size} {stat.st_mtime_ns}"
-                if mark not in sent and stat.st_size:
-                    self.client.log_artifact(position.run_id, str(path))
+                if mark not in sent and stat.st_size and path.is_file():
+                    self.client.log_artifact(position.run_id, str(path), folder)
                     sent.append(mark)
         return replace(position, artifacts=sent)
 
@@ -446,35 +471,26 @@ def run_status(record: TrialRecord, *, live: bool) -> str:
         record: of the trial; ``attempt`` is at least 1.
         live: whether a launch is there that will resume what waits.
     """
-    match record.status:
-        case TrialState.COMPLETE:
+    match standing_of(record, now=time.time()):
+        case Standing.COMPLETE:
             return "FINISHED"
-        case TrialState.FAILED:
+        case Standing.FAILED:
             return "FAILED"
-        case TrialState.RUNNING:
-            return "KILLED" if _is_lost(record) else "RUNNING"
-        case TrialState.WAITING:
+        case Standing.RUNNING:
+            return "RUNNING"
+        case Standing.INTERRUPTED:
+            return "KILLED"
+        case Standing.STOPPED | Standing.WAITING:
             return "SCHEDULED" if live else "KILLED"
 
 
-def _sweep_status(counts: Mapping[str, int], *, live: bool) -> str:
-    if live or counts["running"]:
+def _sweep_status(counts: Mapping[Standing, int], *, live: bool) -> str:
+    if live or counts[Standing.RUNNING]:
         return "RUNNING"
-    if counts["failed"]:
+    if counts[Standing.FAILED]:
         return "FAILED"
-    return "KILLED" if counts["stopped"] + counts["not started"] else "FINISHED"
-
-
-def _is_lost(record: TrialRecord) -> bool:
-    """Whether a trial that says it runs no longer does, as far as one can tell from here."""
-    if record.host == socket.gethostname():
-        try:
-            os.kill(record.pid, 0)  # signal 0 only asks
-        except ProcessLookupError:
-            return True
-        except PermissionError:
-            pass  # somebody else's process, so it is there
-    return time.time() - record.heartbeat > STALE_SECONDS
+    complete = counts[Standing.COMPLETE] == sum(counts.values())
+    return "FINISHED" if complete else "KILLED"
 
 
 def _new_points(trial: TrialStore, data: bytes, position: Position) -> tuple[list[Point], Position]:
@@ -695,7 +711,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _any_runs(store: SweepStore) -> bool:
     records = (trial.record() for trial in store.trials())
-    return any(record.status is TrialState.RUNNING and not _is_lost(record) for record in records)
+    return any(standing_of(record, now=time.time()) is Standing.RUNNING for record in records)
 
 
 def _is_over(parent: int, seconds: float) -> bool:
@@ -727,9 +743,8 @@ def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
     report = last_report(store, uri)
     if report is None or not report.experiment_id:
         return address
-    return (
-        f"{address}/#/experiments/{report.experiment_id}/runs?viewStateShareKey={VIEW}&compareRunsMode=CHART"
-    )
+    page = f"{address}/#/experiments/{report.experiment_id}/runs"
+    return f"{page}?viewStateShareKey={VIEW}&compareRunsMode=CHART&workflowType=machine_learning"
 
 
 @dataclass

@@ -305,7 +305,7 @@ def test_a_sweep_is_shown_as_a_parent_and_a_run_a_trial(write: Callable[..., Swe
     }
     assert {run.data.tags["mlflow.parentRunId"] for run in shown.values()} == {parent.info.run_id}
     assert parent.data.metrics == {}
-    assert "3 trials (1 complete, 1 failed, 1 running)" in parent.data.tags["mlflow.note.content"]
+    assert "3 trials (1 complete, 1 running, 1 failed)" in parent.data.tags["mlflow.note.content"]
     assert shown["river-a cpo linear seed 0"].data.tags["recrl.error"] == "ValueError: the river froze"
     run = shown[DYNAMIC]
     assert (run.data.params["method"], run.data.params["seed"]) == ("dynamic", "0")
