@@ -127,7 +127,9 @@ def main(given: Sequence[str] | None = None) -> int:
 
         from recrl.orchestrator.commands import COMMANDS  # noqa: PLC0415
 
-        return COMMANDS[arguments.command](arguments, Console())
+        # a file or a pipe has no width that tables would have to fit in
+        console = Console() if sys.stdout.isatty() else Console(width=160)
+        return COMMANDS[arguments.command](arguments, console)
     except GridError as error:
         print(error, file=sys.stderr)
         mistakes = f"{len(error.problems)} mistake{'s' if len(error.problems) > 1 else ''}"

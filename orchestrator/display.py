@@ -140,7 +140,7 @@ def duration(seconds: float) -> str:
 def live_progress(ask: Callable[[], SweepProgress], console: Console) -> Iterator[None]:
     """Show the progress while the context lasts.
 
-    On a terminal in place, once a second; elsewhere a line every ten seconds.
+    On a terminal in place, once a second; elsewhere a line every ten seconds, if anything has changed.
 
     Args:
         ask: reads the progress from the files.
@@ -168,8 +168,12 @@ def _show_in_place(ask: Callable[[], SweepProgress], console: Console, done: thr
 
 
 def _show_lines(ask: Callable[[], SweepProgress], console: Console, done: threading.Event) -> None:
+    last = ""
     while not done.wait(LINE_SECONDS):
-        console.print(status_sentence(ask()), highlight=False, soft_wrap=True)
+        sentence = status_sentence(ask())
+        if sentence != last:
+            console.print(sentence, highlight=False, soft_wrap=True)
+        last = sentence
 
 
 def _picture(progress: SweepProgress) -> RenderableType:

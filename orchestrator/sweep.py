@@ -97,6 +97,7 @@ def launch(
     make_plan(specs, store, only=only)  # a mistake in ``only`` leaves no trace
     with store.lock():
         _write_files(grid, specs, store)
+        _leave_none_running(specs, store)  # of a launch that died
         plan = make_plan(specs, store, only=only, retry_failed=retry_failed)
         chosen = [trial.spec for trial in plan.trials]
         if watch is not None:
@@ -160,7 +161,7 @@ def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) 
 
 
 def _leave_none_running(specs: Sequence[TrialSpec], store: SweepStore) -> None:
-    """After the executor nobody works on a trial: one that still says so waits to be resumed."""
+    """Nobody works on these trials: one whose files still say so waits to be resumed."""
     for spec in specs:
         files = store.trial(spec)
         if files.record().status is TrialState.RUNNING:

@@ -216,8 +216,8 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
         (
             "deploy_limits: 2",
             "deploy_limits: 5, train_limits: 3",
-            "grid.yaml:2: tasks.0.train_limits: must be at least the deploy_limits of two-state (d_t >= d_d), "
-            "got 3 under 5",
+            "grid.yaml:2: tasks.0.train_limits: must be at least the deploy_limits of two-state "
+            "(d_t >= d_d), got 3 under 5",
         ),
         (
             "deploy_limits: 2",
