@@ -42,6 +42,13 @@ class Task:
     sample_options: Mapping[str, Any] = field(default_factory=dict)
 
 
+SAFETY_GYM = {
+    "Goal": "drives to one goal after another",
+    "Button": "touches the right one of four buttons",
+    "Push": "pushes a box to one goal after another",
+}
+OBSTACLES = ("", ", past a few obstacles", ", past many obstacles")
+
 TASKS: dict[str, Task] = {
     "two-state": Task(
         summary="A camp and a mine, one cost, closed-form optimum: for testing learners.",
@@ -90,6 +97,17 @@ TASKS: dict[str, Task] = {
         make="recrl.environments.vectorize:make_gymnasium",
         sample_options={"id": "CartPole-v1", "costless": True},
     ),
+    **{
+        f"{robot}{goal}{level}": Task(
+            summary=f"Safety Gym: the {robot} {what}{OBSTACLES[level]}.",
+            options="recrl.environments.safety_gym:SafetyGymOptions",
+            make="recrl.environments.safety_gym:make_safety_gym",
+            sample_options={"horizon": 12},
+        )
+        for robot in ("Car", "Point")
+        for goal, what in SAFETY_GYM.items()
+        for level in (0, 1, 2)
+    },
 }
 
 
