@@ -266,7 +266,9 @@ def _box(task: SafetyTask) -> str:
 
 def _button(index: int, size: float) -> str:
     return f"""
-<body name="button{index}" mocap="true" pos="{-PARKED} {index * size * 3} {size}"><geom type="sphere" size="{size}"/></body>"""
+<body name="button{index}" mocap="true" pos="{-PARKED} {index * size * 3} {size}">
+  <geom type="sphere" size="{size}"/>
+</body>"""
 
 
 def _pillar(index: int, size: float) -> str:

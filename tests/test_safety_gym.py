@@ -34,7 +34,7 @@ def drive(environment: SafetyGymEnv) -> npt.NDArray[np.float64]:
     x, y, _ = offset @ worlds.rotation[0]
     angle = np.arctan2(x, -y)
     forwards, turn = max(np.cos(angle), 0.0), np.clip(angle, -1.0, 1.0)
-    return np.clip([forwards + turn, forwards - turn], -1.0, 1.0)
+    return np.clip(np.array([forwards + turn, forwards - turn]), -1.0, 1.0)
 
 
 def as_bytes(transition: tuple[Any, ...]) -> bytes:
@@ -101,7 +101,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_after_thousands_of_steps(name: s
     for action in actions[:1700]:
         environment.step(action)
     state = environment.state_dict()
-    if name != "CarButton2":
+    if name == "CarGoal2":
         assert (state["physics"]["asleep"] >= 0).any()
     resumed = SafetyGymVectorEnv(name, 1)
     resumed.load_state_dict(state)
