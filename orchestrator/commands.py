@@ -24,14 +24,9 @@ from recrl.orchestrator.plan import Plan, estimate, make_plan, trials_at_once
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.sweep import Mirror, SweepResult, launch, stopping_on_signals
-from recrl.orchestrator.tracking import (
-    last_report,
-    log_figures,
-    open_ui,
-    start_mirror,
-    sync,
-    tracking_uri,
-)
+from recrl.orchestrator.tracking import last_report, log_figures, sync, tracking_uri
+from recrl.orchestrator.tracking_mirror import start_mirror
+from recrl.orchestrator.tracking_ui import open_ui
 from recrl.orchestrator.validation import nearest
 
 DEFAULT_ROOT = Path("runs")

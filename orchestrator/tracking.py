@@ -1,9 +1,9 @@
 """The MLflow view of a sweep: a one-way mirror of its files that may be away without anyone waiting for it.
 
-The only module that imports mlflow, and never in a trial's process: ``start_mirror`` makes one pass after the
-other in a process of its own, politely scheduled. One experiment for a sweep's name (``recrl/<name>``), one
-parent run for the sweep (a note, and figures as artifacts; no metrics, so that no chart shows it), one child
-run for a trial. What a run shows is in ``tracking_points``. Run states are true:
+The only module that imports mlflow, and never in a trial's process: ``tracking_mirror`` makes one pass after
+the other in a process of its own, politely scheduled. One experiment for a sweep's name (``recrl/<name>``),
+one parent run for the sweep (a note, and figures as artifacts; no metrics, so that no chart shows it), one
+child run for a trial. What a run shows is in ``tracking_points``. Run states are true:
 
     the trial's files say                                       the run is
     waiting, never started                                      not there; the parent's note counts it
@@ -26,19 +26,11 @@ run is deleted and a new one is made from the files, as for every run in ``sync(
 
 from __future__ import annotations
 
-import argparse
 import fcntl
 import hashlib
 import json
 import os
-import select
-import shlex
-import socket
-import subprocess
-import sys
 import time
-import urllib.error
-import urllib.request
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -51,9 +43,12 @@ from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.status import Standing, standing_of
 from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
 from recrl.orchestrator.tracking_points import (
+    VIEW,
+    VIEW_STATE,
     Point,
     Row,
     Summary,
+    charts_page,
     final_points,
     note,
     params,
@@ -67,10 +62,6 @@ if TYPE_CHECKING:
 
 BATCH = 1_000  # metrics of a request; MLflow takes no more, and a row costs least in a full one
 MAX_ERROR = 5_000  # characters of a failed trial's error
-POLITENESS = 10  # added to the mirror's nice value: about a tenth of a core that a trial also wants
-LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is away
-ORPHAN_SECONDS = 15.0  # trials outlive a killed driver by some seconds; the last pass waits for them
-VIEW = "recrl"  # key of the prepared chart view
 
 # Read by mlflow when it is imported. A lost server must cost seconds, not MLflow's own four minutes; the
 # mirror tries again by itself. A user's own settings stand.
@@ -82,32 +73,6 @@ ENVIRONMENT = {
     "MLFLOW_LOGGING_LEVEL": "CRITICAL",
     "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-}
-
-# The UI's own state, in its own words (MLflow 3.17; undocumented, so a link without it must do as well).
-VIEW_STATE = {
-    "groupBy": {
-        "aggregateFunction": "average",
-        "groupByKeys": [{"mode": "tag", "groupByData": "recrl.group"}],
-    },
-    "runsHiddenMode": "SHOW_ALL",
-    "selectedColumns": [
-        *(f"params.`{name}`" for name in ("task", "agent", "method", "seed")),
-        *(f"metrics.`{name}`" for name in ("summary/deploy_return", "summary/deploy_cost_0")),
-    ],
-    "compareRunCharts": [],
-    "compareRunSections": [
-        {
-            "uuid": f"recrl-{name}",
-            "name": name,
-            "display": True,
-            "isReordered": False,
-            "deleted": False,
-            "isGenerated": True,
-        }
-        for name in ("train", "curriculum", "deploy", "summary", "evaluation", "student", "perf")
-    ],
-    "isAccordionReordered": True,
 }
 
 
@@ -173,34 +138,69 @@ def sync(store: SweepStore, uri: str, *, rebuild: bool = False) -> SyncReport:
     Returns:
         What was done, or why it could not be: nothing is raised when MLflow is away.
     """
-    with _alone(store, uri):
-        report, _ = _pass(store, uri, None, live=False, rebuild=rebuild)
-        return report
+    return Tracker(store, uri).bring_up_to_date(live=False, rebuild=rebuild)
 
 
 def log_figures(store: SweepStore, uri: str, paths: Sequence[Path]) -> SyncReport:
-    """Show figures and tables as artifacts of the sweep's run, in the folder ``figures``.
-
-    Returns:
-        The report of the pass that was made with it.
-    """
-    with _alone(store, uri):
-        report, view = _pass(store, uri, None, live=False)
-        if view is None:
-            return report
-        try:
-            view.send_figures(paths)
-        except Exception as error:
-            return replace(report, problem=_one_line(error))
-        return report
+    """``sync``, with files that are not in the sweep's own ``figures`` folder shown beside those."""
+    return Tracker(store, uri).bring_up_to_date(live=False, figures=paths)
 
 
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:
     """The report of the last pass that ended, in whatever process; None if there was none."""
     try:
-        return SyncReport(**json.loads((_folder(store, uri) / "report.json").read_text()))
+        return SyncReport(**json.loads((mirror_folder(store, uri) / "report.json").read_text()))
     except (OSError, ValueError, TypeError):
         return None
+
+
+class Tracker:
+    """What one process knows of MLflow between its passes over a sweep."""
+
+    def __init__(self, store: SweepStore, uri: str) -> None:
+        self.store = store
+        self.uri = uri
+        self._view: _View | None = None
+
+    def bring_up_to_date(
+        self, *, live: bool, rebuild: bool = False, figures: Sequence[Path] = ()
+    ) -> SyncReport:
+        """One pass; whatever MLflow raises ends up in the report.
+
+        Args:
+            live: whether a launch is there that will resume what waits.
+            rebuild: delete what MLflow has of the sweep first.
+            figures: files to show beside those in the sweep's ``figures`` folder.
+        """
+        trials = [trial for trial in self.store.trials() if trial.record().attempt]
+        sent, done, problems = 0, 0, []
+        with _alone(self.store, self.uri):
+            view, self._view = self._view, None  # to be asked anew should anything go wrong
+            try:
+                view = view or _View(self.store, self.uri, rebuild=rebuild)
+                for trial in trials:
+                    try:
+                        sent += view.show_trial(trial, live=live)
+                        done += 1
+                    except Exception as error:
+                        if _is_away(error):
+                            raise
+                        problems.append(f"{trial.folder.name}: {_one_line(error)}")
+                view.show_sweep(figures, live=live)
+            except Exception as error:
+                problems.append(_one_line(error))
+            report = SyncReport(
+                trials=len(trials),
+                behind=len(trials) - done,
+                points=sent,
+                problem=problems[0] if problems else "",
+                finished_at=time.time(),
+                experiment_id=view.experiment_id if view else "",
+                parent_run_id=view.parent_run_id if view else "",
+            )
+            write_json(mirror_folder(self.store, self.uri) / "report.json", asdict(report))
+        self._view = None if problems else view
+        return report
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class _View:
         self.store = store
         self.client = _connect(uri)
         self._uri = uri
-        self._folder = _folder(store, uri)
+        self._folder = mirror_folder(store, uri)
         self._sweep_tags = {"recrl.sweep": store.name, "recrl.sweep_id": _sweep_id(store)}
         self.experiment_id = self._find_experiment()
         self._runs = self._find_runs()
@@ -294,7 +294,7 @@ class _View:
         self._save(trial, replace(position, shown=shown))
         return len(metrics)
 
-    def show_sweep(self, *, live: bool) -> None:
+    def show_sweep(self, figures: Sequence[Path], *, live: bool) -> None:
         """Bring the parent run up to date: its note, its status, the grid and the figures."""
         from mlflow.entities import RunTag  # noqa: PLC0415
 
@@ -305,24 +305,24 @@ class _View:
         counts = Counter(standing_of(record, now=time.time()) for record in records.values())
         status = _sweep_status(counts, live=live)
         position = self._parent
-        text = note(self.store.name, {standing: counts[standing] for standing in Standing}, self._summaries())
+        text = note(
+            self.store.name,
+            {standing: counts[standing] for standing in Standing},
+            self._summaries(),
+            charts=f"#{charts_page(self.experiment_id)}",
+        )
         if position.shown.get("note") != text:
             self.client.log_batch(position.run_id, tags=[RunTag("mlflow.note.content", text)])
         if position.shown.get("status") != status:
             last = max((record.heartbeat for record in records.values()), default=0.0)
             self._set_status(position.run_id, status, last or time.time())
         position = self._send_files(position, [self.store.grid_path, self.store.info_path])
-        if self.store.figures_folder.is_dir():
-            position = self._send_files(position, sorted(self.store.figures_folder.iterdir()), "figures")
+        drawn = sorted(self.store.figures_folder.glob("*"))
+        position = self._send_files(position, [*drawn, *figures], "figures")
         position = replace(position, shown={"note": text, "status": status})
         if position != self._parent:
             write_json(self._parent_path, asdict(position))
             self._parent = position
-
-    def send_figures(self, paths: Sequence[Path]) -> None:
-        """Add files to the parent run."""
-        self._parent = self._send_files(self._parent, paths, "figures")
-        write_json(self._parent_path, asdict(self._parent))
 
     def _summaries(self) -> list[Summary]:
         summaries = []
@@ -343,7 +343,7 @@ class _View:
         experiment = self.client.get_experiment_by_name(name)
         if experiment is None:
             # A server knows where it keeps artifacts; a bare database would take the current folder.
-            place = None if _is_server(self._uri) else self.store.mlflow_artifacts.as_uri()
+            place = None if is_server(self._uri) else self.store.mlflow_artifacts.as_uri()
             return str(self.client.create_experiment(name, artifact_location=place, tags=tags))
         if experiment.lifecycle_stage != "active":
             self.client.restore_experiment(experiment.experiment_id)
@@ -518,44 +518,6 @@ def _read_position(path: Path) -> Position | None:
     return position if all(map(isinstance, values, kinds)) else None
 
 
-def _pass(
-    store: SweepStore, uri: str, view: _View | None, *, live: bool, rebuild: bool = False
-) -> tuple[SyncReport, _View | None]:
-    """One pass over the sweep; whatever MLflow raises ends up in the report.
-
-    Returns:
-        The report, and the view to make the next pass with: None if MLflow has to be asked anew.
-    """
-    trials = [trial for trial in store.trials() if trial.record().attempt]
-    sent, done, problems = 0, 0, []
-    away = False
-    try:
-        view = view or _View(store, uri, rebuild=rebuild)
-        for trial in trials:
-            try:
-                sent += view.show_trial(trial, live=live)
-                done += 1
-            except Exception as error:
-                problems.append(f"{trial.folder.name}: {_one_line(error)}")
-                if _is_away(error):
-                    raise
-        view.show_sweep(live=live)
-    except Exception as error:
-        away = True
-        problems = problems or [_one_line(error)]
-    report = SyncReport(
-        trials=len(trials),
-        behind=len(trials) - done,
-        points=sent,
-        problem=problems[0] if problems else "",
-        finished_at=time.time(),
-        experiment_id=view.experiment_id if view else "",
-        parent_run_id=view.parent_run_id if view else "",
-    )
-    write_json(_folder(store, uri) / "report.json", asdict(report))
-    return report, None if away or problems else view
-
-
 def _is_away(error: Exception) -> bool:
     """Whether asking MLflow for the next trial would fail in the same way."""
     from mlflow.exceptions import MlflowException  # noqa: PLC0415
@@ -592,14 +554,14 @@ def _connect(uri: str) -> MlflowClient:
 @contextmanager
 def _alone(store: SweepStore, uri: str) -> Iterator[None]:
     """Wait until no other process tells this store about this sweep; two would make every run twice."""
-    folder = _folder(store, uri)
+    folder = mirror_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
-def _folder(store: SweepStore, uri: str) -> Path:
+def mirror_folder(store: SweepStore, uri: str) -> Path:
     """The positions for one MLflow store; the address itself may hold a password."""
     return store.mirror_folder / hashlib.sha256(uri.encode()).hexdigest()[:10]
 
@@ -620,7 +582,8 @@ def _head(path: Path, length: int) -> bytes:
         return file.read(length)
 
 
-def _is_server(uri: str) -> bool:
+def is_server(uri: str) -> bool:
+    """Whether the address is that of a running MLflow server."""
     return uri.startswith(("http://", "https://"))
 
 
@@ -630,176 +593,3 @@ def _milliseconds(seconds: float) -> int:
 
 def _one_line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:500]
-
-
-@dataclass
-class Mirror:
-    """The process that keeps MLflow up to date during a launch; it ends when its parent does."""
-
-    process: subprocess.Popen[bytes]
-
-    def stop(self, timeout: float) -> bool:
-        """Ask for a last pass and wait for it; whatever it does not manage, the next ``sync`` does.
-
-        Args:
-            timeout: seconds, at least 0; then the process is killed.
-
-        Returns:
-            Whether MLflow is up to date.
-        """
-        if self.process.stdin:
-            self.process.stdin.close()
-        try:
-            return self.process.wait(timeout) == 0
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-            return False
-
-
-def start_mirror(store: SweepStore, uri: str, *, interval_seconds: float) -> Mirror:
-    """Keep MLflow up to date from a process of its own, until ``Mirror.stop`` or until this process dies.
-
-    Args:
-        store: the sweep.
-        uri: of ``tracking_uri``.
-        interval_seconds: between two passes, above 0; longer while MLflow is away.
-    """
-    folder = _folder(store, uri)
-    folder.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "recrl.orchestrator.tracking", str(store.folder)]
-    with (folder / "log.txt").open("ab") as log:
-        process = subprocess.Popen(
-            [*command, "--interval", str(interval_seconds), "--parent", str(os.getpid())],
-            # In the environment and not among the arguments, which other users can see.
-            env={**ENVIRONMENT, **os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1"},
-            stdin=subprocess.PIPE,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,  # Ctrl-C is for the launch, which then says when to stop
-        )
-    return Mirror(process)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Mirror a sweep until standard input closes; the process of ``start_mirror``."""
-    parser = argparse.ArgumentParser(prog="python -m recrl.orchestrator.tracking", description=main.__doc__)
-    parser.add_argument("folder", type=Path, help="the sweep's folder")
-    parser.add_argument("--interval", type=float, required=True, help="seconds between two passes")
-    parser.add_argument("--parent", type=int, required=True, help="the process to end with")
-    arguments = parser.parse_args(argv)
-    os.nice(POLITENESS)
-    store = SweepStore(arguments.folder.parent, arguments.folder.name)
-    uri = os.environ["MLFLOW_TRACKING_URI"]
-    view: _View | None = None
-    wait, over_since = arguments.interval, 0.0
-    while True:
-        with _alone(store, uri):
-            report, view = _pass(store, uri, view, live=not over_since)
-        if report.problem:
-            print(f"{time.strftime('%F %T')} {report.problem}", flush=True)
-        if over_since and (
-            report.problem or not _any_runs(store) or time.time() - over_since > ORPHAN_SECONDS
-        ):
-            return 0 if report.is_up_to_date else 1
-        wait = min(2 * wait, LONGEST_WAIT_SECONDS) if report.problem else arguments.interval
-        if over_since:
-            time.sleep(1.0)
-        elif _is_over(arguments.parent, wait):
-            over_since = time.time()
-
-
-def _any_runs(store: SweepStore) -> bool:
-    records = (trial.record() for trial in store.trials())
-    return any(standing_of(record, now=time.time()) is Standing.RUNNING for record in records)
-
-
-def _is_over(parent: int, seconds: float) -> bool:
-    """Wait; whether standard input was closed or the parent died meanwhile."""
-    readable, _, _ = select.select([sys.stdin], [], [], seconds)
-    return bool(readable) or os.getppid() != parent
-
-
-def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
-    """The command that shows the sweep in a browser, on this machine only.
-
-    A database gets a server of one process, without MLflow's job runner (2.5 GB of memory by default, 0.5
-    GB so); a server has its own pages.
-    """
-    if _is_server(uri):
-        return [sys.executable, "-m", "webbrowser", "-t", ui_url(store, uri)]
-    settings = [
-        f"{key}={value}"
-        for key, value in ENVIRONMENT.items()
-        if "SERVER" in key or "TRACK" in key or "TELEMETRY" in key
-    ]
-    server = [sys.executable, "-m", "mlflow", "server", "--backend-store-uri", uri]
-    return ["env", *settings, *server, "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-
-
-def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
-    """The page of the sweep's charts, grouped by task, student and method."""
-    address = uri.rstrip("/") if _is_server(uri) else f"http://127.0.0.1:{port}"
-    report = last_report(store, uri)
-    if report is None or not report.experiment_id:
-        return address
-    page = f"{address}/#/experiments/{report.experiment_id}/runs"
-    return f"{page}?viewStateShareKey={VIEW}&compareRunsMode=CHART&workflowType=machine_learning"
-
-
-@dataclass
-class UI:
-    """MLflow's UI.
-
-    Attributes:
-        url: the page to open.
-        process: the server, or None if it was there already.
-    """
-
-    url: str
-    process: subprocess.Popen[bytes] | None
-
-    def close(self) -> None:
-        """End the server that was started."""
-        if self.process:
-            self.process.terminate()
-            self.process.wait()
-
-
-def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 120.0) -> UI:
-    """Start MLflow's server on this machine's own address and wait until it answers.
-
-    Args:
-        store: the sweep.
-        uri: of ``tracking_uri``; for a server's address nothing is started.
-        port: of 127.0.0.1.
-        timeout: seconds until it must answer.
-
-    Raises:
-        TrackingError: the port is taken, or the server does not start.
-    """
-    url = ui_url(store, uri, port=port)
-    if _is_server(uri):
-        return UI(url, None)
-    with socket.socket() as probe:
-        if probe.connect_ex(("127.0.0.1", port)) == 0:
-            raise TrackingError(f"port {port} of 127.0.0.1 is taken by another program; choose another port")
-    command = ui_command(store, uri, port=port)
-    log_path = _folder(store, uri) / "ui.txt"
-    log_path.parent.mkdir(parents=True, exist_ok=True)
-    with log_path.open("wb") as log:
-        ui = UI(url, subprocess.Popen(command, stdout=log, stderr=log))
-    end = time.monotonic() + timeout
-    while time.monotonic() < end and ui.process and ui.process.poll() is None:
-        with suppress(urllib.error.URLError, ConnectionError, TimeoutError):
-            urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5.0).close()
-            return ui
-        time.sleep(0.2)
-    ui.close()
-    raise TrackingError(
-        f"MLflow's server did not start; its output is in {log_path}, the command was {shlex.join(command)}"
-    )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -37,6 +37,35 @@ POINTS_PER_METRIC = 200
 MAX_PARAMS = 100  # of a request
 MAX_NOTE = 7_500  # characters; MLflow takes 8,000 in a tag
 
+VIEW = "recrl"  # key of the prepared chart view
+
+# The UI's own state, in its own words (MLflow 3.17; undocumented, so a link without it must do as well).
+VIEW_STATE = {
+    "groupBy": {
+        "aggregateFunction": "average",
+        "groupByKeys": [{"mode": "tag", "groupByData": "recrl.group"}],
+    },
+    "runsHiddenMode": "SHOW_ALL",
+    "selectedColumns": [
+        *(f"params.`{name}`" for name in ("task", "agent", "method")),
+        *(f"metrics.`{name}`" for name in ("summary/deploy_return", "summary/deploy_cost_0")),
+    ],
+    "columnWidths": {"attributes.`Run Name`": 330},
+    "compareRunCharts": [],
+    "compareRunSections": [
+        {
+            "uuid": f"recrl-{name}",
+            "name": name,
+            "display": True,
+            "isReordered": False,
+            "deleted": False,
+            "isGenerated": True,
+        }
+        for name in ("train", "curriculum", "deploy", "summary", "evaluation", "student", "perf")
+    ],
+    "isAccordionReordered": True,
+}
+
 Row = Mapping[str, str]
 
 
@@ -167,17 +196,27 @@ class Summary:
     values: Mapping[str, float]
 
 
-def note(name: str, counts: Mapping[str, int], complete: Sequence[Summary]) -> str:
+def charts_page(experiment_id: str) -> str:
+    """The UI's page of the sweep's charts, seeds averaged, as it stands behind the ``#`` of its address."""
+    page = f"/experiments/{experiment_id}/runs?viewStateShareKey={VIEW}"
+    return f"{page}&compareRunsMode=CHART&workflowType=machine_learning"
+
+
+def note(name: str, counts: Mapping[str, int], complete: Sequence[Summary], *, charts: str) -> str:
     """The sweep's description in Markdown: how far it is, and a line for every group that has an end.
 
     Args:
         name: the sweep.
         counts: trials by what they are: complete, running, ...
         complete: one for each complete trial.
+        charts: address of the page of charts.
     """
     total = sum(counts.values())
     states = ", ".join(f"{count} {state}" for state, count in counts.items() if count) or "none yet"
-    lines = [f"**{name}**: {total} trials ({states}). The figures are artifacts of this run."]
+    lines = [
+        f"**{name}**: {total} trials ({states}). [Charts, seeds averaged]({charts}); "
+        "the figures are artifacts of this run."
+    ]
     names = sorted({value.removeprefix("summary/") for trial in complete for value in trial.values})
     if names:
         heads = ["task", "student", "method", "seeds", *(value.replace("_", " ") for value in names)]

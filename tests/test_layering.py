@@ -45,7 +45,7 @@ LAYERS = (
     ("store", "validation"),
     ("grid_file", "status", "tracking_points", "plan", "trial"),
     ("grid", "executors", "tracking", "teacher_service"),
-    ("sweep", "ray_executor"),
+    ("sweep", "ray_executor", "tracking_mirror", "tracking_ui"),
     ("display",),
     ("commands",),
     ("cli",),

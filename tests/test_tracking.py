@@ -22,7 +22,8 @@ from recrl.orchestrator import tracking
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
-from recrl.orchestrator.tracking import log_figures, run_status, start_mirror, sync, tracking_uri
+from recrl.orchestrator.tracking import log_figures, run_status, sync, tracking_uri
+from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_points import (
     Summary,
     final_points,
@@ -140,8 +141,8 @@ def test_the_summary_weighs_updates_by_their_episodes() -> None:
 def test_the_note_has_a_line_a_group_with_means_over_seeds() -> None:
     group = ("river", "cpo", "dynamic")
     complete = [Summary(group, {"summary/deploy_return": value}) for value in (8.0, 9.0)]
-    text = note("demo", {"complete": 2, "failed": 0, "running": 1}, complete)
-    assert text.splitlines()[0].startswith("**demo**: 3 trials (2 complete, 1 running).")
+    text = note("demo", {"complete": 2, "failed": 0, "running": 1}, complete, charts="#/charts")
+    assert text.splitlines()[0].startswith("**demo**: 3 trials (2 complete, 1 running). [Charts")
     assert text.splitlines()[-1] == "| river | cpo | dynamic | 2 | 8.50 |"
 
 
@@ -149,7 +150,7 @@ def test_a_long_note_is_cut_where_mlflow_would_refuse_it() -> None:
     complete = [
         Summary((f"task-{index}", "cpo", "none"), {"summary/deploy_return": 0.0}) for index in range(999)
     ]
-    text = note("demo", {"complete": 999}, complete)
+    text = note("demo", {"complete": 999}, complete, charts="#/charts")
     assert len(text) < 8000
     assert text.endswith("More groups than fit here: see the table figure.")
 
