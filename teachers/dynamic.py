@@ -12,21 +12,26 @@ the letter wherever it is defined.
   safe, and it would wait for ever. |new - old| <= eps max(|old|, floor) is the same test where that is
   defined, and 0 against 0 has converged. The floor keeps small means from being compared by their noise.
 - *Nothing finished.* A window without an episode says nothing: hold.
-- *Adherence* (line 6). A student at its optimum has a mean cost on either side of its limit, and C <= d would
-  kick it for ever. C may exceed d by its standard error.
+- *Adherence* (line 6). A student at its optimum has a mean cost a little above its limit as often as below,
+  or always (whoever must cross five tiles of river and slips once in a while costs 5.004), and C <= d would
+  kick it for ever. C may exceed d by as much as line 5 lets equal costs differ, or by its standard error.
 - *The step* (line 7). B - b counts episodes, but a limit moves only once per window, so that the limits stay
   far above d_d. Counted in windows that are left, the steps add up to the whole way. The last is not counted:
   a student needs two windows to settle after a large step, and would meet d_d only at B otherwise.
 - *Which limits a window was played under.* The newer window lies wholly after the last change (line 4); the
   older one may lie before it, so that a student who follows each change at once is not made to wait twice.
 - *last_change* is reset when limits or policy have changed; line 11 also resets it when nothing has.
-- *Limits never rise.* With the tolerance, C may lie above d: d <- min(d, ...).
+- *Noise* (line 9) is a disturbance of the teacher's own making: costs jump, and take updates to come back. If
+  the next window is compared with the one before the noise, two windows with the same jump in them look
+  converged and above the limit, and noise follows noise at the pace of the windows for ever. Both windows
+  lie after the last noise.
+- *Limits never rise.* With the tolerance C may lie above d: the step is taken from min(C, d).
 - *Infinite limits.* C <= d holds, and line 7 takes d from infinity to about C: nothing goes wrong. But the
   start may be measured instead (``start_updates``), and then nothing is judged until it is known.
 - *Several costs* (lines 5 to 7 say "for all i"). One cost that is still moving, or that cannot be kept,
   would hold the limits of all the others at d_t. Each limit goes its own way: it falls when the return and
   its own cost have converged and its own limit is kept; the policy gets noise when any converged cost is
-  above its limit. A change in one dimension makes the others wait for at most one window, never longer.
+  above its limit. A step in one dimension makes the others wait for one window, and noise for two.
 - *The end.* At B the limits are d_d whatever the student does, and there is no noise.
 
 One consequence of line 7 is kept, and worth knowing: a student whose converged cost is below d_d is given
@@ -66,6 +71,7 @@ PAPER = {
     "return_floor": 0.0,
     "cost_floor": 0.0,
     "adherence_tolerance": "none",
+    "windows_after_noise": 1,
     "remaining": "episodes",
     "dimensions": "joint",
 }
@@ -115,10 +121,18 @@ class DynamicConfig(BaseModel):
         description="Mean costs below this, in units of the episode cost, count as this much in the "
         "convergence test.",
     )
-    adherence_tolerance: Literal["standard_error", "none"] = Field(
-        default="standard_error",
-        description="By how much a mean cost may exceed its limit and still keep it: one standard error "
-        "of the mean, or nothing (Algorithm 2, line 6).",
+    adherence_tolerance: Literal["relative", "standard_error", "none"] = Field(
+        default="relative",
+        description="By how much a mean cost may exceed its limit and still keep it: one standard error of "
+        "the mean or cost_tolerance x the limit, whichever is more; the standard error; or nothing "
+        "(Algorithm 2, line 6).",
+    )
+    windows_after_noise: int = Field(
+        default=2,
+        ge=1,
+        le=2,
+        description="How many of the two windows must lie after the last noise: both, or the newer one "
+        "(literal).",
     )
     remaining: Literal["windows", "episodes"] = Field(
         default="windows",
@@ -172,10 +186,10 @@ def keeps_limit(cost: float, limit: float, *, tolerance: float) -> bool:
 
 
 def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int) -> float:
-    """The limit after one that was kept: d <- max(d_d, C-bar - (C-bar - d_d) / n), never above d.
+    """The limit after one that was kept: d <- max(d_d, C - (C - d_d) / n) with C = min(C-bar, d).
 
-    Algorithm 2, line 7. Written d_d + (C-bar - d_d)(1 - 1 / n), which is the same and is d_d exactly
-    when n = 1.
+    Algorithm 2, line 7, where C-bar <= d. Written d_d + (C - d_d)(1 - 1 / n), which is the same and is d_d
+    exactly when n = 1.
 
     Args:
         limit: d, possibly infinite.
@@ -188,8 +202,8 @@ def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int
     """
     if limit <= deploy_limit:
         return deploy_limit
-    lower = deploy_limit + (cost - deploy_limit) * (1.0 - 1.0 / max(1, remaining))
-    return min(limit, max(deploy_limit, lower))
+    start = min(cost, limit)
+    return max(deploy_limit, deploy_limit + (start - deploy_limit) * (1.0 - 1.0 / max(1, remaining)))
 
 
 def judge(
@@ -242,11 +256,21 @@ def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
 
 def _kept(new: Stretch, limits: CostLimits, config: DynamicConfig) -> list[bool]:
     """Whether each limit is kept, [k]."""
-    exact = config.adherence_tolerance == "none"
     return [
-        keeps_limit(cost, limit, tolerance=0.0 if exact else error)
+        keeps_limit(cost, limit, tolerance=_tolerance(limit, error, config))
         for cost, limit, error in zip(new.mean_costs, limits, new.standard_errors, strict=True)
     ]
+
+
+def _tolerance(limit: float, standard_error: float, config: DynamicConfig) -> float:
+    """By how much a mean cost may exceed its limit."""
+    match config.adherence_tolerance:
+        case "none":
+            return 0.0
+        case "standard_error":
+            return standard_error
+        case "relative":
+            return max(standard_error, config.cost_tolerance * max(limit, config.cost_floor))
 
 
 def steps_left(
@@ -273,7 +297,7 @@ class DynamicTeacher:
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
     episodes since limits or policy were changed, in the unit of W), ``history`` (one ``Stretch`` for each
-    update of the last two windows) and the keys of ``StartMeasurement``.
+    update of the last two windows, as far as they are comparable) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
@@ -313,6 +337,8 @@ class DynamicTeacher:
             lesson = Lesson(limits)
         else:
             lesson = self._judge(limits, history, report.env_steps)
+        if lesson.policy_noise > 0.0 and self.config.windows_after_noise == 2:
+            history = ()
         has_changed = lesson.limits != before or lesson.policy_noise > 0.0
         next_state = _state(
             update=report.update,
