@@ -83,6 +83,7 @@ class Sweep:
         updates: a row a policy update.
         evaluations: a row an episode of the frozen policy.
         events: a row an event.
+        task_options: the options of every task, by its label.
         notes: sentences on what a reader of the frames must know, for example an unknown optimum.
     """
 
@@ -92,6 +93,7 @@ class Sweep:
     updates: pd.DataFrame
     evaluations: pd.DataFrame
     events: pd.DataFrame
+    task_options: Mapping[str, Mapping[str, Any]]
     notes: tuple[str, ...] = ()
 
     @property
@@ -136,6 +138,7 @@ def load(store: SweepStore) -> Sweep:
         updates=frame((*UPDATE_COLUMNS, *cost_columns, *limit_columns), lambda it: it.store.updates()),
         evaluations=frame((*EVALUATION_COLUMNS, *cost_columns), lambda it: it.store.evaluation()),
         events=frame(EVENT_COLUMNS, lambda member: _event_rows(member.store)),
+        task_options={member.spec.task.label: member.spec.task.options for member in members},
         notes=tuple(notes + unknown),
     )
 

@@ -3,6 +3,7 @@
     report.md                   what is missing, the tables, the list of the rest
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
+    return-against-cost         final policies under the frontier J*(d), where it is known (PDF and PNG)
     outcomes.csv                a row a trial and measure
     summary.csv                 averaged over seeds, with interquartile means
     comparisons.csv             paired differences to the student without a curriculum
@@ -22,6 +23,7 @@ import pandas as pd
 
 from recrl.analysis import figures, frames, metrics, styles, tables
 from recrl.analysis.frames import GROUP, Sweep
+from recrl.analysis.frontier import return_against_cost
 from recrl.analysis.intervals import ENOUGH_RUNS
 from recrl.analysis.metrics import Measure
 from recrl.orchestrator.errors import RecrlError
@@ -60,6 +62,8 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
             stem = "learning-curves_" + re.sub(r"[^A-Za-z0-9.+-]+", "-", agent)
             drawn += styles.save(figures.learning_curves(sweep, agent), folder, stem)
     drawn += styles.save(figures.curricula(sweep), folder, "curricula")
+    if (against := return_against_cost(sweep)) is not None:
+        drawn += styles.save(against, folder, "return-against-cost")
     written, text = _tables(sweep, folder)
     head = [f"# {sweep.name}", "", *_status(sweep), ""]
     images = [f"![{path.stem}]({path.name})" for path in drawn if path.suffix == ".png"]

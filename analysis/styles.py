@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -45,6 +45,11 @@ class MethodStyle:
     def linestyle(self) -> Literal["-"] | tuple[float, Sequence[float]]:
         """As matplotlib wants it."""
         return (0.0, self.dashes) if self.dashes else "-"
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """The line as keywords of ``Axes.plot``, without the marker."""
+        return {"color": self.colour, "linestyle": self.linestyle, "linewidth": self.width}
 
 
 STYLES = {
