@@ -144,9 +144,7 @@ class _Reader:
         if len(place) > MAX_DEPTH:
             raise _UnreadableError(line, f"nested deeper than {MAX_DEPTH} levels")
         if len(self.lines) > MAX_VALUES:
-            raise _UnreadableError(
-                line, f"the file expands to more than {MAX_VALUES} values"
-            )
+            raise _UnreadableError(line, f"the file expands to more than {MAX_VALUES} values")
         if isinstance(node, yaml.ScalarNode):
             return self._scalar(node, place)
         expected = "map" if isinstance(node, yaml.MappingNode) else "seq"

@@ -1,0 +1,231 @@
+"""The command line: quick to start, honest in its exit codes, and its errors are sentences."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from recrl.orchestrator.cli import main
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.grid import parse_grid
+from recrl.orchestrator.store import SweepStore
+
+GRID = """\
+name: small
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [ppo-lag]
+methods: [none, linear]
+seeds: 1
+run: {total_steps: 160, deploy_fraction: 0.5, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
+"""
+UNLUCKY_STUDENT = """\
+from recrl.agents.config import PPOLagConfig
+from recrl.agents.registry import AgentEntry
+
+def make(cmdp, config, seed):
+    raise ArithmeticError("no luck")
+
+ENTRY = AgentEntry("An unlucky student.", PPOLagConfig, make)
+"""
+INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory that holds ``grid.yaml``."""
+    (tmp_path / "grid.yaml").write_text(GRID)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def _python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["launch", "--help"], ["validate", "grid.yaml"]])
+def test_help_and_validate_import_nothing_heavy(folder: Path, arguments: list[str]) -> None:
+    code = f"""
+import sys
+from recrl.orchestrator.cli import main
+try:
+    code = main({arguments!r})
+except SystemExit as end:
+    code = end.code
+heavy = {{"torch", "ray", "mlflow", "matplotlib"}} & set(sys.modules)
+assert not heavy, heavy
+sys.exit(code)
+"""
+    done = _python(code, folder)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_help_imports_nothing_but_the_parser(folder: Path) -> None:
+    code = """
+import sys
+from recrl.orchestrator.cli import parser
+parser().format_help()
+assert not {"numpy", "pandas", "pydantic", "gymnasium", "rich", "yaml"} & set(sys.modules)
+"""
+    done = _python(code, folder)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_help_names_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--help"])
+    assert end.value.code == 0
+    epilog = capsys.readouterr().out.partition("Exit codes:")[2]
+    assert [int(line.split()[0]) for line in epilog.splitlines() if line.strip()] == [*ExitCode]
+
+
+def test_a_right_grid_is_confirmed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", "grid.yaml"]) == ExitCode.OK
+    assert capsys.readouterr().out == (
+        "grid.yaml: small is right: 2 trials, from tasks x agents x methods x seeds = 1 x 1 x 2 x 1\n"
+    )
+
+
+@pytest.mark.parametrize("command", [["validate"], ["plan"], ["launch", *INLINE]])
+def test_a_wrong_grid_starts_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("linear", "linea").replace("seeds: 1", "seeds: 0"))
+    assert main([*command, "grid.yaml"]) == ExitCode.WRONG_INPUT
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    first, second, last = shown.err.splitlines()
+    assert first.startswith("grid.yaml:4: methods.1: no teacher is called 'linea'; did you mean 'linear'?")
+    assert second == "grid.yaml:5: seeds: must be a number of seeds from 1 to 10000, or a list, got 0"
+    assert last == "2 mistakes in grid.yaml; nothing was started"
+    assert not (folder / "runs").exists()
+
+
+def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Plan, launch, plan again, status, figures: what a first user does."""
+    assert main(["plan", "grid.yaml", "--check"]) == ExitCode.TRIALS_LEFT
+    assert "small: 2 trials: 2 new" in capsys.readouterr().out
+    assert not (folder / "runs").exists()
+
+    assert main(["launch", "grid.yaml", "--executor", "inline", "--no-mlflow"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert "Results    runs/small\n" in out
+    assert "Figures    runs/small/figures\n" in out
+    assert "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n" in out
+    assert any((folder / "runs/small/figures").glob("*.png"))
+
+    assert main(["plan", "grid.yaml", "--check"]) == ExitCode.OK
+    assert "small: 2 trials: 2 complete\nnothing to do\n" in capsys.readouterr().out
+
+    for sweep in ([], ["small"], ["grid.yaml"]):
+        assert main(["status", "--brief", *sweep]) == ExitCode.OK
+        assert capsys.readouterr().out == "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
+
+    assert main(["figures", "small"]) == ExitCode.OK
+
+
+def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=linear", "seed=0"]) == ExitCode.OK
+    assert "small: 1 of 1 complete" in capsys.readouterr().out
+    assert main(["status", "--brief"]) == ExitCode.OK
+    assert "small: 1 of 2 complete, 0 running, 1 waiting" in capsys.readouterr().out
+
+
+def test_failed_trials_are_named_with_their_log(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "my_unlucky_student.py").write_text(UNLUCKY_STUDENT)
+    monkeypatch.syspath_prepend(folder)
+    (folder / "grid.yaml").write_text(
+        GRID.replace("[ppo-lag]", "[{name: 'my_unlucky_student:ENTRY', label: unlucky}]")
+    )
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
+    del sys.modules["my_unlucky_student"]
+    trial = SweepStore(Path("runs"), "small").trials()[0].folder.name
+    assert capsys.readouterr().out.splitlines()[-4:] == [
+        "small: 0 of 1 complete, 0 running, 0 waiting, 1 failed; 0%",
+        "failed: two-state unlucky none seed 0: ArithmeticError: no luck",
+        f"        log and traceback: runs/small/trials/{trial}",
+        "Try what failed again with: recrl-sweep launch grid.yaml --executor inline --no-mlflow --no-figures "
+        "--only method=none --retry-failed",
+    ]
+
+
+def test_a_busy_sweep_has_its_own_code(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with SweepStore(folder / "runs", "small").lock():
+        assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.BUSY
+    assert capsys.readouterr().err.startswith("recrl-sweep: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["status"], "runs: holds 0 sweeps; launch one first"),
+        (["status", "smal"], "runs: holds no sweep 'smal', nothing was launched there yet"),
+        (
+            ["plan", "grid.yaml", "--only", "linear"],
+            "--only: must look like method=dynamic or seed=0,1, got 'linear'",
+        ),
+        (
+            ["plan", "grid.yaml", "--only", "method=linaer"],
+            "--only: no trial has method 'linaer'; did you mean 'linear'? (known: none, linear)",
+        ),
+    ],
+)
+def test_wrong_arguments_are_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    assert main(arguments) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+
+
+def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("large", "small"):
+        store = SweepStore(folder / "runs", name)
+        store.folder.mkdir(parents=True)
+        store.info_path.write_text("{}")
+    assert main(["status"]) == ExitCode.WRONG_INPUT
+    assert main(["status", "smal"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.splitlines() == [
+        "recrl-sweep: runs: holds 2 sweeps; say which one: large, small",
+        "recrl-sweep: runs: holds no sweep 'smal'; did you mean 'small'? (there: large, small)",
+    ]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["lunch"], [], ["launch"], ["launch", "g.yaml", "--max-concurrent", "0"]]
+)
+def test_what_cannot_be_parsed_is_wrong_input(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == ExitCode.WRONG_INPUT
+
+
+def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
+    long = GRID.replace("total_steps: 160", "total_steps: 1e9")
+    (folder / "grid.yaml").write_text(long)
+    command = [sys.executable, "-m", "recrl.orchestrator.cli", "launch", "grid.yaml", *INLINE]
+    with subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "small: 2 trials: 2 new\n"  # from here on signals are handled
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (ExitCode.STOPPED, "")
+    assert out.splitlines()[-1] == (
+        "Stopped; nothing is lost. Go on with: recrl-sweep launch grid.yaml "
+        "--executor inline --no-mlflow --no-figures"
+    )
+    store = SweepStore(folder / "runs", "small")
+    assert tuple(store.specs()) == parse_grid(long.encode(), source="grid.yaml").trials()
+    assert not any(trial.record().status.is_finished for trial in store.trials())
+
+
+def test_the_module_runs_like_the_script(folder: Path) -> None:
+    command = [sys.executable, "-m", "recrl.orchestrator.cli", "--version"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("recrl ")
