@@ -3,6 +3,7 @@
     report.md                   what is missing, the tables, the list of the rest
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
+    diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence a method (PDF and PNG)
     return-against-cost         final policies under the frontier J*(d), where it is known (PDF and PNG)
     outcomes.csv                a row a trial and measure
     summary.csv                 averaged over seeds, with interquartile means
@@ -22,6 +23,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis import figures, frames, metrics, styles, tables
+from recrl.analysis.diagnostics import curriculum_diagnostics
 from recrl.analysis.frames import GROUP, Sweep
 from recrl.analysis.frontier import return_against_cost
 from recrl.analysis.intervals import ENOUGH_RUNS
@@ -59,9 +61,12 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
     drawn = []
     for agent in sweep.updates["agent"].cat.categories:
         if (sweep.updates["agent"] == agent).any():
-            stem = "learning-curves_" + re.sub(r"[^A-Za-z0-9.+-]+", "-", agent)
+            stem = f"learning-curves_{_safe(agent)}"
             drawn += styles.save(figures.learning_curves(sweep, agent), folder, stem)
     drawn += styles.save(figures.curricula(sweep), folder, "curricula")
+    for task, agent in sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist():
+        stem = f"diagnostics_{_safe(task)}_{_safe(agent)}"
+        drawn += styles.save(curriculum_diagnostics(sweep, task, agent), folder, stem)
     if (against := return_against_cost(sweep)) is not None:
         drawn += styles.save(against, folder, "return-against-cost")
     written, text = _tables(sweep, folder)
@@ -69,6 +74,11 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
     images = [f"![{path.stem}]({path.name})" for path in drawn if path.suffix == ".png"]
     report = tables.write_text("\n".join([*head, *images, "", *text]), folder / "report.md")
     return [report, *drawn, *written]
+
+
+def _safe(label: str) -> str:
+    """A label as part of a file's name."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "-", label)
 
 
 def missing(sweep: Sweep) -> list[str]:

@@ -12,7 +12,9 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from recrl.analysis import figures, frames, styles
+from recrl.analysis.diagnostics import curriculum_diagnostics
 from recrl.analysis.frames import METHOD_ORDER, Sweep
+from recrl.analysis.frontier import concave_frontier, return_against_cost
 from recrl.analysis.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
 from recrl.orchestrator.store import SweepStore
 
@@ -56,7 +58,7 @@ def test_the_limit_can_be_read_where_costs_start_high(finished: Sweep) -> None:
     costs = figures.learning_curves(finished, "cpo").axes[2]
     assert costs.get_yscale() == "symlog"
     assert 5.0 in costs.get_yticks()
-    assert costs.get_ylim()[0] == 0.0
+    assert -5.0 < costs.get_ylim()[0] < 0.0
 
 
 def test_low_costs_stay_on_a_linear_axis(finished: Sweep) -> None:
@@ -101,6 +103,54 @@ def test_one_seed_before_deployment_can_be_drawn(made_up_sweep: Callable[..., Sw
     sweep = frames.load(store)
     assert "not yet" in [text.get_text() for text in figures.learning_curves(sweep, "cpo").axes[1].texts]
     assert len(figures.curricula(sweep).axes) == 1
+
+
+def test_the_frontier_is_sampled_where_it_bends() -> None:
+    asked: list[float] = []
+
+    def optimum(limit: float) -> float:  # RiverGrid 1a: -20 + 5.9 d up to 5, then flat
+        asked.append(limit)
+        return min(-20.0 + 5.9 * limit, 9.5)
+
+    points = concave_frontier(optimum, 12.0, tolerance=0.05)
+    exact = [min(-20.0 + 5.9 * limit, 9.5) for limit in np.linspace(0.0, 12.0, 200)]
+    assert np.interp(np.linspace(0.0, 12.0, 200), *points.T) == pytest.approx(exact, abs=0.1 * 5.9)
+    assert len(asked) < 25
+
+
+def test_final_policies_lie_under_the_frontier_at_their_means(finished: Sweep) -> None:
+    figure = return_against_cost(finished)
+    assert figure is not None
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["river-a, ppo-lag", "river-a, cpo"]
+    frontier = np.asarray(lines_of(figure.axes[0], OPTIMUM_COLOUR)[0].get_xydata())
+    assert [5.0, 14.0] in frontier.tolist()
+    means = [np.asarray(marks.get_offsets()).tolist() for marks in figure.axes[0].collections[1::2]]
+    assert means[0] == [pytest.approx([(0.5 + 0.5 + 4.8) / 3, -22 / 3])]  # none
+    assert means[1] == [pytest.approx([4.8, 8.0])]
+
+
+def test_without_a_known_optimum_there_is_no_frontier(finished: Sweep) -> None:
+    trials = finished.trials.assign(optimal_return=np.nan)
+    assert return_against_cost(dataclasses.replace(finished, trials=trials)) is None
+
+
+def test_diagnostics_show_limit_cost_multiplier_and_noise(finished: Sweep) -> None:
+    figure = curriculum_diagnostics(finished, "river-a", "cpo")
+    assert len(figure.axes) == 3 * 3
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["none", "linear", "dynamic"]
+    assert [axes.get_ylabel() for axes in figure.axes[::3]] == ["cost", "multiplier", "KL divergence"]
+    dynamic = figure.axes[2]
+    assert len(lines_of(dynamic, LIMIT_COLOUR)) == 3
+    ticks = [line for line in dynamic.get_lines() if line.get_transform() == dynamic.get_xaxis_transform()]
+    at = {float(np.asarray(line.get_xdata())[0]) for line in ticks if line.get_color() != "black"}
+    assert at == {4_000.0, 8_000.0, 12_000.0}
+
+
+def test_diagnostics_mark_recovery_steps(finished: Sweep) -> None:
+    case = np.where(finished.updates["end_step"] == 800, 2.0, 1.0)
+    sweep = dataclasses.replace(finished, updates=finished.updates.assign(case=case))
+    panel = curriculum_diagnostics(sweep, "river-a", "cpo").axes[6]
+    assert [800.0, 800.0] in [list(np.asarray(line.get_xdata())) for line in panel.get_lines()]
 
 
 def test_known_methods_look_the_same_in_every_sweep() -> None:

@@ -28,6 +28,8 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "learning-curves_my-cpo.png",
         "curricula.pdf",
         "curricula.png",
+        "diagnostics_river-a_my-cpo.pdf",
+        "diagnostics_river-a_my-cpo.png",
         "return-against-cost.pdf",
         "return-against-cost.png",
         "training.csv",
