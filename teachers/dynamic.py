@@ -16,8 +16,8 @@ the letter wherever it is defined.
   or always (whoever must cross five tiles of river and slips once in a while costs 5.004), and C <= d would
   kick it for ever. C may exceed d by as much as line 5 lets equal costs differ, or by its standard error.
 - *The step* (line 7). B - b counts episodes, but a limit moves only once per window, so that the limits stay
-  far above d_d. Counted in windows that are left, the steps add up to the whole way. The last is not counted:
-  a student needs two windows to settle after a large step, and would meet d_d only at B otherwise.
+  far above d_d. Counted in windows that are left, the steps add up to the whole way. The last two are not
+  counted: so long a student may need to settle after a large step, and it would meet d_d only at B.
 - *Which limits a window was played under.* The newer window lies wholly after the last change (line 4); the
   older one may lie before it, so that a student who follows each change at once is not made to wait twice.
 - *last_change* is reset when limits or policy have changed; line 11 also resets it when nothing has.
@@ -136,7 +136,7 @@ class DynamicConfig(BaseModel):
     )
     remaining: Literal["windows", "episodes"] = Field(
         default="windows",
-        description="What the step of line 7 divides by: the windows that are left but the last, which "
+        description="What the step of line 7 divides by: the windows that are left but two, which "
         "reaches deploy_limits before B, or the episodes that are left (literal), which does not.",
     )
     dimensions: Literal["separate", "joint"] = Field(
@@ -280,16 +280,16 @@ def steps_left(
 
     B is given in environment steps; how many episodes it holds is known only afterwards. The last window
     took some steps and finished some episodes, so what is left holds (B - env steps) / steps such windows,
-    and as many times its episodes. Rounded down. Of the windows, the last is not counted.
+    and as many times its episodes. Rounded down. The last two windows are not counted.
 
     >>> last = Stretch(env_steps=1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
-    [3, 36]
+    [2, 36]
     """
     steps = train_steps - env_steps
     if unit == "episodes":
         return steps * last.episodes // max(1, last.env_steps)
-    return steps // max(1, last.env_steps) - 1
+    return steps // max(1, last.env_steps) - 2
 
 
 class DynamicTeacher:

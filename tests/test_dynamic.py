@@ -178,7 +178,7 @@ def test_a_dimension_that_is_never_constrained_stays_so() -> None:
 
 def test_steps_left_are_estimated_from_the_last_window() -> None:
     last = Stretch(env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
-    assert steps_left(last, env_steps=4000, train_steps=5000, unit="windows") == 2  # 3 windows fit
+    assert steps_left(last, env_steps=4000, train_steps=5000, unit="windows") == 1  # 3 windows fit
     assert steps_left(last, env_steps=4000, train_steps=5000, unit="episodes") == 20
 
 
@@ -237,14 +237,14 @@ def test_the_first_judgement_takes_two_windows_and_every_other_one() -> None:
     ],
 )
 @pytest.mark.parametrize("deploy", [0.0, 5.0, 25.0])
-def test_an_ideal_student_is_led_to_d_d_a_window_before_the_end(
+def test_an_ideal_student_is_led_to_d_d_two_windows_before_the_end(
     options: dict[str, Any], episodes: int, updates_in_a_window: int, deploy: float
 ) -> None:
     run = play(
         obedient, train=(250.0,), deploy=(deploy,), updates=285, episodes=lambda lesson: episodes, **options
     )
     steps = [before[0] - after[0] for before, after in zip(run.limits, run.limits[1:], strict=False)]
-    assert run.limits[-1 - updates_in_a_window] == (deploy,)
+    assert run.limits[-1 - 2 * updates_in_a_window] == (deploy,)
     assert max(steps) < 16.0
     assert not any(run.noise)
 
@@ -270,7 +270,7 @@ def test_a_student_that_stays_and_then_crosses_is_judged_in_both_regimes(
         **options,
     )
     kicks_before, kicks_after = (sum(noise > 0.0 for noise in run.noise[part]) for part in SPLIT_AT_100)
-    assert run.limits[98][0] == pytest.approx(80.0 - 6 * 75.0 / 54)  # 80 is more than a tenth above that
+    assert run.limits[98][0] == pytest.approx(80.0 - 6 * 75.0 / 53)  # 80 is more than a tenth above that
     assert kicks_before == 7  # at 40, 50, ..., 100
     assert 20.0 < run.limits[150][0] < 40.0
     assert kicks_after == 0
@@ -366,11 +366,11 @@ def test_an_infinite_start_is_kept_until_the_first_judgement_or_measured() -> No
         return 9.5, (65.0,)
 
     kept = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40, start_updates=0)
-    assert kept.limits[8:10] == [(math.inf,), (53.0,)]  # 65 - 60 / 5: six windows are left
+    assert kept.limits[8:10] == [(math.inf,), (50.0,)]  # 65 - 60 / 4: six windows are left
     assert kept.state["start_limits"] == ["inf"]
     measured = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40)
     assert measured.limits[0] == (65.0,)
-    assert measured.limits[8:10] == [(65.0,), (53.0,)]
+    assert measured.limits[8:10] == [(65.0,), (50.0,)]
     assert measured.state["start_limits"] == [65.0]
 
 
