@@ -20,6 +20,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 import tempfile
 import threading
 import time
@@ -31,8 +32,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import ray
-from ray import tune
-from ray.exceptions import AuthenticationError, RayTaskError
+from ray import cloudpickle, tune
+from ray.exceptions import RayError, RayTaskError
 from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
@@ -41,6 +42,7 @@ from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 
 STOP_QUESTION_SECONDS = 0.5
+CONNECT_SECONDS = 5.0
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
 LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
 
@@ -167,9 +169,6 @@ class TuneTrial(tune.Trainable):
 
     def setup(self, config: dict[str, Any]) -> None:
         """Get ready for the first trial."""
-        import torch  # noqa: PLC0415  (the driver, which imports this module too, does without)
-
-        torch.set_num_threads(1)
         self._take(config)
 
     def reset_config(self, new_config: dict[str, Any]) -> bool:
@@ -183,7 +182,7 @@ class TuneTrial(tune.Trainable):
         Raises:
             TeacherUnavailableError: the teacher is gone; Tune tries the trial again.
         """
-        from recrl.orchestrator.trial import run_recorded  # noqa: PLC0415  (imports torch)
+        from recrl.orchestrator.trial import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
         if not self._stop_file.is_set():
             run_recorded(
@@ -277,15 +276,12 @@ class _Watch(tune.Callback):
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
-        error = trial.get_pickled_error()
-        cause = error.cause if isinstance(error, RayTaskError) else error
+        cause = _last_error(trial)
         files = self._store.trial(TrialSpec.from_json(json.loads(trial.config["spec"])))
         if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
-            files.set_status(
-                TrialState.FAILED,
-                error=f"its process failed {trial.num_failures} times, "
-                f"the last time by {type(cause).__name__}: {_first_line(cause)}",
-            )
+            what = f"{type(cause).__name__}: {_first_line(cause)}" if cause else "unknown"
+            error = f"failures of its process: {trial.num_failures}; the last: {what}"
+            files.set_status(TrialState.FAILED, error=error)
 
     def __getstate__(self) -> dict[str, Any]:
         """Nothing: Tune pickles its callbacks to restore them, which nobody does, and events cannot be."""
@@ -329,6 +325,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
                 os.environ.pop(name, None)  # Ray looks at its mode only where it sets it itself
             with _connection(
                 "cannot start Ray on this machine",
+                hint="",
                 address="local",
                 num_cpus=num_cpus,
                 include_dashboard=False,
@@ -343,32 +340,33 @@ def existing_cluster(address: str) -> Iterator[None]:
     """A connection to a Ray cluster that somebody else runs.
 
     Args:
-        address: ``auto`` or ``host:port``.
+        address: ``auto`` for the one this machine belongs to, or ``host:port``.
 
     Raises:
         ClusterError: there is none, or it does not know our token.
     """
-    with _connection(
-        f"cannot use the Ray cluster at {address}", address=address, runtime_env={"env_vars": WORKER}
-    ):
+    failure = f"cannot use the Ray cluster at {address}"
+    host, _, port = address.rpartition(":")
+    if host:  # Ray itself would try for two minutes
+        try:
+            socket.create_connection((host, int(port)), timeout=CONNECT_SECONDS).close()
+        except (OSError, ValueError) as error:
+            raise ClusterError(f"{failure}: {error}; is it running, and is this host:port?") from error
+    hint = "; does it want a token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
+    with _connection(failure, hint, address=address, runtime_env={"env_vars": WORKER}):
         yield
 
 
 @contextmanager
-def _connection(failure: str, **settings: Any) -> Iterator[None]:
+def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
     try:
+        # No public switch keeps Ray from printing a paragraph about every dead process.
+        ray._private.worker._worker_logs_enabled = False
         try:
-            # No public switch keeps Ray from printing a paragraph about every dead process.
-            ray._private.worker._worker_logs_enabled = False
             with _own_signal_handlers():
-                ray.init(log_to_driver=False, logging_level=logging.ERROR, **settings)
-        except AuthenticationError as error:
-            raise ClusterError(
-                f"{failure}: it does not accept our token; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH "
-                "to the cluster's token file before starting"
-            ) from error
-        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-            raise ClusterError(f"{failure}: {_first_line(error)}") from error
+                ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
+        except (RayError, RuntimeError, OSError, ValueError) as error:
+            raise ClusterError(f"{failure}: {_first_line(error)}{hint}") from error
         yield
     finally:
         ray.shutdown()
@@ -397,7 +395,8 @@ def _own_signal_handlers() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if handler is not None:  # None is one that was not installed from Python
+                signal.signal(number, handler)
 
 
 @cache
@@ -415,5 +414,14 @@ def _tune_trial_id(trial: Any) -> str:
     return str(trial.trial_id)
 
 
-def _first_line(error: BaseException | None) -> str:
+def _last_error(trial: Any) -> BaseException | None:
+    """What a Tune trial failed of, last."""
+    path = trial.pickled_error_file
+    if path is None:
+        return None
+    error: BaseException = cloudpickle.loads(Path(path).read_bytes())  # Tune wrote it a moment ago
+    return error.cause if isinstance(error, RayTaskError) else error
+
+
+def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "")

@@ -18,18 +18,12 @@ import ray
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
-from recrl.orchestrator.ray_executor import RayExecutor, StopFile, local_cluster
+from recrl.orchestrator.ray_executor import RayExecutor, StopFile, existing_cluster, local_cluster
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.teacher_service import RayTeacher, start_teacher_service
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, TeacherSpec
-
-# Ray's driver leaves its log files and sockets to the garbage collector.
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
 
 LINEAR = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
@@ -48,6 +42,7 @@ DYNAMIC = replace(LINEAR, method=Choice("dynamic", {"window": 2}), agent=Choice(
 SWEEP = (LINEAR, DYNAMIC, replace(LINEAR, seed=1), replace(DYNAMIC, seed=1))
 LONG = replace(LINEAR, train_steps=150 * 40, seed=2)
 BROKEN = replace(LINEAR, method=Choice("linear", {"windw": 8}))
+CRASHING = replace(LINEAR, task=Choice("os:abort"))
 
 
 @pytest.fixture(scope="module")
@@ -95,17 +90,20 @@ def once(condition: Callable[[], bool], act: Callable[[], object]) -> Iterator[N
 
 
 @pytest.mark.usefixtures("cluster")
-def test_equal_bytes_in_reused_workers_and_one_failure_stops_nobody(
+def test_equal_bytes_in_reused_workers_and_failures_stop_nobody(
     tmp_path: Path, inline: SweepStore, capfd: pytest.CaptureFixture[str]
 ) -> None:
     store = SweepStore(tmp_path, "sweep")
-    RayExecutor().run((BROKEN, *SWEEP), store, threading.Event())
+    RayExecutor(max_failures=0).run((BROKEN, *SWEEP, CRASHING), store, threading.Event())
     assert_equal_bytes(SWEEP, store, inline)
     assert len({store.trial(spec).record().pid for spec in SWEEP}) <= 2
     failed = store.trial(BROKEN).record()
     assert failed.status is TrialState.FAILED
     assert failed.attempt == 1
     assert failed.error.startswith("ValidationError: ")
+    crashed = store.trial(CRASHING).record()
+    assert crashed.status is TrialState.FAILED
+    assert crashed.error.startswith("failures of its process: 1; the last: ActorDiedError: The actor died")
     assert [path.name for path in store.folder.iterdir()] == ["trials"]
     assert capfd.readouterr().out == ""
 
@@ -249,6 +247,14 @@ def test_only_this_user_can_read_the_clusters_token() -> None:
 @pytest.mark.usefixtures("cluster")
 def test_rays_signal_handlers_do_not_replace_ours() -> None:
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_cluster_that_is_not_there_is_a_sentence() -> None:
+    with (
+        pytest.raises(ClusterError, match=r"^cannot use the Ray cluster at 127\.0\.0\.1:1: .*refused; is it"),
+        existing_cluster("127.0.0.1:1"),
+    ):
+        pass
 
 
 def test_a_stop_file_tells_its_own_run_and_all_earlier_ones(tmp_path: Path) -> None:
