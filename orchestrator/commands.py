@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import re
 import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -280,7 +281,8 @@ def _short(path: Path) -> Path:
 
 
 def _say(console: Console, sentence: str) -> None:
-    """One line as it is: no markup, no colours, no wrapping."""
+    """One line as it is, but for passwords in addresses: no markup, no colours, no wrapping."""
+    sentence = re.sub(r"(://[^\s:/@]*):[^\s@]+@", r"\1:***@", sentence)
     console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 

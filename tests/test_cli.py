@@ -154,6 +154,20 @@ def test_failed_trials_are_named_with_their_log(
     ]
 
 
+def test_no_password_is_printed(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "my_unlucky_student.py").write_text(UNLUCKY_STUDENT)
+    monkeypatch.syspath_prepend(folder)
+    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_unlucky_student:ENTRY'"))
+    uri = "postgresql://me:hunter2@database/mlflow"
+    assert main(["launch", "grid.yaml", *INLINE, "--tracking-uri", uri]) == ExitCode.TRIALS_FAILED
+    del sys.modules["my_unlucky_student"]
+    out = capsys.readouterr().out
+    assert "--tracking-uri postgresql://me:***@database/mlflow --retry-failed" in out
+    assert "hunter2" not in out
+
+
 def test_a_busy_sweep_has_its_own_code(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with SweepStore(folder / "runs", "small").lock():
         assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.BUSY
