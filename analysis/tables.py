@@ -23,6 +23,8 @@ LATEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "±": r"$\pm$", "≤": 
 def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
     """Return, costs, gap to the optimum and share of feasible seeds, as text.
 
+    The gap is only an honest score where the seeds are feasible: who breaks the limit can be above J*(d_d).
+
     Args:
         summary: of ``metrics.summary``.
         measure: which of the three outcomes.
@@ -35,7 +37,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         for name in costs:
             title = "cost" if len(costs) == 1 else f"cost {int(name[5:]) + 1}"
-            line[title] = with_error(row[name], row[f"{name}_se"])
+            line[title] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
             line[f"limit of {title}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["optimum"] = number(row["optimal_return"])
         line["gap"] = with_error(row["gap"], row["gap_se"])
@@ -82,16 +84,24 @@ def number(value: float) -> str:
     return f"{value:.{digits}f}"
 
 
-def with_error(mean: float, error: float) -> str:
-    """Mean ± standard error, the error left out where one seed has none, in the same digits.
+def with_error(mean: float, error: float, *, digits: int = 2) -> str:
+    """Mean ± standard error, the error left out where one seed has none.
+
+    Args:
+        mean: NaN becomes a dash.
+        error: of the mean, or NaN.
+        digits: after the point; one is enough from 100 on.
 
     >>> with_error(9.41, 0.05), with_error(9.41, float("nan")), with_error(-20.0, 0.0)
     ('9.41 ± 0.05', '9.41', '-20.00 ± 0.00')
+    >>> with_error(5.002, 0.001, digits=3), with_error(-0.001, 0.012)
+    ('5.002 ± 0.001', '0.00 ± 0.01')
     """
     if math.isnan(mean):
         return DASH
-    digits = 1 if abs(mean) >= 100.0 else 2
-    return f"{mean:.{digits}f}" if math.isnan(error) else f"{mean:.{digits}f} ± {error:.{digits}f}"
+    shown = 1 if abs(mean) >= 100.0 else digits
+    value = round(mean, shown) + 0.0  # no -0.00
+    return f"{value:.{shown}f}" if math.isnan(error) else f"{value:.{shown}f} ± {error:.{shown}f}"
 
 
 def with_interval(row: pd.Series, name: str) -> str:

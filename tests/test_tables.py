@@ -19,7 +19,7 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
         "method": "none",
         "seeds": "3",
         "return": "-7.33 ± 7.67",
-        "cost": "1.93 ± 1.43",
+        "cost": "1.933 ± 1.433",
         "limit of cost": "5.00",
         "optimum": "14.00",
         "gap": "21.33 ± 7.67",
