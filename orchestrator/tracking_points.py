@@ -33,7 +33,7 @@ from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.store import UPDATE_COLUMNS
 
-POINTS_PER_METRIC = 200
+POINTS_PER_METRIC = 100
 MAX_PARAMS = 100  # of a request
 MAX_NOTE = 7_500  # characters; MLflow takes 8,000 in a tag
 
@@ -50,7 +50,6 @@ VIEW_STATE = {
         *(f"params.`{name}`" for name in ("task", "agent", "method")),
         *(f"metrics.`{name}`" for name in ("summary/deploy_return", "summary/deploy_cost_0")),
     ],
-    "columnWidths": {"attributes.`Run Name`": 330},
     "compareRunCharts": [],
     "compareRunSections": [
         {
