@@ -94,6 +94,7 @@ class PPOLagConfig(StudentConfig):
 
     paper: ClassVar[Mapping[str, Any]] = {
         **STARTER_AGENTS_SETTING,
+        "policy_learning_rate": 3e-4,
         "policy_steps": 80,
         "cost_advantages": "centred",
         "penalty": "separate",
@@ -102,9 +103,12 @@ class PPOLagConfig(StudentConfig):
         "multiplier_step": 0.05,
     }
 
-    policy_learning_rate: Positive = Field(default=3e-4, description="Adam's, for the policy (paper).")
+    policy_learning_rate: Positive = Field(
+        default=1e-3,
+        description="Adam's, for the policy; the KL keeps it in bounds (ours; paper 3e-4).",
+    )
     policy_steps: Count = Field(
-        default=40, description="Full-batch steps of the policy an update, at most (ours; paper 80)."
+        default=20, description="Full-batch steps of the policy an update, at most (ours; paper 80)."
     )
     clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
         default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
@@ -125,9 +129,9 @@ class PPOLagConfig(StudentConfig):
         description="Clip the surrogate of reward minus multiplied costs (ours) or the reward's (paper).",
     )
     multiplier_rule: Literal["projected", "softplus-adam", "pid"] = Field(
-        default="projected",
-        description="How multipliers move: projected dual ascent (ours), softplus with Adam (paper), or PID "
-        "(Stooke et al. 2020).",
+        default="pid",
+        description="How multipliers move: PID, a damped dual ascent (Stooke et al. 2020; ours), plain "
+        "projected dual ascent, or softplus with Adam (paper).",
     )
     multiplier_initial: NonNegative = Field(
         default=0.0, description="First value of every multiplier (ours; paper 1)."
@@ -138,10 +142,10 @@ class PPOLagConfig(StudentConfig):
         "paper 0.05).",
     )
     multiplier_proportional: NonNegative = Field(
-        default=0.1, description="K_P of the PID rule, per unit of episode cost (ours)."
+        default=0.2, description="K_P of the PID rule, per unit of episode cost (ours)."
     )
     multiplier_derivative: NonNegative = Field(
-        default=0.01, description="K_D of the PID rule, per unit of episode cost (ours)."
+        default=0.0, description="K_D of the PID rule, per unit of episode cost (ours)."
     )
     multiplier_maximum: Positive = Field(
         default=1000.0,

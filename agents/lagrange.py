@@ -8,8 +8,9 @@ constraint: its multiplier is 0 and the rest of its state stands still.
 A state is a dict of float64 arrays [k], so that a checkpoint can hold it as it is; ``multipliers`` is in
 each. Letters: k costs.
 
-Which to use: ``projected_ascent`` cannot wind down below 0 nor remember old violations, so it answers a limit
-that moves at once. ``softplus_adam`` does both; it is kept because the paper's students use it.
+Which to use: ``projected_ascent`` alone is an integrator, and so it swings about the limit; the proportional
+term of ``pid`` damps it. Neither winds down below 0 nor remembers old violations, so both answer at once when
+the limit moves. ``softplus_adam`` winds down and remembers; it is kept because the paper's students use it.
 """
 
 from __future__ import annotations
