@@ -72,6 +72,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             axes.set_ylabel({"kl": "KL divergence"}.get(quantity, quantity.split("_")[0]), fontsize=7.0)
             if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
                 axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
+                axes.set_ylim(bottom=-0.3)
         _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}")
     return figure
 
