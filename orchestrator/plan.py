@@ -17,7 +17,7 @@ from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore
 from recrl.orchestrator.validation import nearest
 
 # Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the mirror;
-# measured on a 2-core machine with Ray 2.60 and torch 2.13. A task's own buffers come on top.
+# rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers come on top.
 GIGABYTES_PER_TRIAL = 0.35
 GIGABYTES_AROUND = 1.2
 
