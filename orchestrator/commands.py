@@ -25,7 +25,7 @@ from recrl.orchestrator.plan import Plan, estimate, make_plan, trials_at_once
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.sweep import Mirror, SweepResult, launch, stopping_on_signals
-from recrl.orchestrator.tracking import last_report, log_figures, sync, tracking_uri
+from recrl.orchestrator.tracking import last_report, sync, tracking_uri
 from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_ui import open_ui
 from recrl.orchestrator.validation import nearest
@@ -68,7 +68,6 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     executor = _executor(grid, arguments)
     uri = tracking_uri(store, arguments.tracking_uri) if arguments.mlflow else None
     stop = threading.Event()
-    drawn: list[Path] = []
 
     def watch(plan: Plan) -> None:
         _say_plan(plan, grid, arguments, console)
@@ -79,7 +78,7 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     def finish(after: SweepProgress) -> None:
         shown.close()
         if arguments.figures and not stop.is_set() and after.counts[Standing.COMPLETE]:
-            drawn.extend(_draw(store, console))
+            _draw(store, console)
 
     def say_stopping() -> None:
         _say(console, "Stopping: running trials save where they are. Once more to stop at once.")
@@ -96,8 +95,6 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
             watch=watch,
             finish=finish,
         )
-        if uri and drawn:
-            log_figures(store, uri, drawn)
     _say(console, f"Results    {_short(store.folder)}")
     if uri:
         _say_mirrored(store, uri, arguments, console)
@@ -206,12 +203,11 @@ def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
     return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
 
 
-def _draw(store: SweepStore, console: Console) -> list[Path]:
+def _draw(store: SweepStore, console: Console) -> None:
     from recrl.analysis.report import draw  # noqa: PLC0415  (imports matplotlib)
 
-    drawn = draw(store, store.figures_folder)
+    draw(store, store.figures_folder)
     _say(console, f"Figures    {_short(store.figures_folder)}")
-    return drawn
 
 
 def _say_plan(plan: Plan, grid: GridSpec, arguments: argparse.Namespace, console: Console) -> None:

@@ -141,11 +141,6 @@ def sync(store: SweepStore, uri: str, *, rebuild: bool = False) -> SyncReport:
     return Tracker(store, uri).bring_up_to_date(live=False, rebuild=rebuild)
 
 
-def log_figures(store: SweepStore, uri: str, paths: Sequence[Path]) -> SyncReport:
-    """``sync``, with files that are not in the sweep's own ``figures`` folder shown beside those."""
-    return Tracker(store, uri).bring_up_to_date(live=False, figures=paths)
-
-
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:
     """The report of the last pass that ended, in whatever process; None if there was none."""
     try:
@@ -162,15 +157,12 @@ class Tracker:
         self.uri = uri
         self._view: _View | None = None
 
-    def bring_up_to_date(
-        self, *, live: bool, rebuild: bool = False, figures: Sequence[Path] = ()
-    ) -> SyncReport:
+    def bring_up_to_date(self, *, live: bool, rebuild: bool = False) -> SyncReport:
         """One pass; whatever MLflow raises ends up in the report.
 
         Args:
             live: whether a launch is there that will resume what waits.
             rebuild: delete what MLflow has of the sweep first.
-            figures: files to show beside those in the sweep's ``figures`` folder.
         """
         trials = [trial for trial in self.store.trials() if trial.record().attempt]
         sent, done, problems = 0, 0, []
@@ -186,7 +178,7 @@ class Tracker:
                         if _is_away(error):
                             raise
                         problems.append(f"{trial.folder.name}: {_one_line(error)}")
-                view.show_sweep(figures, live=live)
+                view.show_sweep(live=live)
             except Exception as error:
                 problems.append(_one_line(error))
             report = SyncReport(
@@ -294,7 +286,7 @@ class _View:
         self._save(trial, replace(position, shown=shown))
         return len(metrics)
 
-    def show_sweep(self, figures: Sequence[Path], *, live: bool) -> None:
+    def show_sweep(self, *, live: bool) -> None:
         """Bring the parent run up to date: its note, its status, the grid and the figures."""
         from mlflow.entities import RunTag  # noqa: PLC0415
 
@@ -317,8 +309,7 @@ class _View:
             last = max((record.heartbeat for record in records.values()), default=0.0)
             self._set_status(position.run_id, status, last or time.time())
         position = self._send_files(position, [self.store.grid_path, self.store.info_path])
-        drawn = sorted(self.store.figures_folder.glob("*"))
-        position = self._send_files(position, [*drawn, *figures], "figures")
+        position = self._send_files(position, sorted(self.store.figures_folder.glob("*")), "figures")
         position = replace(position, shown={"note": text, "status": status})
         if position != self._parent:
             write_json(self._parent_path, asdict(position))

@@ -7,14 +7,11 @@ import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
-from contextlib import suppress
 from dataclasses import dataclass
 
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.tracking import is_server, last_report, mirror_folder
+from recrl.orchestrator.tracking import is_server, last_report, mirror_folder, sync
 from recrl.orchestrator.tracking_points import charts_page
 
 # Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.
@@ -72,24 +69,29 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 1
     Raises:
         TrackingError: the port is taken, or the server does not start.
     """
+    if not is_server(uri) and _answers(port):
+        raise TrackingError(f"port {port} of 127.0.0.1 is taken by another program; choose another port")
+    if last_report(store, uri) is None:
+        sync(store, uri)
     url = ui_url(store, uri, port=port)
     if is_server(uri):
         return UI(url, None)
-    with socket.socket() as probe:
-        if probe.connect_ex(("127.0.0.1", port)) == 0:
-            raise TrackingError(f"port {port} of 127.0.0.1 is taken by another program; choose another port")
     command = ui_command(store, uri, port=port)
     log_path = mirror_folder(store, uri) / "ui.txt"
-    log_path.parent.mkdir(parents=True, exist_ok=True)
     with log_path.open("wb") as log:
-        ui = UI(url, subprocess.Popen(command, stdout=log, stderr=log))
+        server = subprocess.Popen(command, stdout=log, stderr=log)
     end = time.monotonic() + timeout
-    while time.monotonic() < end and ui.process and ui.process.poll() is None:
-        with suppress(urllib.error.URLError, ConnectionError, TimeoutError):
-            urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5.0).close()
-            return ui
+    while time.monotonic() < end and server.poll() is None:
+        if _answers(port):
+            return UI(url, server)
         time.sleep(0.2)
-    ui.close()
+    UI(url, server).close()
     raise TrackingError(
         f"MLflow's server did not start; its output is in {log_path}, the command was {shlex.join(command)}"
     )
+
+
+def _answers(port: int) -> bool:
+    """Whether a program takes connections on a port of this machine's own address."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -21,7 +21,7 @@ from recrl.orchestrator import tracking
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
-from recrl.orchestrator.tracking import log_figures, run_status, sync, tracking_uri
+from recrl.orchestrator.tracking import run_status, sync, tracking_uri
 from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_points import (
     Summary,
@@ -32,6 +32,7 @@ from recrl.orchestrator.tracking_points import (
     rows_after,
     thinned,
 )
+from recrl.orchestrator.tracking_ui import open_ui, ui_command, ui_url
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -447,7 +448,9 @@ def test_figures_are_artifacts_of_the_parent_and_survive_a_rebuild(write: Callab
     store.figures_folder.mkdir()
     path = store.figures_folder / "curves.png"
     path.write_bytes(b"png")
-    assert log_figures(store, uri, [path]).problem == ""
+    sync(store, uri)
+    path.write_bytes(b"better png")
+    sync(store, uri)
     sync(store, uri, rebuild=True)
     parent = runs(store)["made-up"].info.run_id
     assert [file.path for file in connect(store).list_artifacts(parent, "figures")] == ["figures/curves.png"]
@@ -490,6 +493,32 @@ def test_what_was_missed_is_sent_when_mlflow_is_back(
     database.replace(store.mlflow_database)
     assert sync(store, uri).is_up_to_date
     assert tracking.last_report(store, uri) is not None
+
+
+# MLflow's pages
+
+
+def test_the_pages_of_a_database_are_served_to_this_machine_only(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "demo")
+    command = ui_command(store, tracking_uri(store, None), port=5001)
+    assert command[command.index("--host") + 1] == "127.0.0.1"
+    assert command[command.index("--port") + 1] == "5001"
+    assert "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false" in command
+
+
+def test_a_server_has_its_own_pages(tmp_path: Path) -> None:
+    assert ui_url(SweepStore(tmp_path, "demo"), "http://mlflow:5000/") == "http://mlflow:5000"
+
+
+def test_a_taken_port_is_named(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "demo")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(TrackingError) as caught:
+            open_ui(store, tracking_uri(store, None), port=port)
+    assert str(caught.value) == (f"port {port} of 127.0.0.1 is taken by another program; choose another port")
 
 
 # The process
