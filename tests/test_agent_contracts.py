@@ -157,6 +157,12 @@ def test_noise_returns_the_same_metrics_and_keeps_the_student_learning(agent: st
 
 
 @every_agent
+def test_the_paper_preset_learns_with_the_same_metrics(agent: str) -> None:
+    paper = Lessons(agent, "continuous-bandit", {"preset": "paper"})
+    assert set(paper.update()) == set(Lessons(agent, "continuous-bandit").update())
+
+
+@every_agent
 def test_a_reward_that_is_not_a_number_is_named(agent: str) -> None:
     lessons = Lessons(agent, "two-state")
     rollout, episodes = lessons.collect()
