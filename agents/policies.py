@@ -27,6 +27,8 @@ from recrl.agents.spaces import action_size
 
 # safety-starter-agents' and the usual start of a Gaussian policy's spread.
 INITIAL_LOG_STD = -0.5
+# Noise 1 would make a tempered Gaussian infinitely wide; it becomes a thousand times wider.
+SMALLEST_TEMPERING = 1e-3
 
 
 class StochasticPolicy:
@@ -155,7 +157,7 @@ class StochasticPolicy:
     def _widen(self, noise: float, form: str) -> dict[str, float]:
         before = self.log_std.numpy().astype(np.float64)
         if form == "temperature":
-            after = before - np.log(max(1.0 - noise, 1e-3))
+            after = before - np.log(max(1.0 - noise, SMALLEST_TEMPERING))
         else:
             after = matching_log_std(before, self._half_ranges, noise)
         self.log_std.copy_(torch.from_numpy(after))
