@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import re
 import shlex
+import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -126,6 +127,8 @@ def run_ui(arguments: argparse.Namespace, console: Console) -> ExitCode:
     _say(console, f"Open {ui.url}")
     if ui.process is not None:
         _say(console, "Ctrl-C ends it.")
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
         try:
             ui.process.wait()
         except KeyboardInterrupt:

@@ -25,8 +25,9 @@ def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
     """
     if is_server(uri):
         return [sys.executable, "-m", "webbrowser", "-t", ui_url(store, uri)]
-    server = [sys.executable, "-m", "mlflow", "server", "--backend-store-uri", uri]
-    return ["env", *SETTINGS, *server, "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    stores = ["--backend-store-uri", uri, "--artifacts-destination", str(store.mlflow_artifacts)]
+    address = ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    return ["env", *SETTINGS, sys.executable, "-m", "mlflow", "server", *stores, *address]
 
 
 def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
