@@ -5,13 +5,15 @@ the robot's x axis. An object at distance d reads max(0, 1 - d / 3) in its own s
 two next to it as it nears them ("aliasing"). Of several objects, each sector shows the one that reads most
 there.
 
-Letters: P objects, B environments, 16 sectors.
+Letters: P objects, B environments, G kinds of objects, 16 sectors.
 
-Source: openai/safety-gym ``engine.py``, ``obs_lidar_pseudo`` with ``lidar_num_bins`` 16, ``lidar_max_dist``
-3 and ``lidar_alias``.
+Source: openai/safety-gym ``engine.py``, ``obs_lidar_pseudo`` with ``lidar_num_bins`` 16, ``lidar_max_dist`` 3
+and ``lidar_alias``.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -24,47 +26,54 @@ Reading = npt.NDArray[np.float32]
 _HALF = LIDAR_BINS / 2
 _CENTRES = ((np.arange(LIDAR_BINS) + 0.5 + _HALF) % LIDAR_BINS - _HALF).astype(np.float32)
 _SECTORS_PER_RADIAN = np.float32(LIDAR_BINS / (2.0 * np.pi))
+_NEARNESS = np.float32(-1.0 / LIDAR_RANGE)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
-def egocentric(offsets: Floats, height: Floats, rotation: Floats) -> Reading:
+def egocentric(points: Floats, rotation: Floats, place: Floats) -> Reading:
     """Where objects on the floor lie in the robot's frame, as seen from above.
 
-    ego = ((x, y, 0) - robot position) R, of which the first two numbers.
+    ego = ((x, y, 0) - robot position) R = (x, y, 0) R - (robot position) R, of which the first two numbers.
 
     Args:
-        offsets: (x, y) of the objects minus those of the robot, metres, [2, P, B].
-        height: of the robot, metres, [B].
+        points: (x, y) of the objects, metres, [B, P, 2].
         rotation: R, from the robot's frame to the world's, [B, 3, 3].
+        place: (robot position) R, metres, [B, 3].
 
     Returns:
-        metres, [2, P, B].
+        metres, [P, B, 2].
     """
-    x, y = offsets
-    ego = np.empty(offsets.shape, np.float32)
-    for axis in (0, 1):
-        ego[axis] = x * rotation[:, 0, axis] + y * rotation[:, 1, axis] - height * rotation[:, 2, axis]
+    ego = np.empty((points.shape[1], points.shape[0], 2), np.float32)
+    turned = points @ rotation[:, :2, :2]
+    np.subtract(turned.transpose(1, 0, 2), place[:, :2], out=ego, casting="same_kind")
     return ego
 
 
-def closeness(ego: Reading) -> Reading:
-    """What every single object would read: max(0, 1 - d / 3) clip(3/2 - t, 0, 1).
+def lidar(ego: Reading, kinds: Sequence[slice], out: Reading) -> None:
+    """Write the readings: for each kind of object the greatest max(0, 1 - d / 3) clip(3/2 - t, 0, 1).
 
-    t is the angle between the object and a sector's middle, in sectors: the weight is 1 within the object's
-    own sector and falls to 0 across the next.
+    t is the angle between an object and a sector's middle, in sectors: the weight is 1 within the object's
+    own sector and falls to 0 across the next. With a the plain difference of the two angles, at most a
+    whole turn, the shorter way round is t = 8 - |8 - |a||.
 
     Args:
-        ego: objects in the robot's frame, [2, P, B].
-
-    Returns:
-        in [0, 1], [P, B, 16].
+        ego: objects in the robot's frame, those of a kind together, [P, B, 2].
+        kinds: where in P each kind is, G of them.
+        out: for the readings, in [0, 1], [B, G, 16].
     """
-    x, y = ego
-    reach = np.maximum(np.float32(0.0), 1 - np.sqrt(x * x + y * y) * np.float32(1 / LIDAR_RANGE))
-    sector = np.arctan2(y, x) * _SECTORS_PER_RADIAN
-    weight = np.abs(sector[..., None] - _CENTRES)
-    np.minimum(weight, LIDAR_BINS - weight, out=weight)
-    np.subtract(np.float32(1.5), weight, out=weight)
-    np.maximum(weight, np.float32(0.0), out=weight)
-    np.minimum(weight, np.float32(1.0), out=weight)
-    weighted: Reading = weight * reach[..., None]
-    return weighted
+    x, y = ego[..., 0], ego[..., 1]
+    reach = np.hypot(x, y)
+    reach *= _NEARNESS
+    reach += _ONE
+    np.maximum(reach, _ZERO, out=reach)
+    sector = np.arctan2(y, x)
+    sector *= _SECTORS_PER_RADIAN
+    weight = sector[..., None] - _CENTRES
+    np.abs(weight, out=weight)
+    weight -= np.float32(_HALF)
+    np.abs(weight, out=weight)
+    weight -= np.float32(_HALF - 1.5)
+    np.minimum(weight, _ONE, out=weight)
+    weight *= reach[..., None]
+    for index, kind in enumerate(kinds):
+        np.maximum.reduce(weight[kind], axis=0, initial=_ZERO, out=out[:, index])

@@ -125,7 +125,7 @@ def _put_into(
     worlds.qpos[:, : scene.robot_qpos], worlds.qvel[:, : scene.robot_qvel] = qpos, qvel
     if "goal_pos" in episode:
         goal = worlds.group["goal"].start
-        worlds.points[:, goal] = episode["goal_pos"][:2, pursuing]
+        worlds.points[:, goal] = episode["goal_pos"][:2, pursuing].T
     for index in range(task.vases.number):
         qpos, qvel = _body(meta, episode, f"vase{index}", at)
         worlds.qpos[:, scene.vase_qpos[index] : scene.vase_qpos[index] + 7] = qpos
@@ -136,16 +136,14 @@ def _put_into(
     for kind, mocap in (("hazard", ()), ("button", scene.button_mocap), ("pillar", scene.pillar_mocap)):
         places = _static_places(meta, episode, kind)
         if len(places) and f"{kind}s" in worlds.group:
-            worlds.points[:, worlds.group[f"{kind}s"]] = places.T[:, :, None]
+            worlds.points[:, worlds.group[f"{kind}s"]] = places
         if len(mocap):
             worlds.mocap_pos[:, list(mocap), :2] = places
     gremlins = _put_gremlins(worlds, meta, episode, at) if task.gremlins.number else None
     worlds.simulations.forward(np.arange(worlds.number))
     worlds.refresh()
-    if gremlins is not None:
-        group = worlds.group["gremlins"]
-        worlds.points[:, group] = gremlins
-        worlds.offsets[:, group] = gremlins - worlds.position[:, :2].T[:, None]
+    if gremlins is not None:  # recorded ones may be off course; only their lidar looks at their places
+        worlds.points[:, worlds.group["gremlins"]] = gremlins
     if task.goal == "Button":
         worlds.goal_button[:] = episode["goal_button"][pursuing]
         worlds.button_timer[:] = episode["buttons_timer"][pursuing]
@@ -204,7 +202,7 @@ def _body(meta: dict[str, Any], episode: dict[str, Any], name: str, at: Integers
 def _put_gremlins(
     worlds: SafetyWorlds, meta: dict[str, Any], episode: dict[str, Any], at: Integers
 ) -> Floats:
-    """Make the gremlin nearest the robot the body; return where all are, [2, gremlins, B]."""
+    """Make the gremlin nearest the robot the body; return where all are, [B, gremlins, 2]."""
     scene = worlds.scene
     names = [f"gremlin{index}obj" for index in range(worlds.task.gremlins.number)]
     bodies = [_body(meta, episode, name, at) for name in names]
@@ -217,7 +215,7 @@ def _put_gremlins(
     worlds.qvel[:, qvel : qvel + 6] = velocities[nearest, everyone]
     worlds.embodied[:] = nearest
     worlds.steps[:] = at
-    places: Floats = coordinates[:, :, :2].transpose(2, 0, 1)
+    places: Floats = coordinates[:, :, :2].transpose(1, 0, 2)
     return places
 
 

@@ -15,8 +15,14 @@ import numpy.typing as npt
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_tasks import ROBOT_HEIGHT, SafetyTask
 
+Readings = npt.NDArray[np.float32]
+
 GRAVITY = 9.81
 MAGNETIC_FIELD = (0.0, -0.5, 0.0)
+_UP = np.array((0.0, 0.0, GRAVITY))
+_QUATERNIONS = np.array(((3, 4, 5, 6), (9, 10, 11, 12)))
+"""Of the Car's body and of its rear ball, in its coordinates."""
+_BALL_AND_ROBOT_SPINS = np.array((8, 9, 10, 3, 4, 5))
 
 
 def _rotation_form() -> Floats:
@@ -52,63 +58,67 @@ def rotation_matrices(quaternions: Floats) -> Floats:
 
 
 class RobotSensors:
-    """One robot's sensors and pose.
+    """The sensors of B robots of one kind.
 
     Args:
-        task: gives the robot and where each sensor goes in an observation.
+        task: gives the robot.
+        number: B.
+
+    Attributes:
+        order: the sensors and their sizes, in the order in which ``read`` returns them.
     """
 
-    def __init__(self, task: SafetyTask) -> None:
+    def __init__(self, task: SafetyTask, number: int) -> None:
         self._car = task.robot == "Car"
-        self._where = {name: task.where(name) for name, _ in task.components if "lidar" not in name}
+        ball = (("ballquat_rear", 9), ("ballangvel_rear", 3)) if self._car else ()
+        self.order = (("accelerometer", 3), ("velocimeter", 3), ("magnetometer", 3), *ball, ("gyro", 3))
+        # In the world's frame: acceleration, velocity, magnetic field, position.
+        self._world = np.zeros((number, 4, 3))
+        self._world[:, 0, 2] = GRAVITY
+        self._world[:, 2] = MAGNETIC_FIELD
+        self._world[:, 3, 2] = ROBOT_HEIGHT
 
-    def pose(self, qpos: Floats) -> tuple[Floats, Floats]:
-        """Position [B, 3] and rotation R [B, 3, 3] of the robot, from its coordinates [B, 13] or [B, 3]."""
+    def read(self, qpos: Floats, qvel: Floats, qacc: Floats, out: Readings) -> tuple[Floats, Floats]:
+        """Write what the robots feel, and find where they are.
+
+        Args:
+            qpos: the robots' coordinates, [B, 13] or [B, 3].
+            qvel: their velocities, [B, 11] or [B, 3].
+            qacc: their accelerations, [B, ...].
+            out: for the readings, [B, size].
+
+        Of the first three, numbers after the robots' own are ignored.
+
+        Returns:
+            rotations R from the robots' frames to the world's, [B, 3, 3], and (position) R, metres, [B, 3].
+        """
         if self._car:
-            return qpos[:, :3], rotation_matrices(qpos[:, 3:7])
-        position = np.full((len(qpos), 3), ROBOT_HEIGHT)
-        position[:, :2] = qpos[:, :2]
+            return self._read_car(qpos, qvel, qacc, out)
+        world = self._world
+        world[:, 0, :2] = qacc[:, :2]
+        world[:, 1, :2] = qvel[:, :2]
+        world[:, 3, :2] = qpos[:, :2]
         cosine, sine = np.cos(qpos[:, 2]), np.sin(qpos[:, 2])
         rotation = np.zeros((len(qpos), 3, 3))
         rotation[:, 0, 0] = rotation[:, 1, 1] = cosine
-        rotation[:, 0, 1], rotation[:, 1, 0] = -sine, sine
+        rotation[:, 1, 0] = sine
+        np.negative(sine, out=rotation[:, 0, 1])
         rotation[:, 2, 2] = 1.0
-        return position, rotation
-
-    def read(
-        self,
-        qpos: Floats,
-        qvel: Floats,
-        qacc: Floats,
-        rotation: Floats,
-        out: npt.NDArray[np.float32],
-    ) -> None:
-        """Write all readings into observations.
-
-        Args:
-            qpos: the robot's coordinates, [B, ...].
-            qvel: its velocities, [B, ...].
-            qacc: its accelerations, [B, ...].
-            rotation: R, [B, 3, 3].
-            out: observations, [B, size].
-        """
-        number = len(qpos)
-        world = np.zeros((number, 3, 3))  # acceleration, velocity, magnetic field
-        moving = 3 if self._car else 2
-        world[:, 0, :moving] = qacc[:, :moving]
-        world[:, 0, 2] += GRAVITY
-        world[:, 1, :moving] = qvel[:, :moving]
-        world[:, 2] = MAGNETIC_FIELD
         local = world @ rotation
-        where = self._where
-        out[:, where["accelerometer"]] = local[:, 0]
-        out[:, where["velocimeter"]] = local[:, 1]
-        out[:, where["magnetometer"]] = local[:, 2]
-        if self._car:
-            out[:, where["gyro"]] = qvel[:, 3:6]
-            out[:, where["ballangvel_rear"]] = qvel[:, 8:11]
-            out[:, where["ballquat_rear"]] = rotation_matrices(qpos[:, 9:13]).reshape(number, 9)
-        else:
-            gyro = where["gyro"]
-            out[:, gyro.start : gyro.stop - 1] = 0.0
-            out[:, gyro.stop - 1] = qvel[:, 2]
+        out[:, :9] = local[:, :3].reshape(-1, 9)
+        out[:, 9:11] = 0.0
+        out[:, 11] = qvel[:, 2]
+        return rotation, local[:, 3]
+
+    def _read_car(self, qpos: Floats, qvel: Floats, qacc: Floats, out: Readings) -> tuple[Floats, Floats]:
+        world = self._world
+        np.add(qacc[:, :3], _UP, out=world[:, 0])
+        world[:, 1] = qvel[:, :3]
+        world[:, 3] = qpos[:, :3]
+        robot_and_ball = rotation_matrices(qpos[:, _QUATERNIONS])
+        rotation = robot_and_ball[:, 0]
+        local = world @ rotation
+        out[:, :9] = local[:, :3].reshape(-1, 9)
+        out[:, 9:18] = robot_and_ball[:, 1].reshape(-1, 9)
+        out[:, 18:] = qvel[:, _BALL_AND_ROBOT_SPINS]
+        return rotation, local[:, 3]

@@ -107,16 +107,52 @@ def _costs(outcome: Outcome, options: SafetyGymOptions) -> Floats:
     """The k costs of each world, [B, k]."""
     if options.cost == "per_hazard":
         return outcome.terms
-    return np.asarray(outcome.terms.any(axis=1, keepdims=True), np.float64)
+    if not outcome.terms.shape[1]:
+        return np.zeros((len(outcome.terms), 1))
+    costs: Floats = np.maximum.reduce(outcome.terms, axis=1, keepdims=True)
+    return costs
 
 
 def _info(task: SafetyTask, outcome: Outcome, options: SafetyGymOptions) -> dict[str, Any]:
     info: dict[str, Any] = {"cost": _costs(outcome, options), "goal_met": outcome.goal_met}
     for column, term in enumerate(task.cost_terms):
         info[f"cost_{term}"] = outcome.terms[:, column]
-    if outcome.broken.any():
+    if outcome.broken is not None:
         info["cost_exception"] = outcome.broken.astype(np.float64)
     return info
+
+
+class _Camera:
+    """Draws worlds, once somebody looks; copies of an environment get a camera of their own."""
+
+    def __init__(self, render_mode: str | None) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.render_mode = render_mode
+        self._renderer: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Camera, (self.render_mode,)
+
+    def frames(self, worlds: SafetyWorlds) -> tuple[npt.NDArray[np.uint8], ...]:
+        """One picture [height, width, 3] of each world."""
+        if self.render_mode is None:
+            raise ValueError(
+                f"{worlds.task.name}: to render, make the environment with render_mode='rgb_array'"
+            )
+        if not worlds.generators:
+            raise ValueError(f"{worlds.task.name}: call reset before the first picture")
+        if self._renderer is None:
+            from recrl.environments.safety_rendering import SafetyRenderer  # noqa: PLC0415  # needs graphics
+
+            self._renderer = SafetyRenderer(worlds)
+        return tuple(self._renderer.frame(index) for index in range(worlds.number))
+
+    def close(self) -> None:
+        """Free the graphics driver's memory."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
 
 class SafetyGymVectorEnv(CMDPVectorEnv):
@@ -139,6 +175,7 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
         self.options = SafetyGymOptions(**options)
         self.num_envs = num_envs
         self.render_mode = render_mode
+        self._camera = _Camera(render_mode)
         self.metadata = {
             **CMDPVectorEnv.metadata,
             "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -181,12 +218,19 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
         outcome = worlds.advance(checked)
         observations = worlds.observations()
         info = _info(worlds.task, outcome, self.options)
-        finished = outcome.terminated | outcome.truncated
-        if finished.any():
+        if len(outcome.finished):
             info["final_obs"] = observations
-            worlds.restart(np.flatnonzero(finished))
+            worlds.restart(outcome.finished)
             observations = worlds.observations()
         return observations, outcome.rewards, outcome.terminated, outcome.truncated, info
+
+    def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
+        """One RGB picture of each environment, [height, width, 3]."""
+        return self._camera.frames(self.worlds)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free what drawing needed."""
+        self._camera.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Physics, sleeping bodies included, layouts, goals, counters and generators."""
@@ -218,6 +262,7 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
         found = _find(task)
         self.options = SafetyGymOptions(**options)
         self.render_mode = render_mode
+        self._camera = _Camera(render_mode)
         self.metadata = {**self.metadata, "render_fps": frames_per_second(found)}
         self.cost_names = cost_names(found, self.options)
         self.observation_space = _observation_space(found)
@@ -252,6 +297,14 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
             info,
         )
 
+    def render(self) -> npt.NDArray[np.uint8]:
+        """An RGB picture, [height, width, 3]."""
+        return self._camera.frames(self.worlds)[0]
+
+    def close(self) -> None:
+        """Free what drawing needed."""
+        self._camera.close()
+
 
 def frames_per_second(task: SafetyTask) -> int:
     """Environment steps in a second of the task's time: 25 for the Car, 50 for the Point."""
@@ -273,6 +326,8 @@ def register_safety_gym(tasks: Mapping[str, SafetyTask] = SAFETY_TASKS) -> None:
                 entry_point="recrl.environments.safety_gym:SafetyGymEnv",
                 vector_entry_point="recrl.environments.safety_gym:SafetyGymVectorEnv",
                 kwargs={"task": name},
+                # Its checks would take a tenth of every step, and the tests have made them.
+                disable_env_checker=True,
             )
 
 

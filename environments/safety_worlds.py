@@ -19,8 +19,7 @@ Letters: B worlds, P objects that the lidar sees, k costs.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -29,14 +28,16 @@ import numpy.typing as npt
 from recrl.environments.cmdp import Floats
 from recrl.environments.gremlins import ON_COURSE, gremlin_course, leads
 from recrl.environments.layout import keepouts, sample_goal, sample_layout
-from recrl.environments.lidar import closeness, egocentric
+from recrl.environments.lidar import egocentric, lidar
 from recrl.environments.robot_sensors import RobotSensors
 from recrl.environments.safety_tasks import (
     BUTTON_DELAY,
     EXCEPTION_REWARD,
     GREMLIN_HEIGHT,
     HORIZON,
+    LIDAR_BINS,
     REWARD_BOUND,
+    ROBOT_HEIGHT,
     SUBSTEPS,
     VASE_SPEED,
     SafetyTask,
@@ -51,8 +52,7 @@ GOAL_HEIGHT = 0.16
 """Height of the goal area's middle, metres: in Push, distances to it are three-dimensional."""
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What one step brought.
 
     Attributes:
@@ -61,7 +61,8 @@ class Outcome:
         goal_met: [B].
         terminated: [B].
         truncated: [B].
-        broken: the physics broke down in this step, [B].
+        broken: the physics broke down in this step, [B]; None if it did so nowhere.
+        finished: worlds whose episode is over.
     """
 
     rewards: Floats
@@ -69,7 +70,8 @@ class Outcome:
     goal_met: Booleans
     terminated: Booleans
     truncated: Booleans
-    broken: Booleans
+    broken: Booleans | None
+    finished: npt.NDArray[np.intp]
 
 
 class SafetyWorlds:
@@ -89,7 +91,8 @@ class SafetyWorlds:
         simulations: the physics.
         generators: one generator for each world.
         qpos, qvel: coordinates and velocities, live views, [B, ...].
-        points: (x, y) of everything that the lidar sees, metres, [2, P, B]; ``group`` tells which is which.
+        points: (x, y) of everything that the lidar sees, metres, [B, P, 2]; ``group`` tells which is which.
+        ranges: distances from the robot to all of them, seen from above, metres, [B, P].
         group: for each kind, its slice of P.
         steps: taken in this episode, [B].
         distances: those that the reward compares with, metres, [B, 1 or 2].
@@ -99,6 +102,9 @@ class SafetyWorlds:
         gremlin_yaws: radians, [B, gremlins].
         embodied: the gremlin that is a body, [B].
     """
+
+    distances: Floats
+    button_timer: npt.NDArray[np.int64]
 
     def __init__(
         self, task: SafetyTask, number: int, *, horizon: int = HORIZON, num_threads: int = 1
@@ -129,39 +135,33 @@ class SafetyWorlds:
         for kind in task.lidars:
             self.group[kind] = slice(end, end + counts[kind])
             end += counts[kind]
-        self.points = np.zeros((2, end, number))
-        self._seen_at = {kind: task.where(f"{kind}_lidar") for kind in task.lidars}
-        self._sensors = RobotSensors(task)
-        self._robot_qpos = self.qpos[:, : self.scene.robot_qpos]
-        self._robot_qvel = self.qvel[:, : self.scene.robot_qvel]
-        self._vase_xy = np.add.outer((0, 1), np.array(self.scene.vase_qpos, np.intp))  # [2, vases]
-        self._vase_velocity = np.add.outer((0, 1, 2), np.array(self.scene.vase_qvel, np.intp))
-        box = self.scene.box_qpos
-        self._box = self.qpos[:, box : box + 3]
+        self.points = np.zeros((number, end, 2))
+        self.ranges = np.zeros((number, end))
+        # (x, y) as x + iy: one operation instead of five for a distance.
+        self._plane = self.points.view(np.complex128)[..., 0]
+        self._offsets = np.zeros_like(self._plane)
+        self._robot_plane = self.qpos[:, :2].view(np.complex128)
+        self._sensors = RobotSensors(task, number)
+        self._kinds = list(self.group.values())
+        self._order = _sorted_order(task, self._sensors)
+        self._perceived = np.zeros((number, task.observation_size), np.float32)
+        felt = task.observation_size - LIDAR_BINS * len(task.lidars)
+        self._felt = self._perceived[:, :felt]
+        self._seen = self._perceived[:, felt:].reshape(number, len(task.lidars), LIDAR_BINS)
+        vases = task.vases.number
+        self._vases = self.qpos[:, self.scene.robot_qpos :][:, : 7 * vases].reshape(number, vases, 7)[..., :2]
+        self._vase_velocities = self.qvel[:, self.scene.robot_qvel :][:, : 6 * vases].reshape(
+            number, vases, 6
+        )[..., :3]
+        self._box = self.qpos[:, self.scene.box_qpos :][:, :3]
         self._button_touch = [
             self.scene.sensors[name] for name in self.scene.sensors if name.startswith("button")
         ]
 
-        self.steps = np.zeros(number, np.int64)
-        self.distances = np.zeros((number, 2 if task.goal == "Push" else 1))
-        self.goal_button = np.zeros(number, np.int64)
-        self.button_timer = np.zeros(number, np.int64)
-        self.circles = np.zeros((number, task.gremlins.number, 2))
-        self.gremlin_yaws = np.zeros((number, task.gremlins.number))
-        self.embodied = np.zeros(number, np.int64)
-        self._has_gremlins = task.gremlins.number > 0
-        if self._has_gremlins:
-            gremlin = self.scene.gremlin_qpos
-            self._gremlin = self.qpos[:, gremlin : gremlin + 7]
-            velocity = self.scene.gremlin_qvel
-            self._gremlin_velocity = self.qvel[:, velocity : velocity + 6]
-            self._course = gremlin_course(task)
-            self._leads = leads(task.timestep, np.arange(HORIZON + 1.0) * SUBSTEPS)
-            self._controls = np.zeros((number, SUBSTEPS, model.nu + 3 * model.nmocap))
-            self._lead = slice(
-                model.nu + 3 * self.scene.gremlin_mocap, model.nu + 3 * self.scene.gremlin_mocap + 3
-            )
+        self._indicators = [_INDICATORS[term] for term in task.cost_terms]
         self._everyone = np.arange(number)
+        self._nobody = np.zeros(0, np.intp)
+        self._begin()
         self.refresh()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -194,27 +194,33 @@ class SafetyWorlds:
         self._simulate(actions)
         self.steps += 1
         self.refresh()
-        broken = self.simulations.broken()
         distances = self.measure()
-        rewards = (self.distances - distances).sum(axis=1)
+        self.distances -= distances
+        rewards = np.add.reduce(self.distances, axis=1)
         np.minimum(np.maximum(rewards, -REWARD_BOUND, out=rewards), REWARD_BOUND, out=rewards)
         self.distances = distances
         terms = self.cost_terms()
-        np.maximum(self.button_timer - 1, 0, out=self.button_timer)
+        if self._button_touch:
+            np.maximum(self.button_timer - 1, 0, out=self.button_timer)
         goal_met = self.goal_met()
         terminated = np.zeros(self.number, np.bool_)
-        if broken.any():
+        broken = None
+        if not self.simulations.intact() and (failed := self.simulations.broken()).any():
+            broken = failed
             rewards[broken] = EXCEPTION_REWARD
             terms[broken] = 0.0
             goal_met &= ~broken
             terminated |= broken
+        truncated = self.steps >= self.horizon
         if goal_met.any():
             rewards[goal_met] += 1.0
             met = np.flatnonzero(goal_met)
             self.button_timer[met] = BUTTON_DELAY
             terminated[met] = ~self._renew_goals(met)
-        truncated = (self.steps >= self.horizon) & ~terminated
-        return Outcome(rewards, terms, goal_met, terminated, truncated, broken)
+        truncated &= ~terminated
+        finished = terminated | truncated
+        over = finished.nonzero()[0] if finished.any() else self._nobody
+        return Outcome(rewards, terms, goal_met, terminated, truncated, broken, over)
 
     def observations(self, qacc: Floats | None = None) -> Observations:
         """What the robots perceive now, [B, size].
@@ -222,32 +228,26 @@ class SafetyWorlds:
         Args:
             qacc: the robots' accelerations, if not those of the simulations, [B, ...].
         """
-        seen = np.empty((self.number, self.task.observation_size), np.float32)
         acceleration = self._qacc if qacc is None else qacc
-        self._sensors.read(self._robot_qpos, self._robot_qvel, acceleration, self.rotation, seen)
-        reading = closeness(egocentric(self.offsets, self.position[:, 2], self.rotation))
-        for kind, members in self.group.items():
-            columns = seen[:, self._seen_at[kind]]
-            if members.stop - members.start == 1:
-                columns[...] = reading[members.start]
-            else:
-                reading[members].max(axis=0, out=columns)
-        if "buttons" in self.group:
-            seen[self.button_timer > 0, self._seen_at["buttons"]] = 0.0
-        return seen
+        rotation, place = self._sensors.read(self.qpos, self.qvel, acceleration, self._felt)
+        lidar(egocentric(self.points, rotation, place), self._kinds, self._seen)
+        if self._button_touch and self.button_timer.any():
+            self._seen[self.button_timer > 0, list(self.group).index("buttons")] = 0.0
+        observations: Observations = self._perceived.take(self._order, axis=1)
+        return observations
 
     def refresh(self) -> None:
         """Find everything where the simulations have it now."""
-        self.position, self.rotation = self._sensors.pose(self._robot_qpos)
         if "vases" in self.group:
-            self.points[:, self.group["vases"]] = self.qpos[:, self._vase_xy].transpose(1, 2, 0)
-        if "box" in self.group:
-            self.points[:, self.group["box"].start] = self._box[:, :2].T
-        if self._has_gremlins:
+            self.points[:, self.group["vases"]] = self._vases
+        elif "box" in self.group:
+            self.points[:, self.group["box"].start] = self._box[:, :2]
+        elif self._has_gremlins:
             places = self.circles + self._course.positions[self.steps, None, :2]
             places[self._everyone, self.embodied] = self._gremlin[:, :2]
-            self.points[:, self.group["gremlins"]] = places.transpose(2, 1, 0)
-        self.offsets = self.points - self.position[:, :2].T[:, None]
+            self.points[:, self.group["gremlins"]] = places
+        np.subtract(self._plane, self._robot_plane, out=self._offsets)
+        np.abs(self._offsets, out=self.ranges)
 
     def measure(self) -> Floats:
         """The distances that the reward is made of, metres, [B, 1 or 2].
@@ -255,17 +255,17 @@ class SafetyWorlds:
         Goal and Button: from the robot to the goal, seen from above. Push: from the robot to the box and
         from the box to the goal, in space.
         """
-        if self.task.goal == "Push":
-            to_box = self._box - self.position
-            to_goal = np.empty_like(to_box)
-            to_goal[:, :2] = self.points[:, self.group["goal"].start].T - self._box[:, :2]
-            to_goal[:, 2] = GOAL_HEIGHT - self._box[:, 2]
-            both = np.stack((to_box, to_goal), axis=1)
-            in_space: Floats = np.sqrt(np.square(both).sum(axis=2))
-            return in_space
-        x, y = self.offsets[:, self.group["goal"].start]
-        from_above: Floats = np.sqrt(x * x + y * y)[:, None]
-        return from_above
+        goal = self.group["goal"].start
+        if self.task.goal != "Push":
+            return self.ranges[:, goal : goal + 1].copy()
+        box = self.group["box"].start
+        height = self._box[:, 2]
+        robot_height = self.qpos[:, 2] if self.task.robot == "Car" else ROBOT_HEIGHT
+        distances = np.empty((self.number, 2))
+        np.hypot(self.ranges[:, box], height - robot_height, out=distances[:, 0])
+        to_goal = np.abs(self._plane[:, goal] - self._plane[:, box])
+        np.hypot(to_goal, height - GOAL_HEIGHT, out=distances[:, 1])
+        return distances
 
     def goal_met(self) -> Booleans:
         """Whether the goal is reached, [B]; ``distances`` must be of now."""
@@ -282,8 +282,8 @@ class SafetyWorlds:
     def cost_terms(self) -> Floats:
         """The indicator of each cost term, [B, terms]."""
         terms = np.zeros((self.number, len(self.task.cost_terms)))
-        for column, term in enumerate(self.task.cost_terms):
-            terms[:, column] = getattr(self, f"_cost_of_{term}")()
+        for column, indicator in enumerate(self._indicators):
+            terms[:, column] = indicator(self)
         return terms
 
     def state_dict(self) -> dict[str, Any]:
@@ -331,6 +331,29 @@ class SafetyWorlds:
             generator.bit_generator.state = saved
         self.refresh()
 
+    def _begin(self) -> None:
+        """Make room for what changes within an episode, and for what leads the gremlins."""
+        task, number, model = self.task, self.number, self.scene.model
+        self.steps = np.zeros(number, np.int64)
+        self.distances = np.zeros((number, 2 if task.goal == "Push" else 1))
+        self.goal_button = np.zeros(number, np.int64)
+        self.button_timer = np.zeros(number, np.int64)
+        self.circles = np.zeros((number, task.gremlins.number, 2))
+        self.gremlin_yaws = np.zeros((number, task.gremlins.number))
+        self.embodied = np.zeros(number, np.int64)
+        self._has_gremlins = task.gremlins.number > 0
+        if self._has_gremlins:
+            gremlin = self.scene.gremlin_qpos
+            self._gremlin = self.qpos[:, gremlin : gremlin + 7]
+            velocity = self.scene.gremlin_qvel
+            self._gremlin_velocity = self.qvel[:, velocity : velocity + 6]
+            self._course = gremlin_course(task)
+            self._leads = leads(task.timestep, np.arange(HORIZON + 1.0) * SUBSTEPS)
+            self._controls = np.zeros((number, SUBSTEPS, model.nu + 3 * model.nmocap))
+            self._lead = slice(
+                model.nu + 3 * self.scene.gremlin_mocap, model.nu + 3 * self.scene.gremlin_mocap + 3
+            )
+
     def _simulate(self, actions: npt.NDArray[Any]) -> None:
         if not self._has_gremlins:
             self._control[...] = actions
@@ -346,8 +369,7 @@ class SafetyWorlds:
 
     def _embody_nearest(self) -> None:
         """Make the gremlin nearest the robot the one that is a body, where that changes nothing."""
-        x, y = self.offsets[:, self.group["gremlins"]]
-        nearest = (x * x + y * y).argmin(axis=0)
+        nearest = self.ranges[:, self.group["gremlins"]].argmin(axis=1)
         for index in np.flatnonzero(nearest != self.embodied):
             course = self._course.positions[self.steps[index]]
             astray = self._gremlin[index, :3] - course
@@ -385,7 +407,7 @@ class SafetyWorlds:
             self.mocap_pos[index, list(mocap), :2] = layout[kind]
         for kind in ("hazards", "buttons", "pillars"):
             if kind in self.group:
-                self.points[:, self.group[kind], index] = layout[kind].T
+                self.points[index, self.group[kind]] = layout[kind]
         if task.gremlins.number:
             self.circles[index] = layout["gremlins"]
             self.gremlin_yaws[index] = generator.uniform(0.0, 2.0 * np.pi, task.gremlins.number)
@@ -402,22 +424,22 @@ class SafetyWorlds:
         for position, index in enumerate(ids):
             found[position] = self._renew_goal(index)
         goal = self.group["goal"].start
-        self.offsets[:, goal, ids] = self.points[:, goal, ids] - self.position[ids, :2].T
+        self.ranges[ids, goal] = np.abs(self._plane[ids, goal] - self._robot_plane[ids, 0])
         self.distances[ids] = self.measure()[ids]
         return found
 
     def _renew_goal(self, index: int) -> bool:
         generator = self.generators[index]
-        goal = self.points[:, self.group["goal"].start, index]
+        goal = self.points[index, self.group["goal"].start]
         if self.task.goal == "Button":
             button = int(generator.integers(self.task.buttons.number))
             self.goal_button[index] = button
-            goal[:] = self.points[:, self.group["buttons"].start + button, index]
+            goal[:] = self.points[index, self.group["buttons"].start + button]
             return True
-        places, radii = [self.position[index, :2]], [keepouts(self.task)["robot"][1]]
+        places, radii = [self.qpos[index, :2]], [keepouts(self.task)["robot"][1]]
         for kind, (number, keepout) in keepouts(self.task).items():
             if kind in self.group and kind != "goal":
-                places.extend(self.points[:, self.group[kind], index].T)
+                places.extend(self.points[index, self.group[kind]])
                 radii.extend([keepout] * number)
         found = sample_goal(self.task, np.array(places), np.array(radii), generator)
         if found is None:
@@ -426,8 +448,9 @@ class SafetyWorlds:
         return True
 
     def _cost_of_hazards(self) -> Booleans:
-        x, y = self.offsets[:, self.group["hazards"]]
-        over: Booleans = (x * x + y * y).min(axis=0) < self.task.hazards.size**2
+        over: Booleans = (
+            np.minimum.reduce(self.ranges[:, self.group["hazards"]], axis=1) < self.task.hazards.size
+        )
         return over
 
     def _cost_of_vases_contact(self) -> Booleans:
@@ -436,8 +459,8 @@ class SafetyWorlds:
         return touched
 
     def _cost_of_vases_velocity(self) -> Booleans:
-        squares = np.square(self.qvel[:, self._vase_velocity]).sum(axis=1)
-        moving: Booleans = squares.max(axis=1) >= VASE_SPEED**2
+        squares = np.einsum("bvi,bvi->bv", self._vase_velocities, self._vase_velocities)
+        moving: Booleans = np.maximum.reduce(squares, axis=1) >= VASE_SPEED**2
         return moving
 
     def _cost_of_pillars(self) -> Booleans:
@@ -455,6 +478,25 @@ class SafetyWorlds:
     def _cost_of_gremlins(self) -> Booleans:
         touched: Booleans = self._touch[:, self.scene.sensors["gremlin"]] > 0.0
         return touched
+
+
+_INDICATORS = {
+    "hazards": SafetyWorlds._cost_of_hazards,
+    "vases_contact": SafetyWorlds._cost_of_vases_contact,
+    "vases_velocity": SafetyWorlds._cost_of_vases_velocity,
+    "pillars": SafetyWorlds._cost_of_pillars,
+    "buttons": SafetyWorlds._cost_of_buttons,
+    "gremlins": SafetyWorlds._cost_of_gremlins,
+}
+
+
+def _sorted_order(task: SafetyTask, sensors: RobotSensors) -> npt.NDArray[np.intp]:
+    """Where each number of an observation is found among the readings as they are computed."""
+    computed = [*sensors.order, *((f"{kind}_lidar", LIDAR_BINS) for kind in task.lidars)]
+    starts = dict(
+        zip([name for name, _ in computed], np.cumsum([0, *(n for _, n in computed)]), strict=False)
+    )
+    return np.concatenate([starts[name] + np.arange(size) for name, size in task.components])
 
 
 def _rebuilt(

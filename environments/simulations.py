@@ -31,6 +31,7 @@ _BAD_STATES = [
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]
+_EVERYTHING, _NOTHING = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_NONE)
 _ROW = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -121,8 +122,10 @@ class Simulations:
             (number, self._library.mjb_nstate(self._batch)),
         )
         counters = self._view(self._library.mjb_warning(self._batch), np.int32, (number, _NUM_WARNINGS, 2))
+        self._counters: Integers = counters
         self._warnings: Integers = counters[:, :, 1]
         self._stopped = np.zeros(number, np.bool_)
+        self._any_stopped = False
 
     def state(self, component: mujoco.mjtState, shape: tuple[int, ...]) -> Floats:
         """A part of ``rows`` as a live view, [B, *shape]."""
@@ -142,7 +145,7 @@ class Simulations:
 
     def step(self, substeps: int) -> None:
         """Advance all simulations, then compute everything, accelerations included, at the new state."""
-        self._note(self._library.mjb_step(self._batch, None, 0, substeps, mujoco.mjtStage.mjSTAGE_ACC.value))
+        self._note(self._library.mjb_step(self._batch, None, 0, substeps, _EVERYTHING))
 
     def step_under(self, controls: Floats, components: int) -> None:
         """As ``step``, with controls of their own for every substep.
@@ -156,26 +159,23 @@ class Simulations:
                 self._batch, None, 0, controls.shape[1], controls.ctypes.data, components, None, 0
             )
         )
-        self._note(self._library.mjb_forward(self._batch, None, 0, mujoco.mjtStage.mjSTAGE_ACC.value))
+        self._note(self._library.mjb_forward(self._batch, None, 0, _EVERYTHING))
 
     def reset(self, ids: Sequence[int] | npt.NDArray[np.intp]) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
         chosen = np.ascontiguousarray(ids, np.int32)
         self._stopped[chosen] = False
-        self._check(
-            self._library.mjb_reset(
-                self._batch, chosen.ctypes.data, len(chosen), None, mujoco.mjtStage.mjSTAGE_NONE.value
-            )
-        )
+        self._any_stopped = bool(self._stopped.any())
+        self._check(self._library.mjb_reset(self._batch, chosen.ctypes.data, len(chosen), None, _NOTHING))
 
     def forward(self, ids: Sequence[int] | npt.NDArray[np.intp]) -> None:
         """Compute everything that follows from the rows of some simulations."""
         chosen = np.ascontiguousarray(ids, np.int32)
-        self._check(
-            self._library.mjb_forward(
-                self._batch, chosen.ctypes.data, len(chosen), mujoco.mjtStage.mjSTAGE_ACC.value
-            )
-        )
+        self._check(self._library.mjb_forward(self._batch, chosen.ctypes.data, len(chosen), _EVERYTHING))
+
+    def intact(self) -> bool:
+        """Whether nothing was noted since the last resets: a quick look before ``broken``."""
+        return not (self._any_stopped or self._counters.any())
 
     def broken(self) -> npt.NDArray[np.bool_]:
         """Whether a simulation has diverged since its last reset, [B].
@@ -222,6 +222,7 @@ class Simulations:
 
         self._check(self._library.mjb_apply(self._batch, None, 0, _BatchFunction(put_back), None, 1))
         self._warnings[...], self._stopped[...] = state["warnings"], state["stopped"]
+        self._any_stopped = bool(self._stopped.any())
 
     def _restored(self, row: Floats, asleep: Integers) -> mujoco.MjData:
         data = mujoco.MjData(self.model)
@@ -252,6 +253,7 @@ class Simulations:
     def _note(self, failed: int) -> None:
         if failed:
             self._stopped |= self._status() != 0
+            self._any_stopped = True
 
     def _check(self, failed: int) -> None:
         if not failed:

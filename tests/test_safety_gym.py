@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from recrl.environments.robot_sensors import rotation_matrices
 from recrl.environments.safety_gym import SafetyGymEnv, SafetyGymVectorEnv
 from recrl.environments.safety_tasks import SAFETY_TASKS
 
@@ -30,11 +31,12 @@ def held_actions(steps: int, num_envs: int, seed: int = 0) -> npt.NDArray[np.flo
 def drive(environment: SafetyGymEnv) -> npt.NDArray[np.float64]:
     """Turn the Car towards the goal's place in its own frame, and drive; its front is -y."""
     worlds = environment.worlds
-    offset = np.append(worlds.offsets[:, worlds.group["goal"].start, 0], 0.0)
-    x, y, _ = offset @ worlds.rotation[0]
+    offset = worlds.points[0, worlds.group["goal"].start] - worlds.qpos[0, :2]
+    x, y = offset @ rotation_matrices(worlds.qpos[0, 3:7])[:2, :2]
     angle = np.arctan2(x, -y)
     forwards, turn = max(np.cos(angle), 0.0), np.clip(angle, -1.0, 1.0)
-    return np.clip(np.array([forwards + turn, forwards - turn]), -1.0, 1.0)
+    wheels: npt.NDArray[np.float64] = np.clip(np.array([forwards + turn, forwards - turn]), -1.0, 1.0)
+    return wheels
 
 
 def as_bytes(transition: tuple[Any, ...]) -> bytes:

@@ -66,19 +66,24 @@ def test_computed_sensors_are_those_of_mujoco(robot: str) -> None:
     xml = scene_xml(task).replace("<sensor></sensor>", f"<sensor>{SENSORS}</sensor>")
     xml = xml.replace("<joint name=", '<site name="robot_middle"/><joint name=', 1)
     model = mujoco.MjModel.from_xml_string(xml)
-    data, sensors = mujoco.MjData(model), RobotSensors(task)
+    data, sensors = mujoco.MjData(model), RobotSensors(task, 1)
     generator = np.random.default_rng(0)
     for _ in range(100):
         data.ctrl[:] = generator.uniform(-1.0, 1.0, 2)
         mujoco.mj_step(model, data, 10)
         mujoco.mj_forward(model, data)
-        seen = np.zeros((1, task.observation_size), np.float32)
-        position, rotation = sensors.pose(data.qpos[None])
-        sensors.read(data.qpos[None], data.qvel[None], data.qacc[None], rotation, seen)
-        np.testing.assert_allclose(position[0], data.body("robot").xpos, atol=1e-12)
-        for name in ("accelerometer", "velocimeter", "gyro", "magnetometer"):
-            expected = data.sensor(name).data
-            np.testing.assert_allclose(seen[0, task.where(name)], expected, rtol=1e-5, atol=1e-5)
+        readings = np.zeros((1, sum(size for _, size in sensors.order)), np.float32)
+        rotation, place = sensors.read(data.qpos[None], data.qvel[None], data.qacc[None], readings)
+        body = data.body("robot")
+        np.testing.assert_allclose(rotation[0].reshape(-1), body.xmat, atol=1e-12)
+        np.testing.assert_allclose(rotation[0] @ place[0], body.xpos, atol=1e-12)
+        start = 0
+        for name, size in sensors.order:
+            if "ball" not in name:
+                expected = data.sensor(name).data
+                seen = readings[0, start : start + size]
+                np.testing.assert_allclose(seen, expected, rtol=1e-5, atol=1e-5)
+            start += size
 
 
 def test_rotation_matrices_are_those_of_mujoco() -> None:
