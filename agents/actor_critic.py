@@ -137,6 +137,10 @@ class ActorCritic:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         return self._policy.mode(observations)
 
+    def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
+        return self._policy.probabilities(observations)
+
     def update(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
         """Improve the policy by the rule, then fit the critics to the rollout.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,15 @@ class Policy(Protocol):
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        ...
+
+
+@runtime_checkable
+class DiscretePolicy(Protocol):
+    """A policy that can say how probable each of a finite number of actions is; agents may have it."""
+
+    def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
         ...
 
 

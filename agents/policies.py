@@ -24,6 +24,7 @@ from recrl.agents.distributions import Categorical, Distribution, Gaussian
 from recrl.agents.networks import FlatParameters, NetworkForm, TanhStack
 from recrl.agents.noise import matching_log_std, matching_scale, off_greedy_mass
 from recrl.agents.spaces import action_size
+from recrl.environments.cmdp import Floats
 
 # safety-starter-agents' and the usual start of a Gaussian policy's spread.
 INITIAL_LOG_STD = -0.5
@@ -106,6 +107,19 @@ class StochasticPolicy:
         """The most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
         outputs = self.outputs(observations)
         return outputs.argmax(axis=1) if self._is_categorical else outputs
+
+    def probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """pi(a | s) at B observations [B, n], float64 [B, A].
+
+        Raises:
+            ValueError: actions are continuous.
+        """
+        if not self._is_categorical:
+            raise ValueError("continuous actions have densities, not probabilities")
+        outputs = self.outputs(observations).astype(np.float64)
+        masses = np.exp(outputs - outputs.max(axis=1, keepdims=True))
+        probabilities: Floats = masses / masses.sum(axis=1, keepdims=True)
+        return probabilities
 
     def distribution(self, rows: Tensor) -> Distribution:
         """The action distributions at U rows, [U, n]; not differentiable, see ``evaluate``."""

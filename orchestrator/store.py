@@ -15,6 +15,7 @@
             updates.csv         a row a policy update: UPDATE_COLUMNS and the student's own metrics
             events.jsonl        a line an event: noise added, limits measured, phase changed
             evaluation.csv      a row an episode of the frozen-policy evaluations: EVALUATION_COLUMNS
+            policy.csv          of finite tasks: the final policy, a row a state, action_j for each action
             checkpoints/        the newest two checkpoints
             provenance.json     versions, commit, machine
             log.txt, error.txt  the trial's log; the traceback of a failed trial
@@ -258,6 +259,11 @@ class TrialStore:
         return self.folder / "evaluation.csv"
 
     @property
+    def policy_path(self) -> Path:
+        """The final policy's table, where the task is finite."""
+        return self.folder / "policy.csv"
+
+    @property
     def checkpoints_folder(self) -> Path:
         """The newest checkpoints."""
         return self.folder / "checkpoints"
@@ -306,6 +312,10 @@ class TrialStore:
         if not self.evaluation_path.exists():
             return pd.DataFrame(columns=list(EVALUATION_COLUMNS))
         return pd.read_csv(self.evaluation_path)
+
+    def policy(self) -> pd.DataFrame:
+        """The final policy pi(a | s): a row a state, columns action_j; empty if there is no table."""
+        return pd.read_csv(self.policy_path) if self.policy_path.exists() else pd.DataFrame()
 
     def checkpoints(self) -> list[Path]:
         """The checkpoints on disk, newest first."""
@@ -440,9 +450,11 @@ class TrialWriter:
 
     def write_evaluation(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write the frozen-policy evaluations, whole; at least one row, all with the same keys."""
-        with self._lease():
-            lines = [_csv_line(rows[0]), *(_csv_line(row.values()) for row in rows)]
-            write_atomically(self.store.evaluation_path, "".join(lines).encode())
+        self._write_csv(self.store.evaluation_path, rows)
+
+    def write_policy(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write the final policy's table, whole: a row a state, at least one, all with the same keys."""
+        self._write_csv(self.store.policy_path, rows)
 
     def commit(self, tree: dict[str, Any], *, update: int, env_steps: int, **changes: Any) -> None:
         """Make everything appended so far, and the trial's state, safe.
@@ -500,6 +512,11 @@ class TrialWriter:
     def _write_record(self, **changes: Any) -> None:
         self.record = replace(self.record, heartbeat=time.time(), **changes)
         write_json(self.store.state_path, asdict(self.record))
+
+    def _write_csv(self, path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+        with self._lease():
+            lines = [_csv_line(rows[0]), *(_csv_line(row.values()) for row in rows)]
+            write_atomically(path, "".join(lines).encode())
 
     def _append_csv(self, path: Path, row: Mapping[str, Any]) -> None:
         if self._lengths[path.name] == 0 and not self._rows[path]:

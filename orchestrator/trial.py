@@ -22,12 +22,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from recrl.agents.agent import Agent
+from recrl.agents.agent import Agent, DiscretePolicy
 from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Floats, Phase
+from recrl.environments.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
+from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.errors import LostLeaseError, TeacherUnavailableError
 from recrl.orchestrator.provenance import collect as collect_provenance
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -120,7 +122,7 @@ class Trial:
         )
 
     def evaluate(self) -> None:
-        """Freeze the policy and write its evaluations, stochastic and deterministic.
+        """Freeze the policy; write its evaluations, stochastic and deterministic, and its table.
 
         Environments and generators are fresh and seeded from the trial's seed: nothing of training is
         touched, and every method of a seed is evaluated on the same environment stream.
@@ -146,6 +148,8 @@ class Trial:
             ]
         if rows:
             self._writer.write_evaluation(rows)
+        if table := policy_table(self._agent, self._environments):
+            self._writer.write_policy(table)
 
     def _number(
         self, finished: Sequence[FinishedEpisode], phase: Phase, lesson: Lesson
@@ -214,6 +218,17 @@ class Trial:
         self._environments.load_state_dict(tree["environments"])
         self._collector.load_state_dict(tree["collector"])
         self._generator.bit_generator.state = tree["generator"]
+
+
+def policy_table(agent: Agent, environments: CMDPVectorEnv) -> list[dict[str, float]]:
+    """pi(a | s), a row a state, ``action_j`` the probability of action j.
+
+    Empty where there is no such table: the task is not finite, or the agent does not tell.
+    """
+    if not isinstance(environments, FiniteVectorEnv) or not isinstance(agent, DiscretePolicy):
+        return []
+    probabilities = agent.action_probabilities(environments.observations)
+    return [{f"action_{j}": float(share) for j, share in enumerate(row)} for row in probabilities]
 
 
 def run_trial(

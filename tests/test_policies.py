@@ -191,3 +191,16 @@ def test_an_unbounded_action_is_noised_as_if_its_half_range_were_one() -> None:
     policy.log_std.fill_(-5.0)
     policy.add_noise(1.0, random_rows().numpy(), "match-mixture")
     assert policy.log_std.exp().item() == pytest.approx(3.0**-0.5)
+
+
+def test_probabilities_are_the_distributions() -> None:
+    policy, rows = policy_for(THREE_ACTIONS), random_rows()
+    expected = torch.stack(
+        [policy.distribution(rows).log_prob(torch.full((6,), action), None).exp() for action in range(3)], 1
+    )
+    np.testing.assert_allclose(policy.probabilities(rows.numpy()), expected, rtol=1e-5)
+
+
+def test_continuous_actions_have_no_probabilities() -> None:
+    with pytest.raises(ValueError, match="continuous actions have densities, not probabilities"):
+        policy_for(TWO_COMPONENTS).probabilities(random_rows().numpy())

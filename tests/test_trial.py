@@ -156,6 +156,18 @@ def test_both_frozen_policies_are_evaluated(undisturbed: TrialStore) -> None:
     assert counts == {"stochastic": 6, "deterministic": 6}
 
 
+def test_a_finite_tasks_final_policy_is_written_as_a_table(undisturbed: TrialStore) -> None:
+    table = undisturbed.policy()
+    assert list(table) == ["action_0", "action_1"]
+    assert table.sum(axis=1).tolist() == pytest.approx([1.0, 1.0])  # a row a state: camp and mine
+
+
+def test_a_task_that_is_not_finite_has_no_table(tmp_path: Path) -> None:
+    task = Choice("continuous-bandit")
+    store = run(tmp_path, replace(SPEC, task=task, train_steps=60, rollout_steps=15))
+    assert store.policy().empty
+
+
 def test_a_finished_trial_has_nothing_left_to_do(undisturbed: TrialStore, tmp_path: Path) -> None:
     store = run(tmp_path)
     before = store.episodes_path.read_bytes()
