@@ -21,7 +21,7 @@ demo: install
 	$(BIN)/recrl-sweep launch grids/demo.yaml
 
 test: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: install
 	$(BIN)/ruff check .
