@@ -77,6 +77,13 @@ class RobotSensors:
         self._world[:, 0, 2] = GRAVITY
         self._world[:, 2] = MAGNETIC_FIELD
         self._world[:, 3, 2] = ROBOT_HEIGHT
+        self._local = np.zeros((number, 4, 3))
+        self._flat_local = self._local.reshape(number, 12)
+        # Of the Car's body and rear ball: q q^T, and the rotations that follow from it.
+        self._products = np.zeros((number, 2, 4, 4))
+        self._flat_products = self._products.reshape(number, 2, 16)
+        self._rotations = np.zeros((number, 2, 9))
+        self._rotation = self._rotations.reshape(number, 2, 3, 3)[:, 0]
 
     def read(self, qpos: Floats, qvel: Floats, qacc: Floats, out: Readings) -> tuple[Floats, Floats]:
         """Write what the robots feel, and find where they are.
@@ -90,7 +97,8 @@ class RobotSensors:
         Of the first three, numbers after the robots' own are ignored.
 
         Returns:
-            rotations R from the robots' frames to the world's, [B, 3, 3], and (position) R, metres, [B, 3].
+            rotations R from the robots' frames to the world's, [B, 3, 3], and (position) R, metres, [B, 3];
+            both are overwritten by the next call.
         """
         if self._car:
             return self._read_car(qpos, qvel, qacc, out)
@@ -104,21 +112,22 @@ class RobotSensors:
         rotation[:, 1, 0] = sine
         np.negative(sine, out=rotation[:, 0, 1])
         rotation[:, 2, 2] = 1.0
-        local = world @ rotation
-        out[:, :9] = local[:, :3].reshape(-1, 9)
+        np.matmul(world, rotation, out=self._local)
+        out[:, :9] = self._flat_local[:, :9]
         out[:, 9:11] = 0.0
         out[:, 11] = qvel[:, 2]
-        return rotation, local[:, 3]
+        return rotation, self._local[:, 3]
 
     def _read_car(self, qpos: Floats, qvel: Floats, qacc: Floats, out: Readings) -> tuple[Floats, Floats]:
         world = self._world
         np.add(qacc[:, :3], _UP, out=world[:, 0])
         world[:, 1] = qvel[:, :3]
         world[:, 3] = qpos[:, :3]
-        robot_and_ball = rotation_matrices(qpos[:, _QUATERNIONS])
-        rotation = robot_and_ball[:, 0]
-        local = world @ rotation
-        out[:, :9] = local[:, :3].reshape(-1, 9)
-        out[:, 9:18] = robot_and_ball[:, 1].reshape(-1, 9)
+        quaternions = qpos[:, _QUATERNIONS]
+        np.multiply(quaternions[..., None], quaternions[..., None, :], out=self._products)
+        np.matmul(self._flat_products, _ROTATION_FORM, out=self._rotations)
+        np.matmul(world, self._rotation, out=self._local)
+        out[:, :9] = self._flat_local[:, :9]
+        out[:, 9:18] = self._rotations[:, 1]
         out[:, 18:] = qvel[:, _BALL_AND_ROBOT_SPINS]
-        return rotation, local[:, 3]
+        return self._rotation, self._local[:, 3]

@@ -195,9 +195,9 @@ class SafetyWorlds:
         self.steps += 1
         self.refresh()
         distances = self.measure()
-        self.distances -= distances
-        rewards = np.add.reduce(self.distances, axis=1)
-        np.minimum(np.maximum(rewards, -REWARD_BOUND, out=rewards), REWARD_BOUND, out=rewards)
+        progress = self.distances - distances
+        rewards = progress[:, 0] + progress[:, 1] if self.task.goal == "Push" else progress[:, 0]
+        rewards.clip(-REWARD_BOUND, REWARD_BOUND, out=rewards)
         self.distances = distances
         terms = self.cost_terms()
         if self._button_touch:
@@ -212,15 +212,18 @@ class SafetyWorlds:
             goal_met &= ~broken
             terminated |= broken
         truncated = self.steps >= self.horizon
-        if goal_met.any():
+        eventful = broken is not None
+        if np.logical_or.reduce(goal_met):
+            eventful = True
             rewards[goal_met] += 1.0
             met = np.flatnonzero(goal_met)
             self.button_timer[met] = BUTTON_DELAY
             terminated[met] = ~self._renew_goals(met)
-        truncated &= ~terminated
-        finished = terminated | truncated
-        over = finished.nonzero()[0] if finished.any() else self._nobody
-        return Outcome(rewards, terms, goal_met, terminated, truncated, broken, over)
+        finished = self._nobody
+        if eventful or np.logical_or.reduce(truncated):
+            truncated &= ~terminated
+            finished = np.flatnonzero(terminated | truncated)
+        return Outcome(rewards, terms, goal_met, terminated, truncated, broken, finished)
 
     def observations(self, qacc: Floats | None = None) -> Observations:
         """What the robots perceive now, [B, size].
@@ -459,7 +462,7 @@ class SafetyWorlds:
         return touched
 
     def _cost_of_vases_velocity(self) -> Booleans:
-        squares = np.einsum("bvi,bvi->bv", self._vase_velocities, self._vase_velocities)
+        squares = np.add.reduce(np.square(self._vase_velocities), axis=2)
         moving: Booleans = np.maximum.reduce(squares, axis=1) >= VASE_SPEED**2
         return moving
 

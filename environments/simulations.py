@@ -122,7 +122,7 @@ class Simulations:
             (number, self._library.mjb_nstate(self._batch)),
         )
         counters = self._view(self._library.mjb_warning(self._batch), np.int32, (number, _NUM_WARNINGS, 2))
-        self._counters: Integers = counters
+        self._counters: Integers = counters.reshape(-1)
         self._warnings: Integers = counters[:, :, 1]
         self._stopped = np.zeros(number, np.bool_)
         self._any_stopped = False
@@ -175,7 +175,7 @@ class Simulations:
 
     def intact(self) -> bool:
         """Whether nothing was noted since the last resets: a quick look before ``broken``."""
-        return not (self._any_stopped or self._counters.any())
+        return not (self._any_stopped or np.bitwise_or.reduce(self._counters))
 
     def broken(self) -> npt.NDArray[np.bool_]:
         """Whether a simulation has diverged since its last reset, [B].
