@@ -19,6 +19,7 @@ task lacks are NaN. All returns and costs are undiscounted sums over an episode.
                  batch was collected), then the students' own metrics
     evaluations  a row an episode of the frozen policy: KEY, store.EVALUATION_COLUMNS, cost_i
     events       a row an event: KEY, update, end_step, event
+    policies     a row a state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
 
 Episode files can hold 500,000 rows a trial. ``load`` reads them one at a time and keeps their sums
 (``phases``); ``load_episodes`` gives the rows themselves to whoever wants them.
@@ -83,6 +84,7 @@ class Sweep:
         updates: a row a policy update.
         evaluations: a row an episode of the frozen policy.
         events: a row an event.
+        policies: a row a state of a complete trial's final policy.
         task_options: the options of every task, by its label.
         notes: sentences on what a reader of the frames must know, for example an unknown optimum.
     """
@@ -93,6 +95,7 @@ class Sweep:
     updates: pd.DataFrame
     evaluations: pd.DataFrame
     events: pd.DataFrame
+    policies: pd.DataFrame
     task_options: Mapping[str, Mapping[str, Any]]
     notes: tuple[str, ...] = ()
 
@@ -138,6 +141,7 @@ def load(store: SweepStore) -> Sweep:
         updates=frame((*UPDATE_COLUMNS, *cost_columns, *limit_columns), lambda it: it.store.updates()),
         evaluations=frame((*EVALUATION_COLUMNS, *cost_columns), lambda it: it.store.evaluation()),
         events=frame(EVENT_COLUMNS, lambda member: _event_rows(member.store)),
+        policies=frame(("state",), lambda member: _policy_rows(member.store)),
         task_options={member.spec.task.label: member.spec.task.options for member in members},
         notes=tuple(notes + unknown),
     )
@@ -274,6 +278,11 @@ def _phase_rows(member: _Member) -> pd.DataFrame:
 
 def _event_rows(store: TrialStore) -> pd.DataFrame:
     return pd.DataFrame([{name: event.get(name) for name in EVENT_COLUMNS} for event in store.events()])
+
+
+def _policy_rows(store: TrialStore) -> pd.DataFrame:
+    policy = store.policy()
+    return policy.rename_axis("state").reset_index() if len(policy) else policy
 
 
 def _keyed(

@@ -4,6 +4,7 @@
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
     diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence a method (PDF and PNG)
+    policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
     return-against-cost         final policies under the frontier J*(d), where it is known (PDF and PNG)
     outcomes.csv                a row a trial and measure
     summary.csv                 averaged over seeds, with interquartile means
@@ -24,10 +25,11 @@ import pandas as pd
 
 from recrl.analysis import figures, frames, metrics, styles, tables
 from recrl.analysis.diagnostics import curriculum_diagnostics
-from recrl.analysis.frames import GROUP, Sweep
+from recrl.analysis.frames import GROUP, Sweep, ordered
 from recrl.analysis.frontier import return_against_cost
 from recrl.analysis.intervals import ENOUGH_RUNS
 from recrl.analysis.metrics import Measure
+from recrl.analysis.policy_map import policy_maps
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore
@@ -67,6 +69,9 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
     for task, agent in sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist():
         stem = f"diagnostics_{_safe(task)}_{_safe(agent)}"
         drawn += styles.save(curriculum_diagnostics(sweep, task, agent), folder, stem)
+    for agent in ordered(list(sweep.policies["agent"]), list(sweep.trials["agent"].cat.categories)):
+        if (maps := policy_maps(sweep, agent)) is not None:
+            drawn += styles.save(maps, folder, f"policies_{_safe(agent)}")
     if (against := return_against_cost(sweep)) is not None:
         drawn += styles.save(against, folder, "return-against-cost")
     written, text = _tables(sweep, folder)
