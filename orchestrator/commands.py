@@ -199,6 +199,7 @@ def _executor(grid: GridSpec, arguments: argparse.Namespace) -> Executor:
         cpus_per_trial=grid.resources.cpus_per_trial,
         gpus_per_trial=grid.resources.gpus_per_trial,
         max_concurrent=arguments.max_concurrent or grid.resources.max_concurrent,
+        silence_seconds=grid.resources.silence_seconds,
     )
 
 

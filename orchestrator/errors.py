@@ -19,6 +19,10 @@ class CheckpointError(RecrlError):
     """A checkpoint is truncated, damaged or of another version; an older one may serve."""
 
 
+class StorageError(RecrlError):
+    """A trial's files cannot be written; its last commit stands, and it goes on when they can be."""
+
+
 class LostLeaseError(RecrlError):
     """Another attempt has taken this trial over; this one must write nothing more."""
 

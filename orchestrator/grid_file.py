@@ -156,6 +156,13 @@ class Resources(_Written):
     max_concurrent: Whole | None = Field(
         default=None, ge=1, le=10_000, description="Trials at once, at most; by default as many as fit."
     )
+    silence_seconds: Number = Field(
+        default=300.0,
+        ge=5.0,
+        le=1e7,
+        description="A trial that uses no processor for so long hangs: it is started again from its last "
+        "checkpoint. Wall seconds (ours).",
+    )
 
 
 class Exclusion(_Written):

@@ -7,7 +7,11 @@ result depends on its spec alone, and importing torch anew costs as much as a sm
 
 What fails, and what happens: a worker or its node dies, and Tune starts the trial again, up to
 ``max_failures`` times; a trial's own code raises, and it is FAILED in its files and not tried again; the
-driver dies, and its workers with it.
+driver dies, and its workers with it; a trial hangs, its heartbeat falls silent, and its process is ended,
+which is the first case again.
+
+A signal to the launch and to its whole process group (Ctrl-C, ``timeout``) reaches the driver alone: Ray's
+processes have sessions of their own, and serve until the trials are saved.
 
 Assumes that every node sees the results folder under the same path. Leaves out growing with an elastic
 cluster beyond ``max_concurrent``.
@@ -27,7 +31,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,12 +40,15 @@ from ray import cloudpickle, tune
 from ray.exceptions import RayError, RayTaskError
 from ray.tune.search import BasicVariantGenerator
 
-from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
+from recrl.orchestrator.errors import ClusterError, StorageError, TeacherUnavailableError
+from recrl.orchestrator.scratch import scratch_folder
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore
+from recrl.orchestrator.status import SILENCE_SECONDS
+from recrl.orchestrator.store import SweepStore, TrialRecord
 from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 
 STOP_QUESTION_SECONDS = 0.5
+HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats
 CONNECT_SECONDS = 5.0
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
 LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
@@ -78,6 +85,7 @@ class RayExecutor:
             worker. The results are the same.
         max_failures: how often a trial whose process died is started again, at least 0.
         commit_seconds: wall seconds between a trial's checkpoints, above 0.
+        silence_seconds: wall seconds without a heartbeat after which a trial hangs, above 0.
     """
 
     num_cpus: int | None = None
@@ -88,6 +96,7 @@ class RayExecutor:
     teacher: Literal["service", "inline"] = "service"
     max_failures: int = 3
     commit_seconds: float = 20.0
+    silence_seconds: float = SILENCE_SECONDS
 
     def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
         """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if it is.
@@ -109,10 +118,10 @@ class RayExecutor:
         self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event, stop_file: StopFile
     ) -> None:
         queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
-        watch = _Watch(stop, stop_file, queue, store)
+        watch = _Watch(stop, stop_file, queue, store, _Silence(store, self.silence_seconds))
         service_name = f"teacher-{secrets.token_hex(8)}" if self.teacher == "service" else ""
         service = start_teacher_service(service_name) if service_name else None
-        with tempfile.TemporaryDirectory(prefix="recrl-tune-", ignore_cleanup_errors=True) as scratch:
+        with scratch_folder(tempfile.gettempdir()) as scratch:
             tuner = tune.Tuner(
                 tune.with_resources(TuneTrial, {"cpu": self.cpus_per_trial, "gpu": self.gpus_per_trial}),
                 param_space={
@@ -129,7 +138,7 @@ class RayExecutor:
                     trial_dirname_creator=_tune_trial_id,
                 ),
                 run_config=tune.RunConfig(
-                    storage_path=scratch,
+                    storage_path=str(scratch),
                     name="sweep",
                     verbose=0,
                     callbacks=[watch],
@@ -249,20 +258,78 @@ class StopFile:
         return self._answer
 
 
+class _Silence:
+    """Ends the processes of trials that hang, so that Tune starts these trials again.
+
+    Silence is measured on this process's clock, from when it last saw a heartbeat change: the clocks of the
+    nodes need not agree.
+    """
+
+    def __init__(self, store: SweepStore, seconds: float) -> None:
+        self._store = store
+        self._seconds = seconds
+        self._heard: dict[str, tuple[tuple[int, float], float]] = {}
+        self._looked_at = float("-inf")
+
+    def end(self, trials: Sequence[Any]) -> None:
+        """End those of Tune's trials whose recrl trial runs without a heartbeat."""
+        now = time.monotonic()
+        if now < self._looked_at + min(HEARTBEAT_SECONDS, self._seconds / 4.0):
+            return
+        self._looked_at = now
+        for trial in trials:
+            if trial.status != "RUNNING":
+                self._heard.pop(trial.trial_id, None)
+                continue
+            spec = _spec_of(trial)
+            record = self._store.trial(spec).record()
+            sign = (record.attempt, record.heartbeat)
+            last, heard_at = self._heard.get(trial.trial_id, (None, now))
+            if sign != last:
+                self._heard[trial.trial_id] = (sign, now)
+            elif now - heard_at > self._seconds and record.status is TrialState.RUNNING:
+                self._heard[trial.trial_id] = (sign, float("inf"))  # once for a silence
+                logger.warning("%s: no sign of work for %.0f seconds", spec.title, self._seconds)
+                _end_process(record, trial.temporary_state.ray_actor)
+
+
+def _end_process(record: TrialRecord, actor: Any) -> None:
+    """Kill a trial's process: directly where it is here, because one that is stopped serves no request."""
+    if record.host == socket.gethostname() and _is_worker(record.pid):
+        os.kill(record.pid, signal.SIGKILL)
+    elif actor is not None:
+        ray.kill(actor)
+
+
+def _is_worker(pid: int) -> bool:
+    """Whether the process is one of Ray's: a number may have been given to another one meanwhile."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::")
+    except OSError:
+        return False
+
+
 class _Watch(tune.Callback):
     """What the driver does beside scheduling: passes the stop event on, and records trials given up."""
 
     def __init__(
-        self, stop: threading.Event, stop_file: StopFile, queue: BasicVariantGenerator, store: SweepStore
+        self,
+        stop: threading.Event,
+        stop_file: StopFile,
+        queue: BasicVariantGenerator,
+        store: SweepStore,
+        silence: _Silence,
     ) -> None:
         self._stop = stop
         self._stop_file = stop_file
         self._queue = queue
         self._store = store
+        self._silence = silence
         self.stopped_and_idle = False
 
     def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
-        """Look at the stop event; Tune calls this ten times a second or more."""
+        """Look at the stop event and the heartbeats; Tune calls this ten times a second or more."""
+        self._silence.end(trials)
         if self._stop.is_set():
             if not self._queue.is_finished():
                 self._queue.set_finished()  # type: ignore[no-untyped-call]
@@ -271,17 +338,19 @@ class _Watch(tune.Callback):
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Say that Tune starts a trial again."""
-        spec = TrialSpec.from_json(json.loads(trial.config["spec"]))
-        logger.warning("%s: its process failed; it starts again from its last checkpoint", spec.title)
+        logger.warning("%s: its process failed; it goes on from its last checkpoint", _spec_of(trial).title)
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
         cause = _last_error(trial)
-        files = self._store.trial(TrialSpec.from_json(json.loads(trial.config["spec"])))
+        files = self._store.trial(_spec_of(trial))
         if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
             what = f"{type(cause).__name__}: {_first_line(cause)}" if cause else "unknown"
             error = f"failures of its process: {trial.num_failures}; the last: {what}"
-            files.set_status(TrialState.FAILED, error=error)
+            try:
+                files.set_status(TrialState.FAILED, error=error)
+            except StorageError as also:
+                logger.warning("%s; %s", error, also)
 
     def __getstate__(self) -> dict[str, Any]:
         """Nothing: Tune pickles its callbacks to restore them, which nobody does, and events cannot be."""
@@ -314,10 +383,8 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
     Raises:
         ClusterError: Ray does not start.
     """
-    with tempfile.TemporaryDirectory(
-        prefix="recrl-", dir=_short_folder(), ignore_cleanup_errors=True
-    ) as folder:
-        token_path = Path(folder, "token")
+    with scratch_folder(_short_folder()) as folder:
+        token_path = folder / "token"
         with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
             file.write(_token())
         with _environment(QUIET | WORKER | {"RAY_AUTH_TOKEN_PATH": str(token_path)}):
@@ -363,7 +430,7 @@ def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
         # No public switch keeps Ray from printing a paragraph about every dead process.
         ray._private.worker._worker_logs_enabled = False
         try:
-            with _own_signal_handlers():
+            with _own_signal_handlers(), _own_sessions():
                 ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
         except (RayError, RuntimeError, OSError, ValueError) as error:
             raise ClusterError(f"{failure}: {_first_line(error)}{hint}") from error
@@ -399,6 +466,21 @@ def _own_signal_handlers() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
+@contextmanager
+def _own_sessions() -> Iterator[None]:
+    """Start Ray's processes in sessions of their own; Ray has no public switch for it.
+
+    They still end with this process, however it ends: Ray asks the kernel for that.
+    """
+    services: Any = ray._private.services
+    popen = services.ConsolePopen
+    services.ConsolePopen = partial(popen, start_new_session=True)
+    try:
+        yield
+    finally:
+        services.ConsolePopen = popen
+
+
 @cache
 def _token() -> str:
     """This process's token for the clusters it starts: Ray reads a process's token only once."""
@@ -408,6 +490,11 @@ def _token() -> str:
 def _short_folder() -> str:
     folder = tempfile.gettempdir()
     return folder if len(folder) <= LONGEST_SOCKET_FOLDER - len("/recrl-12345678/ray") else "/tmp"
+
+
+def _spec_of(trial: Any) -> TrialSpec:
+    """The recrl trial that a Tune trial is."""
+    return TrialSpec.from_json(json.loads(trial.config["spec"]))
 
 
 def _tune_trial_id(trial: Any) -> str:

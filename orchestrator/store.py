@@ -19,12 +19,14 @@
             checkpoints/        the newest two checkpoints
             provenance.json     versions, commit, machine
             log.txt, error.txt  the trial's log; the traceback of a failed trial
+            .reserve            room for a running trial's last words, should the disk be full
 
 Rules. Small files are written beside and renamed. Rows are appended only by ``TrialWriter.commit``, then
 synced, then a checkpoint that holds the files' lengths is written, then ``state.json``: whatever dies
 between, a restart cuts the files back to the newest intact checkpoint and nothing is there twice. Readers
 look only at committed bytes. A writer holds a lease (a token in ``state.json``): once another attempt has
-taken the trial over, its every write is refused.
+taken the trial over, its every write is refused. Where the disk is full or gone, a writer's methods raise
+StorageError, and the last commit stands.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ import pandas as pd
 
 from recrl.environments.cmdp import EpisodeStats
 from recrl.orchestrator import checkpoint
-from recrl.orchestrator.errors import CheckpointError, LostLeaseError, SweepBusyError
+from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError, SweepBusyError
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 EPISODE_COLUMNS = ("index", "phase", "end_step", "length", "episode_return", "noise")
@@ -64,6 +66,7 @@ UPDATE_COLUMNS = (
 )
 EVALUATION_COLUMNS = ("policy", "index", "length", "episode_return")
 KEPT_CHECKPOINTS = 2
+RESERVE_BYTES = 16 * 1024  # a record and a traceback
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -283,6 +286,11 @@ class TrialStore:
         """The traceback of a failed trial."""
         return self.folder / "error.txt"
 
+    @property
+    def reserve_path(self) -> Path:
+        """Room that is given up to say, on a full disk, how a trial ended."""
+        return self.folder / ".reserve"
+
     @cached_property
     def spec(self) -> TrialSpec:
         """What the trial is; it must be on disk."""
@@ -335,9 +343,17 @@ class TrialStore:
 
         Args:
             spec: the trial; must be what the folder already holds, if anything.
+
+        Raises:
+            StorageError: the disk is full or gone.
         """
-        self.checkpoints_folder.mkdir(parents=True, exist_ok=True)
+        with self.writing():
+            self.checkpoints_folder.mkdir(parents=True, exist_ok=True)
+            return self._begin(spec)
+
+    def _begin(self, spec: TrialSpec) -> TrialWriter:
         with self.locked():
+            self.reserve_path.write_bytes(secrets.token_bytes(RESERVE_BYTES))
             if not self.spec_path.exists():
                 write_json(self.spec_path, spec.to_json())
             old = self.record()
@@ -360,11 +376,38 @@ class TrialStore:
         """Say from outside where the trial stands, for a trial that can no longer say it itself.
 
         Revokes the lease of whoever still writes.
+
+        Raises:
+            StorageError: the disk is full or gone.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
+        with self.writing():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.reserve_path.unlink(missing_ok=True)
+            self._set_status(status, error)
+
+    def _set_status(self, status: TrialState, error: str) -> None:
         with self.locked():
             record = replace(self.record(), status=status, error=error, token="")
             write_json(self.state_path, asdict(record))
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Turn what a full or lost disk raises into a StorageError that says how to go on."""
+        try:
+            yield
+        except OSError as error:
+            update = self.saved_update
+            saved = f"it goes on from update {update}" if update else "it starts anew"
+            raise StorageError(
+                f"{self.folder.name}: its files cannot be written ({error.strerror or error}); "
+                f"{saved} when there is room and the sweep is launched again"
+            ) from error
+
+    @property
+    def saved_update(self) -> int:
+        """The update of the newest checkpoint, intact or not; 0 if there is none."""
+        names = [path.stem.removeprefix("checkpoint-") for path in self.checkpoints()[:1]]
+        return int(names[0]) if names and names[0].isdecimal() else 0
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -467,7 +510,7 @@ class TrialWriter:
 
         Raises:
             LostLeaseError: another attempt runs the trial now; nothing was written.
-            OSError: the disk is full or gone; the previous commit stands.
+            StorageError: the disk is full or gone; the previous commit stands.
         """
         with self._lease():
             lengths = {
@@ -498,13 +541,14 @@ class TrialWriter:
     def close(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
         """End this attempt: complete, failed with an error, or waiting to be resumed."""
         with self._lease():
+            self.store.reserve_path.unlink(missing_ok=True)
             if traceback:
                 write_atomically(self.store.error_path, traceback.encode())
             self._write_record(status=status, error=error, steps_per_second=0.0)
 
     @contextmanager
     def _lease(self) -> Iterator[None]:
-        with self.store.locked():
+        with self.store.writing(), self.store.locked():
             if self.store.record().token != self.record.token:
                 raise LostLeaseError(f"{self.store.folder.name}: another attempt runs this trial now")
             yield

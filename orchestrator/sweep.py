@@ -8,6 +8,7 @@ from the files.
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import threading
 import time
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Protocol
 
+from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.grid import GridSpec
 from recrl.orchestrator.plan import Plan, make_plan
@@ -28,6 +30,8 @@ from recrl.orchestrator.store import SweepStore, write_atomically, write_json
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
 MIRROR_SECONDS = 120.0
 HASTY_MIRROR_SECONDS = 10.0
+
+logger = logging.getLogger("recrl.sweep")
 
 
 class Mirror(Protocol):
@@ -165,4 +169,7 @@ def _leave_none_running(specs: Sequence[TrialSpec], store: SweepStore) -> None:
     for spec in specs:
         files = store.trial(spec)
         if files.record().status is TrialState.RUNNING:
-            files.set_status(TrialState.WAITING)
+            try:
+                files.set_status(TrialState.WAITING)
+            except StorageError as error:  # the next launch says it; nothing that came before is hidden
+                logger.warning("%s", error)

@@ -30,7 +30,8 @@ from recrl.environments.cmdp import CostLimits, EpisodeStats, Floats, Phase
 from recrl.environments.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.orchestrator.errors import LostLeaseError, TeacherUnavailableError
+from recrl.orchestrator.errors import LostLeaseError, StorageError, TeacherUnavailableError
+from recrl.orchestrator.heartbeat import Heartbeat
 from recrl.orchestrator.provenance import collect as collect_provenance
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import TrialStore, TrialWriter, write_json
@@ -253,34 +254,60 @@ def run_trial(
 
     Raises:
         LostLeaseError: another attempt took the trial over.
-        Exception: whatever the task, the student or the teacher raised; the last commit stands.
+        StorageError: the disk is full or gone; the last commit stands.
+        Exception: whatever the task, the student or the teacher raised, with a note of where; the last
+            commit stands.
     """
     trial = Trial(spec, writer, teacher)
-    committed = beat = time.monotonic()
-    beat_steps = trial.env_steps
-    while not trial.learned:
-        if should_stop():
-            trial.save()
-            writer.close(TrialState.WAITING)
-            logger.info("stopped after update %d; it can be resumed", trial.update)
-            return TrialState.WAITING
-        trial.advance()
-        now = time.monotonic()
-        if now - beat >= HEARTBEAT_SECONDS:
-            writer.heartbeat(
-                update=trial.update,
-                env_steps=trial.env_steps,
-                steps_per_second=(trial.env_steps - beat_steps) / (now - beat),
-            )
-            beat, beat_steps = now, trial.env_steps
-        if now - committed >= commit_seconds:
-            trial.save()
-            committed = now
-    trial.evaluate()
-    trial.save()
+    with Heartbeat(_beat_of(trial, writer), seconds=HEARTBEAT_SECONDS) as heartbeat:
+        committed = time.monotonic()
+        while not trial.learned and not should_stop():
+            with _located(f"in update {trial.update + 1}", writer):
+                trial.advance()
+            heartbeat.check()
+            if time.monotonic() - committed >= commit_seconds:
+                trial.save()
+                committed = time.monotonic()
+        if trial.learned:
+            with _located("in the evaluation", writer):
+                trial.evaluate()
+        trial.save()
+    if not trial.learned:
+        writer.close(TrialState.WAITING)
+        logger.info("stopped after update %d; it can be resumed", trial.update)
+        return TrialState.WAITING
     writer.close(TrialState.COMPLETE)
     logger.info("complete: %d updates, %d environment steps", trial.update, trial.env_steps)
     return TrialState.COMPLETE
+
+
+def _beat_of(trial: Trial, writer: TrialWriter) -> Callable[[], None]:
+    """What says that the trial lives, how far it is, and how fast: over its last updates, however long."""
+    steps, since, speed = trial.env_steps, time.monotonic(), 0.0
+
+    def beat() -> None:
+        nonlocal steps, since, speed
+        now, done = time.monotonic(), trial.env_steps
+        if done > steps:
+            speed = (done - steps) / (now - since)
+            steps, since = done, now
+        writer.heartbeat(update=trial.update, env_steps=done, steps_per_second=speed)
+
+    return beat
+
+
+@contextmanager
+def _located(where: str, writer: TrialWriter) -> Iterator[None]:
+    """Note on whatever is raised where that was, and what is left of the trial."""
+    try:
+        yield
+    except Exception as error:
+        update = writer.store.saved_update
+        saved = (
+            f"the last good checkpoint is that of update {update}" if update else "no checkpoint before it"
+        )
+        error.add_note(f"{where}; {saved}")
+        raise
 
 
 def run_recorded(
@@ -294,7 +321,8 @@ def run_recorded(
     """``run_trial``, with everything about the run recorded in the trial's folder.
 
     A trial that raises is FAILED in its own files, with the traceback in ``error.txt``, and nothing is
-    raised here: one trial's failure must not stop the others.
+    raised here: one trial's failure must not stop the others. A full disk is no failure of the trial's own:
+    it waits, and the same launch goes on from its last commit once there is room.
 
     Returns:
         How the trial stands now.
@@ -303,10 +331,15 @@ def run_recorded(
         TeacherUnavailableError: the teacher's process is gone; the trial waits to be resumed.
     """
     torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
-    writer = store.begin(spec)
+    try:
+        writer = store.begin(spec)
+    except StorageError as error:
+        logger.warning("%s", error)
+        return TrialState.WAITING
     with _log_to(store):
-        write_json(store.provenance_path, collect_provenance())
         try:
+            with store.writing():
+                write_json(store.provenance_path, collect_provenance())
             return run_trial(
                 spec,
                 writer,
@@ -317,20 +350,32 @@ def run_recorded(
         except LostLeaseError as error:
             logger.warning("%s", error)
         except TeacherUnavailableError:
-            writer.close(TrialState.WAITING)
+            _close(writer, TrialState.WAITING)
             raise
+        except StorageError as error:
+            logger.error("%s", error)
+            return _close(writer, TrialState.WAITING, error=str(error))
         except Exception as error:
             logger.exception("failed after update %d", writer.record.update)
-            text = " ".join(f"{type(error).__name__}: {error}".split())
-            with suppress(LostLeaseError):
-                writer.close(TrialState.FAILED, error=text, traceback=traceback.format_exc())
+            notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
+            text = " ".join(f"{type(error).__name__}: {error}{notes}".split())
+            return _close(writer, TrialState.FAILED, error=text, traceback=traceback.format_exc())
         return store.record().status
+
+
+def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:
+    """End an attempt that broke off; what keeps its files from saying so must not hide why it did."""
+    try:
+        writer.close(status, error=error, traceback=traceback)
+    except (LostLeaseError, StorageError) as also:
+        logger.warning("%s", also)
+    return status
 
 
 @contextmanager
 def _log_to(store: TrialStore) -> Iterator[None]:
     """Send the log of this process's trial to its folder."""
-    handler = logging.FileHandler(store.log_path, encoding="utf-8")
+    handler = _Log(store.log_path, encoding="utf-8", delay=True)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     root = logging.getLogger("recrl")
     level = root.level
@@ -341,7 +386,19 @@ def _log_to(store: TrialStore) -> Iterator[None]:
     finally:
         root.removeHandler(handler)
         root.setLevel(level)
-        handler.close()
+        with suppress(OSError):
+            handler.close()
+
+
+class _Log(logging.FileHandler):
+    """A log that loses lines rather than end a trial: on a full disk nothing is said about the log."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):
+            super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
+        pass
 
 
 def _mean(values: Sequence[float] | Floats) -> float:

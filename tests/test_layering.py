@@ -40,8 +40,8 @@ ADAPTERS = {
 }
 # The order inside the orchestrator: no module may import one that stands in a later line.
 LAYERS = (
-    ("errors", "exit_codes", "located_yaml", "provenance"),
-    ("spec", "checkpoint"),
+    ("errors", "exit_codes", "located_yaml", "provenance", "scratch"),
+    ("spec", "checkpoint", "heartbeat"),
     ("store", "validation"),
     ("grid_file", "status", "tracking_points", "plan", "trial"),
     ("grid", "executors", "tracking", "teacher_service"),
