@@ -86,6 +86,7 @@ class Sweep:
         events: a row an event.
         policies: a row a state of a complete trial's final policy.
         task_options: the options of every task, by its label.
+        agent_options: the options of every student, by its label.
         notes: sentences on what a reader of the frames must know, for example an unknown optimum.
     """
 
@@ -97,6 +98,7 @@ class Sweep:
     events: pd.DataFrame
     policies: pd.DataFrame
     task_options: Mapping[str, Mapping[str, Any]]
+    agent_options: Mapping[str, Mapping[str, Any]]
     notes: tuple[str, ...] = ()
 
     @property
@@ -143,6 +145,7 @@ def load(store: SweepStore) -> Sweep:
         events=frame(EVENT_COLUMNS, lambda member: _event_rows(member.store)),
         policies=frame(("state",), lambda member: _policy_rows(member.store)),
         task_options={member.spec.task.label: member.spec.task.options for member in members},
+        agent_options={member.spec.agent.label: member.spec.agent.options for member in members},
         notes=tuple(notes + unknown),
     )
 

@@ -94,6 +94,18 @@ def parser() -> argparse.ArgumentParser:
 
     _add_sweep(_command(commands, "figures", "draw the figures and tables of what is there so far"))
 
+    bound = _command(commands, "bound", "what training cost beside its bounds; which d_t a budget allows")
+    _add_sweep(bound)
+    bound.add_argument(
+        "--budget",
+        type=float,
+        metavar="COST",
+        help="cost above d_d that may be spent over all training episodes: say the largest d_t for it",
+    )
+    bound.add_argument(
+        "--cost", type=_at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
+    )
+
     user_interface = _command(commands, "ui", "open MLflow's pages about a sweep, on this machine only")
     _add_sweep(user_interface)
     _add_tracking(user_interface)

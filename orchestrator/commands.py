@@ -14,6 +14,7 @@ import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -30,6 +31,9 @@ from recrl.orchestrator.tracking import last_report, sync, tracking_uri
 from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_ui import open_ui
 from recrl.orchestrator.validation import nearest
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 DEFAULT_ROOT = Path("runs")
 MIRROR_INTERVAL_SECONDS = 5.0
@@ -117,6 +121,23 @@ def run_status(arguments: argparse.Namespace, console: Console) -> ExitCode:
 def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Draw the figures and tables of what is on disk."""
     _draw(_store(arguments), console)
+    return ExitCode.OK
+
+
+def run_bound(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Say what training cost beside its bounds, and which d_t a budget would have allowed."""
+    from recrl.analysis import cumulative, frames  # noqa: PLC0415  (imports pandas and SciPy)
+
+    sweep = frames.load(_store(arguments))
+    rows = cumulative.cumulative_costs(sweep, cost=arguments.cost - 1)
+    if not len(rows):
+        raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
+    _show(cumulative.bound_table(rows), console)
+    _say(console, "Undiscounted, summed over policies, one expected episode each; means over runs.")
+    if arguments.budget is not None:
+        allowed = cumulative.admissible_limits(rows, sweep, budget=arguments.budget)
+        _say(console, f"\nThe largest d_t within {arguments.budget:g} of cost above d_d over all episodes:")
+        _show(cumulative.admissible_table(allowed), console)
     return ExitCode.OK
 
 
@@ -214,6 +235,11 @@ def _draw(store: SweepStore, console: Console) -> None:
     _say(console, f"Figures    {_short(store.figures_folder)}")
 
 
+def _show(table: pd.DataFrame, console: Console) -> None:
+    """A table of finished text."""
+    console.print(display.text_table(list(map(str, table)), table.to_numpy().tolist()))
+
+
 def _say_plan(plan: Plan, grid: GridSpec, arguments: argparse.Namespace, console: Console) -> None:
     inline = arguments.command == "launch" and arguments.executor == "inline"
     at_once = trials_at_once(
@@ -292,6 +318,7 @@ COMMANDS: Mapping[str, Command] = {
     "validate": run_validate,
     "status": run_status,
     "figures": run_figures,
+    "bound": run_bound,
     "ui": run_ui,
     "sync": run_sync,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console, Group, RenderableType
@@ -189,6 +189,14 @@ def _picture(progress: SweepProgress) -> RenderableType:
     if len(running) > SHOWN_RUNNING:
         table.add_row(f"  and {len(running) - SHOWN_RUNNING} more")
     return Group(*rows, table)
+
+
+def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """A table of finished text."""
+    table = _table(*columns)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table
 
 
 def _table(*columns: str) -> Table:

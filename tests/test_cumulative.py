@@ -1,0 +1,111 @@
+"""What training cost beside what theory allows: sums by hand, and a trial that the bound holds for."""
+
+import dataclasses
+import math
+
+import pandas as pd
+import pytest
+
+from recrl.analysis import cumulative, frames
+from recrl.analysis.frames import Sweep
+from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.cli import main
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.store import SweepStore
+from recrl.orchestrator.trial import run_recorded
+from recrl.teachers.bounds import undiscounted_excess
+
+RIVER = TrialSpec(
+    task=Choice("rivergrid-1a", {"horizon": 20}),
+    agent=Choice("cpo", {"hidden_sizes": [8], "target_kl": 1e-7, "discount": 0.9}),
+    method=Choice("linear"),
+    train_limits=CostLimits((18.0,)),
+    deploy_limits=CostLimits((15.0,)),
+    train_steps=800,
+    deploy_steps=80,
+    num_envs=4,
+    rollout_steps=20,
+    evaluation_episodes=0,
+    seed=0,
+)
+
+
+@pytest.fixture(scope="module")
+def river_grid(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
+    store = SweepStore(tmp_path_factory.mktemp("runs"), "river")
+    trial = store.trial(RIVER)
+    assert run_recorded(RIVER, trial, should_stop=lambda: False) is TrialState.COMPLETE
+    store.info_path.write_text("{}")
+    return store
+
+
+def test_measured_cost_lies_under_the_bound_on_river_grid(river_grid: SweepStore) -> None:
+    (row,) = cumulative.cumulative_costs(frames.load(river_grid)).to_dict("records")
+    assert row["policies"] == 10
+    assert 10 < row["cost_sum"] < row["bound"] < row["ceiling_sum"] == 10 * 20
+    updates = river_grid.trials()[0].updates().iloc[:10]
+    excesses = [undiscounted_excess(kl, 20.0, horizon=20) for kl in updates["kl"][:9]]
+    assert row["bound"] == pytest.approx(
+        20.0 + sum(min(20.0, d + excess) for d, excess in zip(updates["limit_0"][:9], excesses, strict=True))
+    )
+    assert row["discounted_excess_sum"] == pytest.approx(
+        sum(math.sqrt(2 * kl) * 0.9 * 10.0 / 0.1**2 for kl in updates["kl"][:9])
+    )
+
+
+def three_policies(finished: Sweep) -> Sweep:
+    """One linear trial whose three policies cost 30, 6 and 2 under 20, 10 and infinity; d_d is 5."""
+    trials = finished.trials.query(
+        "task == 'river-a' and agent == 'cpo' and method == 'linear' and seed == 0"
+    )
+    updates = finished.updates.merge(trials[["task", "agent", "method", "seed"]]).iloc[:3]
+    for name in ("task", "agent", "method"):
+        updates[name] = updates[name].astype(finished.updates[name].dtype)
+    updates = updates.assign(
+        cost_0=[30.0, 6.0, 2.0], limit_0=[20.0, 10.0, math.inf], kl=[0.0, 0.02, 0.0], episodes=[4, 4, 4]
+    )
+    return dataclasses.replace(finished, trials=trials, updates=updates)
+
+
+def test_sums_are_those_counted_by_hand(finished: Sweep) -> None:
+    (row,) = cumulative.cumulative_costs(three_policies(finished)).to_dict("records")
+    assert (row["cost_sum"], row["limit_sum"]) == (38.0, 32.0)
+    assert (row["overshoot_sum"], row["violation_sum"]) == (10.0, 26.0)
+    assert row["episodes_per_policy"] == 4.0
+    # two-state costs at most 1 a step for 10 steps: the first policy 10, then min(20, 10), min(10, 10)
+    assert (row["bound"], row["ceiling_sum"]) == (30.0, 30.0)
+
+
+def test_a_budget_is_spent_by_the_limit_it_allows(finished: Sweep) -> None:
+    sweep = three_policies(finished)
+    rows = cumulative.cumulative_costs(sweep)
+    # 4 episodes a policy: 80 are 20 a policy's episode. Overshoot is 10 in all; what is left, 10, is
+    # (1 + 2/3 + 1/3) (d_t - 5)
+    (row,) = cumulative.admissible_limits(rows, sweep, budget=80.0).to_dict("records")
+    assert row["largest_train_limit"] == pytest.approx(10.0)
+    assert row["measured_violation"] == 104.0
+    (row,) = cumulative.admissible_limits(rows, sweep, budget=39.0).to_dict("records")
+    assert math.isnan(row["largest_train_limit"])
+    table = cumulative.admissible_table(pd.DataFrame([row]))
+    assert table["largest d_t"].tolist() == ["none"]
+
+
+def test_a_negative_budget_is_refused(finished: Sweep) -> None:
+    with pytest.raises(RecrlError, match=r"^--budget: must be at least 0, got -1$"):
+        cumulative.admissible_limits(pd.DataFrame(), finished, budget=-1.0)
+
+
+def test_lemma_1_is_not_said_of_other_students(finished: Sweep) -> None:
+    rows = cumulative.cumulative_costs(finished)
+    assert rows.loc[rows["agent"] == "ppo-lag", ["bound", "discounted_excess_sum"]].isna().all(axis=None)
+    assert rows["ceiling_sum"].notna().all()
+
+
+def test_the_command_says_it(river_grid: SweepStore, capsys: pytest.CaptureFixture[str]) -> None:
+    root = str(river_grid.folder.parent)
+    assert main(["bound", "--root", root, "--budget", "1000"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert "rivergrid-1a" in out
+    assert "The largest d_t within 1000 of cost above d_d over all episodes:" in out
