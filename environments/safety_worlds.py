@@ -101,6 +101,7 @@ class SafetyWorlds:
         circles: middles of the gremlins' circles, metres, [B, gremlins, 2].
         gremlin_yaws: radians, [B, gremlins].
         embodied: the gremlin that is a body, [B].
+        touching: bodies of the model that the robot touches, of those that matter, [B, bodies].
     """
 
     distances: Floats
@@ -125,7 +126,9 @@ class SafetyWorlds:
         self.mocap_quat = self.simulations.state(state.mjSTATE_MOCAP_QUAT, (model.nmocap, 4))
         self._control = self.simulations.state(state.mjSTATE_CTRL, (model.nu,))
         self._qacc = self.simulations.output("qacc", (model.nv,))
-        self._touch = self.simulations.output("sensordata", (model.nsensordata,))
+        self._awake = self.simulations.output("tree_awake", (model.ntree,), np.int32)
+        self.touching = np.zeros((number, model.nbody), np.bool_)
+        self._root = np.asarray(model.body_rootid)
 
         counts = {"goal": 1} | {
             kind: number for kind, (number, _) in keepouts(task).items() if kind != "goal"
@@ -154,9 +157,7 @@ class SafetyWorlds:
             number, vases, 6
         )[..., :3]
         self._box = self.qpos[:, self.scene.box_qpos :][:, :3]
-        self._button_touch = [
-            self.scene.sensors[name] for name in self.scene.sensors if name.startswith("button")
-        ]
+        self._is_button = task.goal == "Button"
 
         self._indicators = [_INDICATORS[term] for term in task.cost_terms]
         self._everyone = np.arange(number)
@@ -200,7 +201,7 @@ class SafetyWorlds:
         rewards.clip(-REWARD_BOUND, REWARD_BOUND, out=rewards)
         self.distances = distances
         terms = self.cost_terms()
-        if self._button_touch:
+        if self._is_button:
             np.maximum(self.button_timer - 1, 0, out=self.button_timer)
         goal_met = self.goal_met()
         terminated = np.zeros(self.number, np.bool_)
@@ -234,7 +235,7 @@ class SafetyWorlds:
         acceleration = self._qacc if qacc is None else qacc
         rotation, place = self._sensors.read(self.qpos, self.qvel, acceleration, self._felt)
         lidar(egocentric(self.points, rotation, place), self._kinds, self._seen)
-        if self._button_touch and self.button_timer.any():
+        if self._is_button and self.button_timer.any():
             self._seen[self.button_timer > 0, list(self.group).index("buttons")] = 0.0
         observations: Observations = self._perceived.take(self._order, axis=1)
         return observations
@@ -251,6 +252,7 @@ class SafetyWorlds:
             self.points[:, self.group["gremlins"]] = places
         np.subtract(self._plane, self._robot_plane, out=self._offsets)
         np.abs(self._offsets, out=self.ranges)
+        self._feel()
 
     def measure(self) -> Floats:
         """The distances that the reward is made of, metres, [B, 1 or 2].
@@ -280,7 +282,7 @@ class SafetyWorlds:
 
     def pressed(self) -> Booleans:
         """Whether the robot touches each button, [B, buttons]."""
-        return self._touch[:, self._button_touch] > 0.0
+        return self.touching[:, self.scene.touchable["buttons"][0]].copy()
 
     def cost_terms(self) -> Floats:
         """The indicator of each cost term, [B, terms]."""
@@ -302,7 +304,7 @@ class SafetyWorlds:
             "gremlin_yaws": self.gremlin_yaws.copy(),
             "embodied": self.embodied.copy(),
             "qacc": self._qacc.copy(),
-            "touch": self._touch.copy(),
+            "touching": self.touching.copy(),
             "generators": [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators],
         }
 
@@ -315,7 +317,7 @@ class SafetyWorlds:
             )
         self.simulations.load(state["physics"])
         # Loading computes nothing: what the last step computed is put back as well.
-        self._qacc[...], self._touch[...] = state["qacc"], state["touch"]
+        self._qacc[...] = state["qacc"]
         for name in (
             "points",
             "steps",
@@ -333,6 +335,7 @@ class SafetyWorlds:
         for generator, saved in zip(self.generators, state["generators"], strict=True):
             generator.bit_generator.state = saved
         self.refresh()
+        self.touching[...] = state["touching"]
 
     def _begin(self) -> None:
         """Make room for what changes within an episode, and for what leads the gremlins."""
@@ -357,6 +360,22 @@ class SafetyWorlds:
                 model.nu + 3 * self.scene.gremlin_mocap, model.nu + 3 * self.scene.gremlin_mocap + 3
             )
 
+    def _feel(self) -> None:
+        """Find what the robots touch.
+
+        Contacts are looked up only where something can be touched: it is near, and, if it is a vase, awake.
+        A sensor for them would cost time in every physics step.
+        """
+        self.touching[...] = False
+        for kind, (_, reach) in self.scene.touchable.items():
+            near = np.minimum.reduce(self.ranges[:, self.group[kind]], axis=1) < reach
+            if kind == "vases":
+                near &= np.add.reduce(self._awake, axis=1) > 1
+            for index in near.nonzero()[0]:
+                roots = self._root[self.simulations.contacts(index)]
+                others = roots[(roots == self.scene.robot_body)[:, ::-1]]
+                self.touching[index, others] = True
+
     def _simulate(self, actions: npt.NDArray[Any]) -> None:
         if not self._has_gremlins:
             self._control[...] = actions
@@ -377,7 +396,7 @@ class SafetyWorlds:
             course = self._course.positions[self.steps[index]]
             astray = self._gremlin[index, :3] - course
             astray[:2] -= self.circles[index, self.embodied[index]]
-            touched = self._touch[index, self.scene.sensors["gremlin"]] > 0.0
+            touched = self.touching[index, self.scene.touchable["gremlins"][0]][0]
             if not touched and np.square(astray).sum() < ON_COURSE**2:
                 self._embody(int(index), int(nearest[index]))
 
@@ -457,9 +476,7 @@ class SafetyWorlds:
         return over
 
     def _cost_of_vases_contact(self) -> Booleans:
-        sensors = self.scene.sensors
-        touched: Booleans = self._touch[:, sensors["any"]] > self._touch[:, sensors["floor"]]
-        return touched
+        return self._touches("vases")
 
     def _cost_of_vases_velocity(self) -> Booleans:
         squares = np.add.reduce(np.square(self._vase_velocities), axis=2)
@@ -467,10 +484,7 @@ class SafetyWorlds:
         return moving
 
     def _cost_of_pillars(self) -> Booleans:
-        others = self.scene.sensors["floor"], self.scene.sensors["box"]
-        touch = self._touch
-        touched: Booleans = touch[:, self.scene.sensors["any"]] > touch[:, others[0]] + touch[:, others[1]]
-        return touched
+        return self._touches("pillars")
 
     def _cost_of_buttons(self) -> Booleans:
         pressed = self.pressed()
@@ -479,7 +493,10 @@ class SafetyWorlds:
         return wrong
 
     def _cost_of_gremlins(self) -> Booleans:
-        touched: Booleans = self._touch[:, self.scene.sensors["gremlin"]] > 0.0
+        return self._touches("gremlins")
+
+    def _touches(self, kind: str) -> Booleans:
+        touched: Booleans = np.logical_or.reduce(self.touching[:, self.scene.touchable[kind][0]], axis=1)
         return touched
 
 

@@ -120,9 +120,9 @@ class Scene:
             -1 where there is none.
         button_mocap, pillar_mocap: mocap index of each, [buttons] and [pillars].
         gremlin_mocap: mocap index of what leads the gremlin, or -1.
-        sensors: address in ``sensordata`` of the number of the robot's contacts, by what is touched:
-            ``any``, ``floor``, ``box``, ``gremlin``, ``button0`` and so on. Only what costs or is wanted
-            is counted.
+        touchable: for each kind of object of which it matters whether the robot touches it, the bodies (they
+            have consecutive numbers) and the distance between the robot's and the object's middle, metres,
+            beyond which they cannot touch.
     """
 
     task: SafetyTask
@@ -138,7 +138,7 @@ class Scene:
     button_mocap: tuple[int, ...]
     pillar_mocap: tuple[int, ...]
     gremlin_mocap: int
-    sensors: dict[str, int]
+    touchable: dict[str, tuple[slice, float]]
 
 
 def scene_xml(task: SafetyTask) -> str:
@@ -166,7 +166,6 @@ def scene_xml(task: SafetyTask) -> str:
   </option>
   {robot}
   {_LEAD if task.gremlins.number else ""}
-  <sensor>{"".join(_contact(other) for other in _touchables(task))}</sensor>
 </mujoco>"""
 
 
@@ -210,7 +209,7 @@ def make_scene(task: SafetyTask) -> Scene:
             int(model.body(f"pillar{index}").mocapid[0]) for index in range(task.pillars.number)
         ),
         gremlin_mocap=int(model.body("gremlin_lead").mocapid[0]) if has_gremlin else -1,
-        sensors={other: int(model.sensor(f"touch_{other}").adr[0]) for other in _touchables(task)},
+        touchable=_touchable(task, model),
     )
 
 
@@ -221,23 +220,28 @@ def upright(yaw: npt.ArrayLike) -> Floats:
     return np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
 
 
-def _touchables(task: SafetyTask) -> tuple[str, ...]:
-    """Whatever the robot's contacts must be counted with.
-
-    Contacts with vases or pillars are those that are not with the floor or the box: two or three sensors
-    instead of one per vase, at every physics step.
-    """
-    if "vases_contact" in task.cost_terms:
-        return ("any", "floor")
-    if "pillars" in task.cost_terms:
-        return ("any", "floor", "box")
-    gremlin = ("gremlin",) if task.gremlins.number else ()
-    return (*(f"button{index}" for index in range(task.buttons.number)), *gremlin)
-
-
-def _contact(other: str) -> str:
-    criterion = {"any": "", "floor": 'geom2="floor"'}.get(other, f'body2="{other}"')
-    return f'<contact name="touch_{other}" subtree1="robot" {criterion} data="found"/>'
+def _touchable(task: SafetyTask, model: mujoco.MjModel) -> dict[str, tuple[slice, float]]:
+    kinds = {
+        "vases": ("vase0", task.vases.number if "vases_contact" in task.cost_terms else 0),
+        "pillars": ("pillar0", task.pillars.number if "pillars" in task.cost_terms else 0),
+        "buttons": ("button0", task.buttons.number),
+        "gremlins": ("gremlin", min(task.gremlins.number, 1)),
+    }
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    robot = model.body("robot").id
+    limbs = np.flatnonzero(model.body_rootid[model.geom_bodyid] == robot)
+    offsets = np.linalg.norm(data.geom_xpos[limbs] - data.xpos[robot], axis=1)
+    reach = float((offsets + model.geom_rbound[limbs]).max())
+    touchable = {}
+    for kind, (name, number) in kinds.items():
+        if number:
+            first = model.body(name).id
+            geom = model.body_geomadr[first]
+            # A pillar stands upright: what counts is its radius.
+            size = model.geom_size[geom, 0] if kind == "pillars" else model.geom_rbound[geom]
+            touchable[kind] = (slice(first, first + number), reach + float(size) + 0.01)
+    return touchable
 
 
 def _vase(index: int, size: float) -> str:

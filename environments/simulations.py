@@ -116,6 +116,7 @@ class Simulations:
             raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
         self._delete = weakref.finalize(self, self._library.mjb_deleteBatch, self._batch)
         self._data = mujoco.MjData(model)
+        self._bodies = np.asarray(model.geom_bodyid)
         self.rows: Floats = self._view(
             self._library.mjb_state(self._batch),
             np.float64,
@@ -135,13 +136,18 @@ class Simulations:
         view: Floats = self.rows[:, start : start + size.value].reshape(self.number, *shape)
         return view
 
-    def output(self, name: str, shape: tuple[int, ...]) -> Floats:
-        """A float field of ``MjData`` that every call refreshes, as a live view, [B, *shape]."""
+    def output(self, name: str, shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
+        """A field of ``MjData`` that every call refreshes, as a live view, [B, *shape]."""
         address = self._library.mjb_output(self._batch, name.encode(), None, None)
         if not address:
             raise KeyError(f"MuJoCo has no field {name!r} that can be read from a batch")
-        view: Floats = self._view(address, np.float64, (self.number, *shape))
-        return view
+        return self._view(address, dtype, (self.number, *shape))
+
+    def contacts(self, index: int) -> Integers:
+        """The two bodies of each contact in one simulation, [contacts, 2]."""
+        self._library.mjb_getData(self._batch, int(index), self._data._address)
+        bodies: Integers = self._bodies[self._data.contact.geom]
+        return bodies
 
     def step(self, substeps: int) -> None:
         """Advance all simulations, then compute everything, accelerations included, at the new state."""

@@ -263,3 +263,23 @@ def test_an_unknown_task_or_option_is_refused() -> None:
         SafetyGymEnv("DoggoGoal1")
     with pytest.raises(ValueError, match="lidar_bins"):
         SafetyGymEnv("CarGoal1", lidar_bins=10)
+
+
+@pytest.mark.parametrize("name", [*LEVEL_2, "PointGoal2", "PointPush2"])
+def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -> None:
+    environment = SafetyGymVectorEnv(name, 4)
+    environment.reset(seed=5)
+    worlds, model = environment.worlds, environment.worlds.scene.model
+    kinds = [bodies for bodies, _ in worlds.scene.touchable.values()]
+    felt = 0
+    for action in held_actions(250, 4, seed=2):
+        environment.step(action)
+        for index in range(4):
+            contact = worlds.simulations.data(index).contact
+            roots = model.body_rootid[model.geom_bodyid[contact.geom]]
+            others = {int(other) for pair in roots for other in pair if worlds.scene.robot_body in pair}
+            for bodies in kinds:
+                expected = [body in others for body in range(bodies.start, bodies.stop)]
+                assert worlds.touching[index, bodies].tolist() == expected
+                felt += sum(expected)
+    assert felt > 0 or name == "CarPush2" or name.startswith("Point")

@@ -63,7 +63,7 @@ def test_vases_at_rest_cost_nothing_and_soon_sleep_while_the_robot_never_does() 
 @pytest.mark.parametrize("robot", ["Car", "Point"])
 def test_computed_sensors_are_those_of_mujoco(robot: str) -> None:
     task = SAFETY_TASKS[f"{robot}Goal0"]
-    xml = scene_xml(task).replace("<sensor></sensor>", f"<sensor>{SENSORS}</sensor>")
+    xml = scene_xml(task).replace("</mujoco>", f"<sensor>{SENSORS}</sensor></mujoco>")
     xml = xml.replace("<joint name=", '<site name="robot_middle"/><joint name=', 1)
     model = mujoco.MjModel.from_xml_string(xml)
     data, sensors = mujoco.MjData(model), RobotSensors(task, 1)

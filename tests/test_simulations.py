@@ -40,7 +40,7 @@ def controls(steps: int) -> Floats:
 
 def run(simulations: Simulations, chosen: Floats) -> list[bytes]:
     control = simulations.state(CONTROL, (2,))
-    touch = simulations.output("sensordata", (SCENE.model.nsensordata,))
+    awake = simulations.output("tree_awake", (SCENE.model.ntree,), np.int32)
     acceleration = simulations.output("qacc", (SCENE.model.nv,))
     robot = slice(0, SCENE.robot_qvel)
     past = []
@@ -49,7 +49,7 @@ def run(simulations: Simulations, chosen: Floats) -> list[bytes]:
         simulations.step(10)
         past.append(
             simulations.rows.tobytes()
-            + touch.tobytes()
+            + awake.tobytes()
             + np.ascontiguousarray(acceleration[:, robot]).tobytes()
         )
     return past

@@ -3,7 +3,7 @@
 python tests/benchmarks/bench_safety_gym.py [--tasks CarGoal2 ...] [--repeats 100] [--threads 2]
 
 For every task, 16 environments under random actions, against the same 16 simulations stepped by ``mj_step``
-alone in a Python loop, without sensors ("bare"); and one environment of ``gymnasium.make``. They take turns
+alone in a Python loop ("bare"); and one environment of ``gymnasium.make``. They take turns
 of a few steps, in one run on one core, so that a noisy machine hurts all alike. Times are CPU seconds of this
 process, lower quartiles over the turns; a share is the median over the turns of neighbouring times. With
 --threads: wall seconds, several threads against one. Resets are timed apart: an episode is 1,000 steps and
@@ -25,7 +25,6 @@ from recrl.environments.gremlins import leads
 from recrl.environments.safety_gym import SafetyGymVectorEnv
 from recrl.environments.safety_tasks import HORIZON, SAFETY_TASKS, SUBSTEPS
 from recrl.environments.safety_worlds import SafetyWorlds
-from recrl.environments.scene import scene_xml
 
 NUM_ENVS = 16
 STEPS = 5
@@ -45,7 +44,7 @@ class Bare:
     """Simulations stepped by MuJoCo alone."""
 
     def __init__(self, worlds: SafetyWorlds) -> None:
-        self.model = mujoco.MjModel.from_xml_string(without_sensors(scene_xml(worlds.task)))
+        self.model = worlds.scene.model
         self.datas = [mujoco.MjData(self.model) for _ in range(worlds.number)]
         self.generator = np.random.default_rng(0)
         self.gremlin = worlds.scene.gremlin_mocap
@@ -79,11 +78,6 @@ class Bare:
             for place in course + np.append(circle, 0.0):
                 lead[:] = place
                 mujoco.mj_step(self.model, data)
-
-
-def without_sensors(xml: str) -> str:
-    start, _, rest = xml.partition("<sensor>")
-    return start + rest.partition("</sensor>")[2]
 
 
 def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
