@@ -6,6 +6,7 @@ Imports next to nothing until it knows what is asked, so that ``--help`` is quic
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib.metadata
 import os
 import sys
@@ -30,6 +31,8 @@ Going on:
   recrl-sweep status demo                 from any terminal, whether it runs or not
   recrl-sweep launch grids/demo.yaml      after a crash, Ctrl-C or with more seeds: the same command; complete
                                           trials are kept, begun ones go on from their last checkpoint
+  recrl-sweep stop demo                   from another terminal: trials save where they are, the launch ends
+  recrl-sweep logs demo 3f2a --follow     a trial's log, by the beginning of its id or title
   recrl-sweep launch grids/demo.yaml --retry-failed
   recrl-sweep launch grids/demo.yaml --only method=dynamic task=rivergrid-1b
 
@@ -38,10 +41,11 @@ Exit codes:
   1    some trials failed or could not be finished
   2    the grid or the arguments are wrong; nothing was started
   3    another process is running this sweep
-  4    Ray or MLflow could not be started or reached
+  4    Ray or MLflow could not be started or reached, or files could not be written
   5    plan --check: a launch would have something to do
   130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 SWEEP_HELP = "a sweep's name, or its grid file; may be left out where there is only one"
 
 
@@ -92,6 +96,21 @@ def parser() -> argparse.ArgumentParser:
     _add_sweep(status)
     status.add_argument("--brief", action="store_true", help="one line, without the table of trials")
 
+    _add_sweep(
+        _command(commands, "stop", "ask the launch that runs a sweep to save its trials and end, and wait")
+    )
+
+    logs = _command(commands, "logs", "print a trial's log")
+    _add_sweep(logs)
+    logs.add_argument(
+        "trial",
+        nargs="*",
+        metavar="TRIAL",
+        help="the beginning of its id, title or folder, as status shows them; by default the one that runs",
+    )
+    logs.add_argument("--follow", action="store_true", help="wait for more as long as the trial runs")
+    logs.add_argument("--folder", action="store_true", help="print the trial's folder instead")
+
     _add_sweep(_command(commands, "figures", "draw the figures and tables of what is there so far"))
 
     bound = _command(commands, "bound", "what training cost beside its bounds; which d_t a budget allows")
@@ -105,6 +124,23 @@ def parser() -> argparse.ArgumentParser:
     bound.add_argument(
         "--cost", type=_at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
     )
+
+    replay = _command(
+        commands, "replay", "what limits another teacher would have set on the recorded episodes"
+    )
+    _add_sweep(replay)
+    replay.add_argument(
+        "--teacher", required=True, metavar="NAME", help="a method of the sweep, or any teacher by its name"
+    )
+    replay.add_argument(
+        "--option",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="options of the teacher other than the sweep's, window=8",
+    )
+    _add_only(replay)
 
     user_interface = _command(commands, "ui", "open MLflow's pages about a sweep, on this machine only")
     _add_sweep(user_interface)
@@ -157,6 +193,12 @@ def main(given: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, for example ``head``, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        where = error.filename or arguments.root
+        print(f"recrl-sweep: {where}: {error.strerror}; what was saved stays", file=sys.stderr)
+        return ExitCode.CANNOT_RUN
 
 
 def _code_of(error: RecrlError) -> ExitCode:
@@ -193,7 +235,7 @@ def _add_sweep(command: argparse.ArgumentParser) -> None:
     command.add_argument("sweep", nargs="?", metavar="SWEEP", help=SWEEP_HELP)
 
 
-def _add_selection(command: argparse.ArgumentParser) -> None:
+def _add_only(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--only",
         nargs="+",
@@ -203,6 +245,10 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
         help="only these trials: task, agent or method by label, or seed; several values with commas, "
         "method=none,dynamic",
     )
+
+
+def _add_selection(command: argparse.ArgumentParser) -> None:
+    _add_only(command)
     command.add_argument(
         "--retry-failed", action="store_true", help="try failed trials again, from their last checkpoint"
     )

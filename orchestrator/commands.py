@@ -8,29 +8,42 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import re
 import shlex
 import signal
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
 from rich.console import Console
 
+from recrl.environments.plugins import UnknownNameError
 from recrl.orchestrator import display
 from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid
-from recrl.orchestrator.plan import Plan, estimate, make_plan, trials_at_once
-from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
-from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.sweep import Mirror, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.plan import Plan, estimate, make_plan, select, trials_at_once
+from recrl.orchestrator.spec import Choice
+from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
+from recrl.orchestrator.store import SweepStore, TrialStore
+from recrl.orchestrator.sweep import (
+    REQUEST_SECONDS,
+    Mirror,
+    SweepResult,
+    launch,
+    request_stop,
+    stopping_on_signals,
+)
 from recrl.orchestrator.tracking import last_report, sync, tracking_uri
 from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_ui import open_ui
 from recrl.orchestrator.validation import nearest
+from recrl.teachers.registry import teacher_config
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,6 +131,46 @@ def run_status(arguments: argparse.Namespace, console: Console) -> ExitCode:
     return ExitCode.OK
 
 
+def run_stop(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Ask the launch that runs a sweep to save its trials and end, and wait until it has."""
+    store = _store(arguments)
+    still_runs = request_stop(store)
+    if not still_runs():
+        _say(console, f"{store.name}: no launch runs this sweep")
+        return ExitCode.OK
+    _say(console, f"{store.name}: its trials save where they are")
+    while still_runs():
+        time.sleep(REQUEST_SECONDS)
+    _say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
+    return ExitCode.OK
+
+
+def run_logs(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Print a trial's log, or say where its folder is."""
+    trial = _trial(_store(arguments), " ".join(arguments.trial))
+    if arguments.folder:
+        _say(console, str(_short(trial.folder)))
+        return ExitCode.OK
+    for text in display.lines_of(trial, follow=arguments.follow):
+        _say(console, text)
+    return ExitCode.OK
+
+
+def _trial(store: SweepStore, text: str) -> TrialStore:
+    """The trial that a person means; the one that runs if they do not say."""
+    found = store.find(text)
+    if not text:
+        now = time.time()
+        found = [trial for trial in found if standing_of(trial.record(), now=now) is Standing.RUNNING]
+    if len(found) == 1:
+        return found[0]
+    titles = [f"{trial.spec.trial_id} {trial.spec.title}" for trial in found[:10]]
+    more = f" and {len(found) - 10} more" if len(found) > 10 else ""
+    which = f"say which one, by its id or title: {', '.join(titles)}{more}" if found else "status names them"
+    what = f"trials on disk begin with {text!r}" if text else "trials are running"
+    raise RecrlError(f"{store.name}: {len(found) or 'no'} {what}; {which}")
+
+
 def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Draw the figures and tables of what is on disk."""
     _draw(_store(arguments), console)
@@ -139,6 +192,59 @@ def run_bound(arguments: argparse.Namespace, console: Console) -> ExitCode:
         _say(console, f"\nThe largest d_t within {arguments.budget:g} of cost above d_d over all episodes:")
         _show(cumulative.admissible_table(allowed), console)
     return ExitCode.OK
+
+
+def run_replay(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Say what limits another teacher would have set on the recorded episodes."""
+    import pandas as pd  # noqa: PLC0415  (commands that do not need it are quick to start)
+
+    from recrl.analysis.replay import replay, replay_summary  # noqa: PLC0415
+    from recrl.analysis.tables import write_csv  # noqa: PLC0415
+
+    store = _store(arguments)
+    specs = select(store.specs(), _only(arguments.only))
+    method = _teacher(store, arguments)
+    written, summaries = [], []
+    for trial in (store.trial(spec) for spec in specs):
+        if trial.record().update:
+            rows = replay(trial, method)
+            name = f"{trial.folder.name}__{re.sub('[^A-Za-z0-9.+-]+', '-', method.label)}.csv"
+            written.append(write_csv(rows, store.folder / "replays" / name))
+            summaries.append(replay_summary(trial, rows))
+    if not written:
+        raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials has a policy update yet")
+    _say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
+    _show(pd.concat(summaries), console)
+    _say(console, f"Every update  {_short(written[0].parent)}")
+    return ExitCode.OK
+
+
+def _teacher(store: SweepStore, arguments: argparse.Namespace) -> Choice:
+    """The teacher to ask: a method of the sweep by its label, or any teacher by its name."""
+    known = {spec.method.label: spec.method for spec in store.specs()}
+    method = known.get(arguments.teacher, Choice(arguments.teacher))
+    options = dict(method.options)
+    for pair in arguments.option:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise RecrlError(f"--option: must look like window=8, got {pair!r}")
+        options[key] = _parsed(value)
+    try:
+        teacher_config(method.name, options)
+    except ValidationError as error:
+        mistakes = "; ".join(f"{'.'.join(map(str, it['loc']))}: {it['msg']}" for it in error.errors())
+        raise RecrlError(f"teacher {method.name}: {mistakes}, got {options}") from error
+    except UnknownNameError as error:
+        raise RecrlError(str(error)) from error
+    return Choice(method.name, options, method.label)
+
+
+def _parsed(text: str) -> Any:
+    """A JSON value, or the text itself."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
 
 
 def run_ui(arguments: argparse.Namespace, console: Console) -> ExitCode:
@@ -254,7 +360,8 @@ def _say_failures(now: SweepProgress, store: SweepStore, console: Console) -> No
     def folder_of(trial: TrialProgress) -> str:
         return str(_short(store.trial(trial.spec).folder))
 
-    for line in display.failures(now.standing(Standing.FAILED), folder_of):
+    broken = [*now.standing(Standing.FAILED), *(t for t in now.standing(Standing.STOPPED) if t.record.error)]
+    for line in display.failures(broken, folder_of):
         _say(console, line)
 
 
@@ -317,8 +424,11 @@ COMMANDS: Mapping[str, Command] = {
     "plan": run_plan,
     "validate": run_validate,
     "status": run_status,
+    "stop": run_stop,
+    "logs": run_logs,
     "figures": run_figures,
     "bound": run_bound,
+    "replay": run_replay,
     "ui": run_ui,
     "sync": run_sync,
 }

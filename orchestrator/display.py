@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -14,10 +14,12 @@ from rich.table import Table
 from rich.text import Text
 
 from recrl.orchestrator.plan import Estimate, Plan, Work
-from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress
+from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, standing_of
+from recrl.orchestrator.store import TrialStore
 
 TERMINAL_SECONDS = 1.0
 LINE_SECONDS = 10.0
+LOG_SECONDS = 0.5
 SHOWN_RUNNING = 8
 
 _STYLES = {
@@ -112,10 +114,33 @@ def status_sentence(progress: SweepProgress) -> str:
 
 
 def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress], str]) -> Iterator[str]:
-    """A line for every failed trial: which, why, and where its log and traceback are."""
+    """For every trial that broke off: which, why, and where its log and traceback are."""
     for trial in trials:
-        yield f"failed: {trial.spec.title}: {trial.record.error or 'no reason was left'}"
+        word = "failed" if trial.standing is Standing.FAILED else "waiting"
+        yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was left'}"
         yield f"        log and traceback: {folder_of(trial)}"
+
+
+def lines_of(trial: TrialStore, *, follow: bool) -> Iterator[str]:
+    """The lines of a trial's log, without their ends.
+
+    Args:
+        trial: on disk.
+        follow: whether to wait for more as long as the trial runs.
+    """
+    offset, rest = 0, ""
+    while True:
+        runs = standing_of(trial.record(), now=time.time()) is Standing.RUNNING
+        with suppress(FileNotFoundError), trial.log_path.open("rb") as file:
+            file.seek(offset)
+            *lines, rest = (rest + file.read().decode(errors="replace")).split("\n")
+            offset = file.tell()
+            yield from lines
+        if not (follow and runs):
+            break
+        time.sleep(LOG_SECONDS)
+    if rest:
+        yield rest
 
 
 def duration(seconds: float) -> str:

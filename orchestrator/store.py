@@ -5,6 +5,7 @@
         grid.yaml               the grid file as given to the last launch
         trials.jsonl            the trials of that grid, a TrialSpec a line, in their order
         lock                    held by the one process that runs the sweep
+        stop.request            there while somebody asks that process to stop
         figures/                what ``recrl-sweep figures`` drew
         mlflow.db, mlartifacts/ the default MLflow store
         mirror/                 how far MLflow has been told, for each store it was told to
@@ -182,6 +183,11 @@ class SweepStore:
         """How far MLflow has been told; may be deleted at any time."""
         return self.folder / "mirror"
 
+    @property
+    def stop_request_path(self) -> Path:
+        """Whether the process that runs the sweep is asked to stop."""
+        return self.folder / "stop.request"
+
     def trial(self, spec: TrialSpec) -> TrialStore:
         """The trial's folder; it need not exist yet."""
         return TrialStore(self.trials_folder / spec.folder_name)
@@ -197,6 +203,29 @@ class SweepStore:
         if not self.trials_folder.is_dir():
             return []
         return [TrialStore(path.parent) for path in sorted(self.trials_folder.glob("*/spec.json"))]
+
+    def find(self, text: str) -> list[TrialStore]:
+        """The trials on disk that are called so, or else all whose name begins so.
+
+        Args:
+            text: a trial's id, title or folder, or its beginning.
+        """
+        trials = self.trials()
+        names = [(trial.spec.trial_id, trial.spec.title, trial.folder.name) for trial in trials]
+        called = [trial for trial, known in zip(trials, names, strict=True) if text in known]
+        begins = (any(name.startswith(text) for name in known) for known in names)
+        return called or [trial for trial, fits in zip(trials, begins, strict=True) if fits]
+
+    def is_locked(self) -> bool:
+        """Whether some process runs the sweep."""
+        try:
+            with (self.folder / "lock").open() as file:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return False
+        except BlockingIOError:
+            return True
+        return False
 
     @contextmanager
     def lock(self) -> Iterator[None]:

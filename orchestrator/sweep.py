@@ -30,6 +30,7 @@ from recrl.orchestrator.store import SweepStore, write_atomically, write_json
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
 MIRROR_SECONDS = 120.0
 HASTY_MIRROR_SECONDS = 10.0
+REQUEST_SECONDS = 0.5  # between two looks whether somebody asks to stop, or has been heard
 
 logger = logging.getLogger("recrl.sweep")
 
@@ -99,7 +100,7 @@ def launch(
     """
     specs = grid.trials()
     make_plan(specs, store, only=only)  # a mistake in ``only`` leaves no trace
-    with store.lock():
+    with store.lock(), _stopping_on_request(store, stop):
         _write_files(grid, specs, store)
         _leave_none_running(specs, store)  # of a launch that died
         plan = make_plan(specs, store, only=only, retry_failed=retry_failed)
@@ -123,6 +124,39 @@ def launch(
             if mirror is not None:
                 mirrored = mirror.stop(patience)
     return SweepResult(plan, after, stopped=stop.is_set(), mirrored=mirrored)
+
+
+def request_stop(store: SweepStore) -> Callable[[], bool]:
+    """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
+
+    Returns:
+        Whether it still runs; to be asked until it does not.
+    """
+    if store.is_locked():
+        store.stop_request_path.touch()
+    return store.is_locked
+
+
+@contextmanager
+def _stopping_on_request(store: SweepStore, stop: threading.Event) -> Iterator[None]:
+    """Set ``stop`` when ``request_stop`` is called, in whatever process; what was asked before is void."""
+
+    def watch() -> None:
+        while not over.wait(REQUEST_SECONDS):
+            if store.stop_request_path.exists():
+                stop.set()
+                return
+
+    store.stop_request_path.unlink(missing_ok=True)
+    over = threading.Event()
+    thread = threading.Thread(target=watch, name="stop request", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        store.stop_request_path.unlink(missing_ok=True)
 
 
 @contextmanager

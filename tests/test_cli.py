@@ -1,5 +1,7 @@
 """The command line: quick to start, honest in its exit codes, and its errors are sentences."""
 
+import json
+import resource
 import signal
 import subprocess
 import sys
@@ -10,6 +12,7 @@ import pytest
 from recrl.orchestrator.cli import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import parse_grid
+from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore
 
 GRID = """\
@@ -243,3 +246,86 @@ def test_the_module_runs_like_the_script(folder: Path) -> None:
     command = [sys.executable, "-m", "recrl.orchestrator.cli", "--version"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("recrl ")
+
+
+LONG = GRID.replace("total_steps: 160", "total_steps: 1e9")
+
+
+def test_stop_ends_a_launch_from_another_terminal(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "grid.yaml").write_text(LONG)
+    command = [sys.executable, "-m", "recrl.orchestrator.cli", "launch", "grid.yaml", *INLINE]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "small: 2 trials: 2 new\n"
+        assert main(["stop", "small"]) == ExitCode.OK
+        first, last = capsys.readouterr().out.splitlines()
+        assert first == "small: its trials save where they are"
+        assert last.startswith("small: 0 of 2 complete, 0 running, ")
+        assert "Stopped; nothing is lost." in process.communicate(timeout=60)[0]
+    assert process.returncode == ExitCode.STOPPED
+    assert main(["stop", "small"]) == ExitCode.OK
+    assert capsys.readouterr().out == "small: no launch runs this sweep\n"
+    assert not SweepStore(folder / "runs", "small").stop_request_path.exists()
+
+
+def test_logs_are_found_by_id_title_or_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    capsys.readouterr()
+    trial = SweepStore(Path("runs"), "small").trials()[1]
+    assert trial.spec.title == "two-state ppo-lag none seed 0"
+    for words in (
+        [trial.spec.trial_id],
+        [trial.spec.trial_id[:5]],
+        ["two-state", "ppo-lag", "none"],
+        [trial.folder.name],
+    ):
+        assert main(["logs", "small", *words, "--follow"]) == ExitCode.OK
+        assert capsys.readouterr().out == trial.log_path.read_text()
+    assert main(["logs", "small", trial.spec.trial_id, "--folder"]) == ExitCode.OK
+    assert capsys.readouterr().out == f"runs/small/trials/{trial.folder.name}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["nobody"], "small: no trials on disk begin with 'nobody'; status names them"),
+        ([], "small: no trials are running; status names them"),
+        (
+            ["two-state"],
+            "small: 2 trials on disk begin with 'two-state'; say which one, by its id or title: ",
+        ),
+    ],
+)
+def test_logs_of_nobody_and_of_several(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    grid = parse_grid(GRID.encode(), source="grid.yaml")
+    store = SweepStore(folder / "runs", "small")
+    for spec in grid.trials():
+        store.trial(spec).begin(spec).close(TrialState.WAITING)
+    store.info_path.write_text("{}")
+    assert main(["logs", "small", *words]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
+
+
+def test_status_says_why_a_trial_waits(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = parse_grid(GRID.encode(), source="grid.yaml")
+    store = SweepStore(folder / "runs", "small")
+    spec = grid.trials()[0]
+    store.trial(spec).begin(spec).close(TrialState.WAITING, error="the disk was full")
+    store.info_path.write_text("{}")
+    assert main(["status", "--brief"]) == ExitCode.OK  # nothing was launched: no trials are known
+    store.specs_path.write_text(json.dumps(spec.to_json()) + "\n")
+    assert main(["status", "--brief"]) == ExitCode.OK
+    assert "\nwaiting: two-state ppo-lag none seed 0: the disk was full\n" in capsys.readouterr().out
+
+
+def test_a_disk_that_takes_nothing_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
+    try:
+        code = main(["launch", "grid.yaml", *INLINE])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert code == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err.endswith("File too large; what was saved stays\n")
