@@ -1,7 +1,7 @@
-"""Generalised advantage estimation for the reward and every cost at once.
+"""Generalised advantage estimation for the reward and every cost at once, and the units of the estimates.
 
-Letters: T steps, B environments, C = 1 + k signals (the reward, then the k costs), M truncated steps,
-gamma the discount, lambda the trace decay.
+Letters: T steps, B environments, N = T B samples, C = 1 + k signals (the reward, then the k costs), M
+truncated steps, gamma the discount, lambda the trace decay.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+
+SMALLEST_STD = 1e-8
 
 
 def next_values(
@@ -71,3 +73,36 @@ def generalised_advantages(
     for step in range(len(advantages) - 2, -1, -1):
         advantages[step] += carry[step] * advantages[step + 1]
     return advantages
+
+
+def reward_spread(advantages: Floats) -> float:
+    """The standard deviation of the reward's advantages, [N, 1 + k], at least a number above 0."""
+    return max(float(advantages[:, 0].std()), SMALLEST_STD)
+
+
+def scaled_advantages(advantages: Floats, form: str) -> tuple[Floats, Floats]:
+    """Reward advantages standardised, [N]; cost advantages centred and in the unit ``form`` says, [N, k].
+
+    Beside standardised rewards, raw costs make the multiplier's meaning drift: on RiverGrid a step's cost
+    advantage is tens of times a reward's, and grows further as the reward's spread falls. ``reward-scaled``
+    divides both by the same number, so that the multiplier is the CMDP's own.
+
+    Args:
+        advantages: raw, [N, 1 + k].
+        form: ``reward-scaled`` or ``centred``.
+    """
+    centred = advantages - advantages.mean(axis=0)
+    std = reward_spread(centred)
+    return centred[:, 0] / std, centred[:, 1:] / (std if form == "reward-scaled" else 1.0)
+
+
+def penalised_advantages(rewards: Floats, costs: Floats, multipliers: Floats) -> Floats:
+    """The advantages of the Lagrangian, (A_r - sum_i p_i A_i) / (1 + sum_i p_i), [N].
+
+    Args:
+        rewards: A_r, [N].
+        costs: A_i, [N, k].
+        multipliers: p, [k].
+    """
+    weight = 1.0 / (1.0 + float(multipliers.sum()))
+    return weight * (rewards - costs @ multipliers)

@@ -29,6 +29,13 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "noise_form": "match-mixture",
 }
 
+STARTER_AGENTS_ASCENT: Mapping[str, Any] = {"policy_learning_rate": 3e-4, "policy_steps": 80}
+STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
+    "multiplier_rule": "softplus-adam",
+    "multiplier_initial": 1.0,
+    "multiplier_step": 0.05,
+}
+
 
 class StudentConfig(BaseModel):
     """Settings that all students with a policy and 1 + k critics share."""
@@ -89,19 +96,10 @@ class StudentConfig(BaseModel):
         return options
 
 
-class PPOLagConfig(StudentConfig):
-    """Settings of ``ppo-lag``, PPO on the Lagrangian."""
+class AscentConfig(StudentConfig):
+    """Settings of students that climb an objective by Adam until the policy has moved far enough."""
 
-    paper: ClassVar[Mapping[str, Any]] = {
-        **STARTER_AGENTS_SETTING,
-        "policy_learning_rate": 3e-4,
-        "policy_steps": 80,
-        "cost_advantages": "centred",
-        "penalty": "separate",
-        "multiplier_rule": "softplus-adam",
-        "multiplier_initial": 1.0,
-        "multiplier_step": 0.05,
-    }
+    paper: ClassVar[Mapping[str, Any]] = {**STARTER_AGENTS_SETTING, **STARTER_AGENTS_ASCENT}
 
     policy_learning_rate: Positive = Field(
         default=1e-3,
@@ -110,24 +108,14 @@ class PPOLagConfig(StudentConfig):
     policy_steps: Count = Field(
         default=20, description="Full-batch steps of the policy an update, at most (ours; paper 80)."
     )
-    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
-    )
     stop_kl_factor: Positive = Field(
         default=1.2, description="Stop the policy's steps when the KL exceeds this times target_kl (paper)."
     )
-    entropy_bonus: NonNegative = Field(
-        default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
-    )
-    cost_advantages: Literal["reward-scaled", "centred"] = Field(
-        default="reward-scaled",
-        description="Unit of the cost advantages: divided by the reward advantages' standard deviation, so "
-        "that the multiplier is that of the CMDP (ours), or as they are beside standardised rewards (paper).",
-    )
-    penalty: Literal["combined", "separate"] = Field(
-        default="combined",
-        description="Clip the surrogate of reward minus multiplied costs (ours) or the reward's (paper).",
-    )
+
+
+class MultiplierConfig(StudentConfig):
+    """Settings of students that price the constraints: how their multipliers move."""
+
     multiplier_rule: Literal["projected", "softplus-adam", "pid"] = Field(
         default="pid",
         description="How multipliers move: PID, a damped dual ascent (Stooke et al. 2020; ours), plain "
@@ -166,8 +154,8 @@ class PPOLagConfig(StudentConfig):
         return self
 
 
-class CPOConfig(StudentConfig):
-    """Settings of ``cpo``, constrained policy optimisation."""
+class TrustRegionConfig(StudentConfig):
+    """Settings of students that take one trust-region step an update."""
 
     damping: NonNegative = Field(
         default=0.1, description="Multiple of the identity added to the Hessian of the KL (paper)."
@@ -177,3 +165,137 @@ class CPOConfig(StudentConfig):
         default=0.8, description="Factor on the step from one try of the line search to the next (paper)."
     )
     backtrack_tries: Count = Field(default=10, description="Tries of the line search (paper).")
+
+
+class PPOConfig(AscentConfig):
+    """Settings of ``ppo``, which knows no constraint."""
+
+    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+    )
+    entropy_bonus: NonNegative = Field(
+        default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
+    )
+
+
+class PPOLagConfig(AscentConfig, MultiplierConfig):
+    """Settings of ``ppo-lag``, PPO on the Lagrangian."""
+
+    paper: ClassVar[Mapping[str, Any]] = {
+        **STARTER_AGENTS_SETTING,
+        **STARTER_AGENTS_ASCENT,
+        **STARTER_AGENTS_MULTIPLIERS,
+        "cost_advantages": "centred",
+        "penalty": "separate",
+    }
+
+    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+    )
+    entropy_bonus: NonNegative = Field(
+        default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
+    )
+    cost_advantages: Literal["reward-scaled", "centred"] = Field(
+        default="reward-scaled",
+        description="Unit of the cost advantages: divided by the reward advantages' standard deviation, so "
+        "that the multiplier is that of the CMDP (ours), or as they are beside standardised rewards (paper).",
+    )
+    penalty: Literal["combined", "separate"] = Field(
+        default="combined",
+        description="Clip the surrogate of reward minus multiplied costs (ours) or the reward's (paper).",
+    )
+
+
+class FOCOPSConfig(AscentConfig, MultiplierConfig):
+    """Settings of ``focops``, first-order constrained optimisation in policy space."""
+
+    paper: ClassVar[Mapping[str, Any]] = {
+        **STARTER_AGENTS_SETTING,
+        **STARTER_AGENTS_ASCENT,
+        "target_kl": 0.02,
+        "stop_kl_factor": 1.0,
+        "multiplier_rule": "projected",
+        "multiplier_step": 0.01,
+        "multiplier_maximum": 2.0,
+        "temperature": 1.5,
+    }
+
+    temperature: Positive = Field(
+        default=0.5,
+        description="lambda, standard deviations of the reward advantages that are worth a nat (ours; Zhang "
+        "et al. 2020: 1.5).",
+    )
+
+
+class P3OConfig(AscentConfig):
+    """Settings of ``p3o``, penalised proximal policy optimisation."""
+
+    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+    )
+    penalty_factor: Positive = Field(
+        default=20.0,
+        description="kappa, reward per unit of cost; must exceed every multiplier of the task (ours; Zhang "
+        "et al. 2022 fix one for all tasks).",
+    )
+
+
+class IPOConfig(AscentConfig):
+    """Settings of ``ipo``, interior-point policy optimisation."""
+
+    paper: ClassVar[Mapping[str, Any]] = {
+        **STARTER_AGENTS_SETTING,
+        **STARTER_AGENTS_ASCENT,
+        "barrier_sharpness": 20.0,
+    }
+
+    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+    )
+    barrier_sharpness: Positive = Field(
+        default=500.0,
+        description="t of the barrier log(slack) / t; at the optimum it gives away 1 / t of the reward "
+        "advantages' standard deviation a step and constraint (ours; Liu et al. 2020: 20).",
+    )
+    barrier_slope: Positive = Field(
+        default=20.0,
+        description="The barrier's steepest slope, with which it goes on where there is no slack, reward per "
+        "unit of cost; must exceed every multiplier of the task (ours).",
+    )
+
+
+class CPOConfig(TrustRegionConfig):
+    """Settings of ``cpo``, constrained policy optimisation."""
+
+
+class PCPOConfig(TrustRegionConfig):
+    """Settings of ``pcpo``, projection-based constrained policy optimisation."""
+
+
+class TRPOConfig(TrustRegionConfig):
+    """Settings of ``trpo``, which knows no constraint."""
+
+
+class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):
+    """Settings of ``trpo-lag``, TRPO on the Lagrangian."""
+
+    paper: ClassVar[Mapping[str, Any]] = {
+        **STARTER_AGENTS_SETTING,
+        **STARTER_AGENTS_MULTIPLIERS,
+        "cost_advantages": "centred",
+    }
+
+    cost_advantages: Literal["reward-scaled", "centred"] = Field(
+        default="reward-scaled",
+        description="Unit of the cost advantages: divided by the reward advantages' standard deviation, so "
+        "that the multiplier is that of the CMDP (ours), or as they are beside standardised rewards (paper).",
+    )
+
+
+class CRPOConfig(TrustRegionConfig):
+    """Settings of ``crpo``, constraint-rectified policy optimisation."""
+
+    tolerance: NonNegative = Field(
+        default=0.0,
+        description="eta, the violation that is borne, in episode cost (ours; Xu et al. 2021: 0.5).",
+    )

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import CPOConfig
+from recrl.agents.config import CPOConfig, TrustRegionConfig
 from recrl.agents.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.agents.distributions import Distribution, mean_divergence
 from recrl.agents.errors import require_finite
@@ -139,27 +139,10 @@ class ConstrainedPolicyOptimisation:
         }
 
     def _direction(self, model: LocalModel, active: ActiveConstraints) -> tuple[Tensor, DualSolution]:
-        """The full step x, [P], of the linearised problem, and its solution.
-
-        The dual takes v.H v for q and so on, as safety-starter-agents does, not g.v: where conjugate
-        gradients have not converged, that is the true size of the step.
-        """
-        config = self._config
-        gradients = model.gradients()
-        metric = model.metric(config.damping)
-        chosen = torch.cat([-gradients[:1], gradients[1 + torch.from_numpy(active.index)]])
-        solved = torch.stack(
-            [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in chosen]
-        )
-        products = torch.stack([metric(direction) for direction in solved])
-        gram = (solved @ products.T).numpy().astype(np.float64)
-        require_finite("products of CPO's directions", gram)
-        gram = 0.5 * (gram + gram.T)
-        solution = solve_dual(
-            StepProblem(gram[0, 0], gram[0, 1:], gram[1:, 1:], active.violations, config.target_kl)
-        )
-        weights = np.concatenate([[solution.gradient_weight], solution.constraint_weights])
-        return -torch.from_numpy(weights.astype(np.float32)) @ solved, solution
+        """The full step x, [P], of the linearised problem, and its solution."""
+        problem, solved = linearise(model, active, self._config)
+        solution = solve_dual(problem)
+        return along(solution, solved), solution
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing."""
@@ -167,6 +150,34 @@ class ConstrainedPolicyOptimisation:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Nothing to load."""
+
+
+def linearise(
+    model: LocalModel, active: ActiveConstraints, config: TrustRegionConfig
+) -> tuple[StepProblem, Tensor]:
+    """The step's problem reduced to products, and H^-1 g, H^-1 b_1, ..., H^-1 b_j, [1 + j, P].
+
+    The products are v.H v for q and so on, as safety-starter-agents takes them, not g.v: where conjugate
+    gradients have not converged, that is the true size of the step.
+    """
+    gradients = model.gradients()
+    metric = model.metric(config.damping)
+    chosen = torch.cat([-gradients[:1], gradients[1 + torch.from_numpy(active.index)]])
+    solved = torch.stack(
+        [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in chosen]
+    )
+    products = torch.stack([metric(direction) for direction in solved])
+    gram = (solved @ products.T).numpy().astype(np.float64)
+    require_finite("products of the trust region's directions", gram)
+    gram = 0.5 * (gram + gram.T)
+    problem = StepProblem(gram[0, 0], gram[0, 1:], gram[1:, 1:], active.violations, config.target_kl)
+    return problem, solved
+
+
+def along(solution: DualSolution, solved: Tensor) -> Tensor:
+    """The step x, [P], that a solution stands for; ``solved`` is as ``linearise`` gives it."""
+    weights = np.concatenate([[solution.gradient_weight], solution.constraint_weights])
+    return -torch.from_numpy(weights.astype(np.float32)) @ solved
 
 
 def acceptance(

@@ -8,12 +8,13 @@ import torch
 from gymnasium.spaces import Discrete
 
 from recrl.agents.actor_critic import Constraints
+from recrl.agents.advantages import scaled_advantages
 from recrl.agents.agent import Rollout
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import PPOLagConfig
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.ppo_lag import PPOLagrangian, scaled_advantages
+from recrl.agents.ppo_lag import PPOLagrangian
 from recrl.environments.cmdp import Floats
 
 STATES = np.array([0, 0, 1, 1, 1, 2])
