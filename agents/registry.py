@@ -15,7 +15,18 @@ import numpy as np
 from pydantic import BaseModel
 
 from recrl.agents.agent import Agent
-from recrl.agents.config import CPOConfig, PPOLagConfig
+from recrl.agents.config import (
+    CPOConfig,
+    CRPOConfig,
+    FOCOPSConfig,
+    IPOConfig,
+    P3OConfig,
+    PCPOConfig,
+    PPOConfig,
+    PPOLagConfig,
+    TRPOConfig,
+    TRPOLagConfig,
+)
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.plugins import load_attribute, resolve
 
@@ -45,6 +56,46 @@ AGENTS: dict[str, AgentEntry] = {
         "Constrained policy optimisation: a trust-region step that keeps the constraints.",
         CPOConfig,
         "recrl.agents.cpo:make_cpo",
+    ),
+    "pcpo": AgentEntry(
+        "Projection-based constrained policy optimisation: a reward step, projected onto the constraints.",
+        PCPOConfig,
+        "recrl.agents.pcpo:make_pcpo",
+    ),
+    "focops": AgentEntry(
+        "First-order constrained optimisation in policy space: multipliers, no second derivatives.",
+        FOCOPSConfig,
+        "recrl.agents.focops:make_focops",
+    ),
+    "p3o": AgentEntry(
+        "Penalised proximal policy optimisation: an exact penalty, nothing to adapt.",
+        P3OConfig,
+        "recrl.agents.p3o:make_p3o",
+    ),
+    "ipo": AgentEntry(
+        "Interior-point policy optimisation: a logarithmic barrier before each limit.",
+        IPOConfig,
+        "recrl.agents.ipo:make_ipo",
+    ),
+    "crpo": AgentEntry(
+        "Constraint-rectified policy optimisation: reward steps while the constraints hold, else cost steps.",
+        CRPOConfig,
+        "recrl.agents.crpo:make_crpo",
+    ),
+    "trpo-lag": AgentEntry(
+        "TRPO on the Lagrangian, with a choice of multiplier rules.",
+        TRPOLagConfig,
+        "recrl.agents.trpo_lag:make_trpo_lag",
+    ),
+    "ppo": AgentEntry(
+        "PPO, which knows no constraint: a control.",
+        PPOConfig,
+        "recrl.agents.ppo:make_ppo",
+    ),
+    "trpo": AgentEntry(
+        "TRPO, which knows no constraint: a control.",
+        TRPOConfig,
+        "recrl.agents.trpo:make_trpo",
     ),
 }
 

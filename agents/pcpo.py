@@ -1,0 +1,158 @@
+"""Projection-based constrained policy optimisation (Yang et al. 2020), for any small number of constraints.
+
+First the step that improves the reward, y = -sqrt(2 delta / q) v, then its projection, in the metric H, onto
+the set where the linearised constraints hold (symbols as in ``recrl.agents.cpo_dual``):
+
+    minimise (x - y).H (x - y) / 2  subject to  b_i.x + c_i <= 0 for i = 1..k.
+
+The optimum is x = y - sum_i nu_i w_i, where nu >= 0 solves the complementarity problem
+
+    e - S nu <= 0,  nu.(e - S nu) = 0,    e = c - sqrt(2 delta / q) r  (the excesses b_i.y + c_i of y);
+
+for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far from feasible is far from it
+too: the paper bounds the damage, here the step is scaled back into the trust region. Then it is shortened by
+``cpo``'s line search, which the paper leaves out.
+
+If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, k
+costs, P parameters.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
+from recrl.agents.advantages import reward_spread
+from recrl.agents.batch import LearningBatch
+from recrl.agents.config import PCPOConfig
+from recrl.agents.cpo import ActiveConstraints, LocalModel, acceptance, along, linearise
+from recrl.agents.cpo_dual import (
+    FEASIBILITY_TOLERANCE,
+    NO_GRADIENT,
+    NO_INFLUENCE,
+    DualSolution,
+    StepCase,
+    StepProblem,
+)
+from recrl.agents.policies import StochasticPolicy
+from recrl.agents.trust_region import backtrack
+from recrl.environments.cmdp import CMDPSpec, Floats
+
+
+def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
+    """The weights nu of the module's complementarity problem, by trying every set of binding constraints.
+
+    Args:
+        gram: S, [k, k], symmetric and positive semidefinite.
+        excesses: e, [k].
+
+    Returns:
+        [k], or None if the constraints contradict one another.
+
+    >>> projection_weights(np.array([[4.0]]), np.array([2.0]))
+    array([0.5])
+    """
+    usable = [i for i in range(len(excesses)) if gram[i, i] > NO_INFLUENCE]
+    scale = max(float(np.abs(excesses).max(initial=0.0)), NO_INFLUENCE)
+    for size in range(len(usable) + 1):
+        for binding in itertools.combinations(usable, size):
+            index = list(binding)
+            block = gram[np.ix_(index, index)]
+            if index and np.linalg.cond(block) > 1.0 / NO_GRADIENT:
+                continue  # linearly dependent: a smaller set has the same face
+            weights = np.zeros_like(excesses)
+            weights[index] = np.linalg.solve(block, excesses[index])
+            left = (excesses - gram @ weights)[usable]
+            if np.all(weights >= 0.0) and np.all(left <= FEASIBILITY_TOLERANCE * scale):
+                return weights
+    return None
+
+
+def projected_step(problem: StepProblem) -> DualSolution:
+    """The reward's step, projected and scaled back into the trust region.
+
+    Where the constraints contradict one another, only the one that is violated most is projected on.
+    """
+    squared = problem.squared_gradient
+    reach = float(np.sqrt(2.0 * problem.radius / squared)) if squared > NO_INFLUENCE else 0.0
+    excesses = problem.violations - reach * problem.mixed
+    weights = projection_weights(problem.gram, excesses)
+    if weights is None:
+        spreads = np.sqrt(np.maximum(np.diag(problem.gram), NO_INFLUENCE))
+        worst = int(np.argmax(excesses / spreads))
+        weights = np.zeros_like(excesses)
+        weights[worst] = excesses[worst] / spreads[worst] ** 2
+    length = (
+        reach**2 * squared
+        + 2.0 * reach * float(weights @ problem.mixed)
+        + float(weights @ problem.gram @ weights)
+    )
+    scale = min(1.0, float(np.sqrt(2.0 * problem.radius / max(length, NO_INFLUENCE))))
+    case = StepCase.CONSTRAINED if weights.any() else StepCase.UNCONSTRAINED
+    multipliers = weights / reach if reach > 0.0 else np.full_like(weights, np.nan)
+    return DualSolution(case, scale * reach, scale * weights, multipliers, None)
+
+
+class ProjectionBasedConstrainedPolicyOptimisation:
+    """The rule of ``pcpo``; a ``recrl.agents.actor_critic.PolicyRule``. It keeps no state."""
+
+    def __init__(self, config: PCPOConfig) -> None:
+        self._config = config
+
+    def improve(
+        self,
+        policy: StochasticPolicy,
+        batch: LearningBatch,
+        advantages: Floats,
+        constraints: Constraints,
+    ) -> dict[str, float]:
+        """Take one projected step, unless nothing is known about the constraints."""
+        config = self._config
+        centred = advantages - advantages.mean(axis=0)
+        std = reward_spread(centred)
+        centred[:, 0] /= std  # changes no step, only the unit of the multipliers
+        model = LocalModel(policy, batch, centred)
+        multipliers = np.full_like(constraints.limits, np.nan)
+        shortened, norm = None, 0.0
+        if constraints.known:
+            active = ActiveConstraints.of(constraints)
+            problem, solved = linearise(model, active, config)
+            solution = projected_step(problem)
+            step = along(solution, solved)
+            shortened = backtrack(
+                policy.parameters,
+                step,
+                acceptance(model, active, solution, config.target_kl),
+                ratio=config.backtrack_ratio,
+                tries=config.backtrack_tries,
+            )
+            norm = 0.0 if shortened is None else config.backtrack_ratio**shortened * float(step.norm())
+            multipliers = np.zeros_like(constraints.limits)
+            multipliers[active.index] = solution.multipliers
+        gains, _ = model.measure()
+        return {
+            "policy_steps": float(shortened is not None),
+            "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
+            "step_norm": norm,
+            "surrogate_reward": float(gains[0]) * std,
+            **indexed("surrogate_cost", gains[1:]),
+            **indexed("multiplier", multipliers),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Nothing to load."""
+
+
+def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
+    """A fresh PCPO student."""
+    policy, critics = initial_networks(cmdp, config, seed)
+    rule = ProjectionBasedConstrainedPolicyOptimisation(config)
+    return ActorCritic(cmdp, config, policy, critics, rule)

@@ -1,0 +1,132 @@
+"""The students that know no constraint, and the ascent that first-order students share."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete, Space
+
+from recrl.agents.actor_critic import Constraints, PolicyRule
+from recrl.agents.advantages import penalised_advantages
+from recrl.agents.ascent import climb, with_entropy, with_prices
+from recrl.agents.batch import LearningBatch
+from recrl.agents.config import CPOConfig, PPOConfig, TRPOConfig
+from recrl.agents.cpo import ConstrainedPolicyOptimisation
+from recrl.agents.distributions import Categorical
+from recrl.agents.networks import Adam, NetworkForm, orthogonal
+from recrl.agents.policies import StochasticPolicy
+from recrl.agents.ppo import ProximalPolicyOptimisation
+from recrl.agents.trpo import TrustRegionPolicyOptimisation
+from recrl.environments.cmdp import Floats
+
+SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
+DELTA = 0.01
+
+
+def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floats]:
+    """A policy, what it did, and advantages of the reward and two costs."""
+    generator = np.random.default_rng(0)
+    policy = StochasticPolicy(
+        3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
+    )
+    observations = generator.normal(size=(400, 3)).astype(np.float32)
+    actions = policy.sample(observations, generator)
+    liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
+    advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
+    return policy, LearningBatch.gather(observations, actions, compact=True), advantages
+
+
+def rule_of(name: str, policy: StochasticPolicy) -> PolicyRule:
+    if name == "ppo":
+        return ProximalPolicyOptimisation(PPOConfig(target_kl=DELTA), policy)
+    if name == "trpo":
+        return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA))
+    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
+
+
+def improved(
+    name: str, space: Space[object], gaps: list[float], limits: list[float]
+) -> tuple[dict[str, float], Floats]:
+    """The metrics, and the policy's parameters afterwards."""
+    policy, batch, advantages = sampled(space)
+    length = math.nan if math.isnan(gaps[0]) else 10.0
+    constraints = Constraints(np.array(limits), np.array(gaps), length)
+    metrics = rule_of(name, policy).improve(policy, batch, advantages, constraints)
+    return metrics, policy.parameters.to_numpy().astype(np.float64)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("name", ["ppo", "trpo"])
+def test_neither_limits_nor_costs_nor_finished_episodes_change_a_control(
+    name: str, space: Space[object]
+) -> None:
+    metrics, reference = improved(name, space, [9.0, 9.0], [1.0, 1.0])
+    assert metrics["surrogate_reward"] > 0.0
+    assert metrics["multiplier_0"] == metrics["multiplier_1"] == 0.0
+    for gaps, limits in (([-9.0, -9.0], [10.0, math.inf]), ([math.nan, math.nan], [1.0, 1.0])):
+        np.testing.assert_array_equal(improved(name, space, gaps, limits)[1], reference)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object]) -> None:
+    unlimited = [math.inf, math.inf]
+    found, after = improved("trpo", space, [-math.inf, -math.inf], unlimited)
+    expected, after_cpo = improved("cpo", space, [-math.inf, -math.inf], unlimited)
+    np.testing.assert_allclose(after, after_cpo, atol=1e-5)
+    assert found["surrogate_reward"] == pytest.approx(expected["surrogate_reward"], rel=1e-3)
+    assert found["step_norm"] == pytest.approx(expected["step_norm"], rel=1e-3)
+
+
+def test_where_no_action_is_better_trpo_stays() -> None:
+    policy, batch, advantages = sampled(SPACES[0])
+    before = policy.parameters.to_numpy()
+    constraints = Constraints(np.array([1.0]), np.array([0.0]), 10.0)
+    metrics = rule_of("trpo", policy).improve(policy, batch, np.zeros((400, 2)), constraints)
+    np.testing.assert_array_equal(policy.parameters.to_numpy(), before)
+    assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
+    assert advantages.shape == (400, 3)
+
+
+def climbed(steps: int, largest_kl: float) -> tuple[int, bool]:
+    """The steps taken up an advantage, and whether the policy is another."""
+    policy, batch, advantages = sampled(SPACES[0])
+    before = policy.parameters.to_numpy()
+    weights = batch.per_decision(advantages[:, 0])
+    taken = climb(
+        policy,
+        Adam(policy.parameters, 0.01),
+        batch,
+        lambda _, ratios: ratios @ weights,
+        steps=steps,
+        largest_kl=largest_kl,
+    )
+    return taken, bool(np.any(policy.parameters.to_numpy() != before))
+
+
+def test_the_ascent_takes_its_steps_and_stops_when_it_has_gone_too_far() -> None:
+    assert climbed(0, 1.0) == (0, False)
+    assert climbed(3, math.inf) == (3, True)
+    taken, moved = climbed(100, 1e-4)
+    assert moved
+    assert 1 <= taken < 20
+
+
+def test_an_entropy_bonus_adds_the_mean_entropy_in_nats() -> None:
+    _, batch, _ = sampled(SPACES[0])
+    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.rows), 4), dim=1))
+    objective = with_entropy(lambda ratios: ratios.sum(), batch, 0.5)
+    assert float(objective(uniform, torch.ones(2))) == pytest.approx(2.0 + 0.5 * math.log(4.0), rel=1e-5)
+
+
+def test_a_priced_gain_is_divided_by_one_and_its_price() -> None:
+    _, batch, _ = sampled(SPACES[0])
+    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.rows), 4), dim=1))
+    objective = with_prices(lambda ratios: (ratios.sum(), 3.0))
+    assert float(objective(uniform, torch.ones(2))) == 0.5
+
+
+def test_the_lagrangians_advantages_are_the_ones_computed_by_hand() -> None:
+    rewards, costs = np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.0, 4.0]])
+    found = penalised_advantages(rewards, costs, np.array([1.0, 2.0]))
+    assert found.tolist() == [-0.25, -2.25]
