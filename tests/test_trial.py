@@ -1,10 +1,12 @@
 """A trial walks the paper's two phases, records what happened, and never depends on how it was run."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,12 +40,17 @@ def never() -> bool:
     return False
 
 
+def stop_after(updates: int) -> Callable[[], bool]:
+    """Asked once before each update, it stops a trial after so many."""
+    answers = iter([False] * updates + [True])
+    return lambda: next(answers)
+
+
 def run(folder: Path, spec: TrialSpec = SPEC, stops: tuple[int, ...] = ()) -> TrialStore:
     """The trial, stopped and resumed after the given numbers of further updates, then run to its end."""
     store = SweepStore(folder, "sweep").trial(spec)
     for updates in stops:
-        countdown = iter([False] * updates + [True])
-        assert run_recorded(spec, store, should_stop=lambda left=countdown: next(left)) is TrialState.WAITING
+        assert run_recorded(spec, store, should_stop=stop_after(updates)) is TrialState.WAITING
     assert run_recorded(spec, store, should_stop=never) is TrialState.COMPLETE
     return store
 
@@ -92,8 +99,6 @@ def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path
         "store = SweepStore(Path(sys.argv[1]), 'sweep').trial(spec)\n"
         "run_recorded(spec, store, should_stop=lambda: False, commit_seconds=0.0)\n"
     )
-    import json  # noqa: PLC0415
-
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
     process = subprocess.Popen([sys.executable, "-c", program, str(tmp_path), json.dumps(SPEC.to_json())])
     deadline = time.monotonic() + 60.0
