@@ -37,7 +37,7 @@ class Problem:
     sentence: str
 
     def __str__(self) -> str:
-        where = ".".join(str(part) for part in self.place)
+        where = ".".join(str(part) if str(part).isprintable() else repr(part) for part in self.place)
         return f"{self.line}: {where}: {self.sentence}" if where else f"{self.line}: {self.sentence}"
 
 

@@ -432,6 +432,8 @@ def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
         try:
             with _own_signal_handlers(), _own_sessions():
                 ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
+        except SystemExit as error:  # Ray's own answer to a SIGTERM while it starts; nothing runs yet
+            raise KeyboardInterrupt from error
         except (RayError, RuntimeError, OSError, ValueError) as error:
             raise ClusterError(f"{failure}: {_first_line(error)}{hint}") from error
         yield

@@ -10,7 +10,7 @@ import struct
 from typing import Any
 
 import yaml
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from recrl.orchestrator.checkpoint import MAGIC, decode, encode
@@ -96,6 +96,7 @@ def assert_grid_or_error(data: bytes) -> None:
 
 
 @given(st.binary(max_size=300) | st.text(max_size=300).map(str.encode))
+@example(b"? '\n\n  '\n: null\n")  # a key of two lines
 @FUZZED
 def test_any_bytes_are_a_grid_or_an_error(data: bytes) -> None:
     assert_grid_or_error(data)
