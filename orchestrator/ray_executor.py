@@ -37,7 +37,7 @@ from typing import Any, Literal
 
 import ray
 from ray import cloudpickle, tune
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import RayTaskError
 from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import ClusterError, StorageError, TeacherUnavailableError
@@ -434,7 +434,7 @@ def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
                 ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
         except SystemExit as error:  # Ray's own answer to a SIGTERM while it starts; nothing runs yet
             raise KeyboardInterrupt from error
-        except (RayError, RuntimeError, OSError, ValueError) as error:
+        except Exception as error:  # that a node is too slow to start, Ray says by a bare Exception
             raise ClusterError(f"{failure}: {_first_line(error)}{hint}") from error
         yield
     finally:
