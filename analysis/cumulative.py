@@ -40,6 +40,7 @@ from recrl.analysis.frames import GROUP, KEY, Sweep
 from recrl.analysis.tables import number
 from recrl.environments.cmdp import Phase
 from recrl.environments.finite_cmdp import FiniteVectorEnv
+from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import find_task, make_vector
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
@@ -164,7 +165,10 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> tuple[int, float] | None:
     """Horizon and largest cost of a step of a finite task; None for others."""
-    if find_task(name).optimum is None:  # no finite task is without one, and others can be slow to build
+    try:
+        if find_task(name).optimum is None:  # no finite task is without, and others can be slow to build
+            return None
+    except UnknownNameError:  # not installed here
         return None
     environment = make_vector(name, 1, options=options)
     if not isinstance(environment, FiniteVectorEnv):

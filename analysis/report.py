@@ -1,5 +1,6 @@
 """All figures and tables of a sweep in one call, from a finished or a running one.
 
+    report.html                 all of it on one self-contained page, with settings and provenance
     report.md                   what is missing, the tables, the list of the rest
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
@@ -10,6 +11,7 @@
     summary.csv                 averaged over seeds, with interquartile means
     comparisons.csv             paired differences to the student without a curriculum
     training.csv                what relaxed training cost, a row a trial
+    bounds.csv                  the same beside Proposition 1, a row a trial and cost
     outcomes.tex                the first table for LaTeX (booktabs)
 
 Equal sweeps give equal bytes: no time is written, and the bootstrap's generator is seeded here.
@@ -17,24 +19,36 @@ Equal sweeps give equal bytes: no time is written, and the bootstrap's generator
 
 from __future__ import annotations
 
+import json
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from recrl.analysis import figures, frames, metrics, styles, tables
+from recrl.analysis import figures, frames, metrics, page, styles, tables
+from recrl.analysis.cumulative import bound_table, cumulative_costs
 from recrl.analysis.diagnostics import curriculum_diagnostics
 from recrl.analysis.frames import GROUP, Sweep, ordered
 from recrl.analysis.frontier import return_against_cost
 from recrl.analysis.intervals import ENOUGH_RUNS
 from recrl.analysis.metrics import Measure
+from recrl.analysis.page import Section
 from recrl.analysis.policy_map import policy_maps
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore
 
 BOOTSTRAP_SEED = 0
+NO_TABLE = "No trial is complete yet: no table."
+CAPTIONS = {
+    "learning-curves": "Return and cost over training and over deployment",
+    "curricula": "Cost limits in force",
+    "diagnostics": "Limit, cost, multiplier and KL divergence",
+    "policies": "Final policies and their visits",
+    "return-against-cost": "Final policies under the best return for each limit, J*(d)",
+}
 
 
 class NothingToDrawError(RecrlError):
@@ -49,7 +63,7 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
         folder: where the files go, for example ``store.figures_folder``.
 
     Returns:
-        The files written, ``report.md`` first.
+        The files written, ``report.html`` and ``report.md`` first.
 
     Raises:
         NothingToDrawError: no trial has committed a policy update yet.
@@ -74,11 +88,19 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
             drawn += styles.save(maps, folder, f"policies_{_safe(agent)}")
     if (against := return_against_cost(sweep)) is not None:
         drawn += styles.save(against, folder, "return-against-cost")
-    written, text = _tables(sweep, folder)
-    head = [f"# {sweep.name}", "", *_status(sweep), ""]
-    images = [f"![{path.stem}]({path.name})" for path in drawn if path.suffix == ".png"]
-    report = tables.write_text("\n".join([*head, *images, "", *text]), folder / "report.md")
-    return [report, *drawn, *written]
+    written, shown = _tables(sweep, folder)
+    pictures = [path for path in drawn if path.suffix == ".png"]
+    text = [f"![{path.stem}]({path.name})" for path in pictures]
+    for heading, table in shown:
+        text += ["", f"## {heading}", "", tables.markdown(table)]
+    if not shown:
+        text += ["", NO_TABLE]
+    state = [_count(sweep), "", *(f"- {sentence}" for sentence in missing(sweep))]
+    reports = [
+        tables.write_text(_html(sweep, store, pictures, shown), folder / "report.html"),
+        tables.write_text("\n".join([f"# {sweep.name}", "", *state, "", *text]), folder / "report.md"),
+    ]
+    return [*reports, *drawn, *written]
 
 
 def _safe(label: str) -> str:
@@ -95,6 +117,9 @@ def missing(sweep: Sweep) -> list[str]:
         (TrialState.WAITING, "waiting to be run"),
     ):
         chosen = sweep.trials[sweep.trials["status"] == status.value]
+        if status is TrialState.WAITING and (blank := chosen["env_steps"] == 0).any():
+            sentences.append(f"{blank.sum()} trials: not begun yet")
+            chosen = chosen[~blank]
         for _, row in chosen.iterrows():
             done = row["env_steps"] / row["total_steps"]
             reason = f": {row['error']}" if row["error"] else ""
@@ -110,33 +135,42 @@ def missing(sweep: Sweep) -> list[str]:
     return sentences
 
 
-def _status(sweep: Sweep) -> list[str]:
+def _count(sweep: Sweep) -> str:
+    """How many trials stand how: ``20 trials: 1 running, 19 complete.``."""
     counts = sweep.trials["status"].value_counts()
     states = [f"{counts[state.value]} {state.value}" for state in TrialState if counts.get(state.value)]
-    lines = [f"{len(sweep.trials)} trials: {', '.join(states)}."]
-    return [*lines, "", *(f"- {sentence}" for sentence in missing(sweep))]
+    return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
-def _tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[str]]:
-    """Write the tables; returns the files and their Markdown."""
+def _tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str, pd.DataFrame]]]:
+    """Write the tables; returns the files, and those for people under their headings."""
     rows = metrics.outcomes(sweep)
-    written = [tables.write_csv(metrics.training_totals(sweep), folder / "training.csv")]
+    bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
+    written = [
+        tables.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
+        tables.write_csv(pd.concat(bounds), folder / "bounds.csv"),
+    ]
     if not len(rows):
-        return written, ["No trial is complete yet: no table."]
+        return written, []
     generator = np.random.default_rng(BOOTSTRAP_SEED)
     averaged = metrics.summary(rows)
     robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
     compared = metrics.comparisons(rows, generator)
-    text, latex = [], []
-    for measure in Measure:
-        table = tables.outcome_table(averaged, measure)
-        if len(table):
-            text += [f"## Outcome of {measure.description}", "", tables.markdown(table), ""]
-            latex += [f"% Outcome of {measure.description}.", tables.latex(table), ""]
+    outcomes = {measure: tables.outcome_table(averaged, measure) for measure in Measure}
+    latex = [
+        f"% Outcome of {measure.description}.\n{tables.latex(table)}\n"
+        for measure, table in outcomes.items()
+        if len(table)
+    ]
+    shown = [
+        (f"Outcome of {measure.description}", table) for measure, table in outcomes.items() if len(table)
+    ]
     if len(compared):
         against = tables.comparison_table(compared, Measure.DEPLOYMENT)
-        text += ["## Deployment phase against `none`, seed by seed [95% interval]", ""]
-        text += [tables.markdown(against), ""]
+        shown.append(("Deployment phase against `none`, seed by seed [95% interval]", against))
+    for i, costs in enumerate(bounds):
+        which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
+        shown.append((f"Cumulative cost of training beside its bounds{which}", bound_table(costs)))
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
     written += [
         tables.write_csv(rows, folder / "outcomes.csv"),
@@ -144,4 +178,46 @@ def _tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[str]]:
         tables.write_csv(compared, folder / "comparisons.csv"),
         tables.write_text("\n".join(latex), folder / "outcomes.tex"),
     ]
-    return written, text
+    return written, shown
+
+
+def _html(
+    sweep: Sweep, store: SweepStore, pictures: list[Path], shown: list[tuple[str, pd.DataFrame]]
+) -> str:
+    """The page: what is missing, figures, tables, settings, provenance."""
+    failed = bool((sweep.trials["status"] == TrialState.FAILED.value).any())
+    sections = []
+    if sentences := missing(sweep):
+        sections.append(Section("To be known", page.items(sentences, failed=failed)))
+    sections.append(Section("Figures", "\n".join(page.figure(path, _caption(path)) for path in pictures)))
+    sections += [Section(heading, page.table(table)) for heading, table in shown]
+    if not shown:
+        sections.append(Section("Tables", page.items([NO_TABLE])))
+    settings = {
+        f"{kind} {choice['label']}": choice
+        for spec in store.specs()
+        for kind, choice in spec.to_json().items()
+        if kind in ("task", "agent", "method")
+    }
+    grid = store.grid_path.read_text(encoding="utf-8") if store.grid_path.exists() else ""
+    sections.append(
+        Section(
+            "Settings",
+            page.verbatim(grid)
+            + page.verbatim("\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)),
+        )
+    )
+    sections.append(Section("Provenance", page.verbatim("\n".join(_provenance(store)))))
+    return page.page(sweep.name, _count(sweep), sections)
+
+
+def _caption(path: Path) -> str:
+    kind, _, of = path.stem.partition("_")
+    return " ".join([CAPTIONS[kind], *(["for", of.replace("_", ", ")] if of else [])])
+
+
+def _provenance(store: SweepStore) -> list[str]:
+    """Every different origin of the trials, and how many have it."""
+    paths = [trial.provenance_path for trial in store.trials() if trial.provenance_path.exists()]
+    origins = Counter(path.read_text(encoding="utf-8") for path in paths)
+    return [f"{count} trials:\n{text}" for text, count in sorted(origins.items())]

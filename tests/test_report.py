@@ -1,6 +1,8 @@
 """One call draws a sweep, as far as it has come."""
 
+import json
 from collections.abc import Callable
+from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
     )
     written = report.draw(store, tmp_path / "first")
     assert [path.name for path in written] == [
+        "report.html",
         "report.md",
         "learning-curves_my-cpo.pdf",
         "learning-curves_my-cpo.png",
@@ -33,12 +36,13 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "return-against-cost.pdf",
         "return-against-cost.png",
         "training.csv",
+        "bounds.csv",
         "outcomes.csv",
         "summary.csv",
         "comparisons.csv",
         "outcomes.tex",
     ]
-    text = written[0].read_text().splitlines()
+    text = written[1].read_text().splitlines()
     assert text[2] == "4 trials: 1 running, 2 complete, 1 failed."
     assert (
         "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
@@ -68,3 +72,55 @@ def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
         f"{store.folder}: nothing to draw yet, because none of its 0 trials has committed a policy update"
     )
     assert not (tmp_path / "figures").exists()
+
+
+class Strict(HTMLParser):
+    """Reads a page; every tag that is opened must be closed, in order.
+
+    Attributes:
+        outside: what the page would fetch.
+        text: what it shows.
+    """
+
+    EMPTY = ("meta", "link", "img")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.outside: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+        addresses = (value or "" for name, value in attrs if name in ("src", "href"))
+        self.outside += [address for address in addresses if not address.startswith("data:")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_holds_everything_and_fetches_nothing(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=1,
+        tasks=["<b>bold & wide"],
+        agents=["cpo"],
+        methods=["none", "linear"],
+        failed=["<b>bold & wide cpo linear seed 0"],
+    )
+    trial = store.trials()[0]
+    trial.provenance_path.write_text('{"torch": "9.9"}')
+    store.specs_path.write_text(json.dumps(trial.spec.to_json()) + "\n")
+    store.grid_path.write_text("name: made-up  # <script>alert(1)</script>\n")
+    report.draw(store, tmp_path / "figures")
+    reader = Strict()
+    reader.feed((tmp_path / "figures" / "report.html").read_text())
+    assert reader.open == []
+    assert all(address.startswith("#s") for address in reader.outside)
+    for sentence in ("<b>bold & wide", "<script>alert(1)</script>", '{"torch": "9.9"}', "Provenance"):
+        assert sentence in reader.text

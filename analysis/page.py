@@ -1,0 +1,123 @@
+"""A sweep's report as one self-contained HTML page: nothing is fetched, no script runs, it prints.
+
+Figures are embedded PNGs. What is too wide for a phone scrolls by itself, so that the page never does; in
+print it shrinks instead. All text is escaped.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import pandas as pd
+
+STYLE = """\
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; background: #fff; margin: 0 auto;
+       max-width: 70rem; padding: 1rem; overflow-wrap: anywhere; }
+h1 { font-size: 1.6rem; line-height: 1.2; margin: 0.5rem 0; }
+h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; border-top: 1px solid #ddd; padding-top: 1rem; }
+nav a { display: inline-block; margin: 0 1rem 0.3rem 0; }
+a { color: #00548f; }
+figure { margin: 1rem 0; }
+figure img { width: 100%; min-width: 42rem; height: auto; display: block; }
+figcaption { color: #555; font-size: 0.85rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
+th, td { text-align: left; padding: 0.2rem 0.6rem 0.2rem 0; white-space: nowrap;
+         border-bottom: 1px solid #e6e6e6; }
+th { border-bottom: 2px solid #999; vertical-align: bottom; }
+pre { font-size: 0.8rem; background: #f6f6f6; padding: 0.6rem; overflow-x: auto; }
+summary { cursor: pointer; }
+.failed { border-left: 4px solid #c0392b; padding-left: 0.6rem; }
+@media print {
+  @page { margin: 14mm; }
+  body { font-size: 10pt; max-width: none; padding: 0; }
+  nav { display: none; }
+  .scroll, pre { overflow: visible; }
+  figure img { min-width: 0; }
+  table { font-size: 6.5pt; width: 100%; }
+  th, td { white-space: normal; padding-right: 0.3rem; }
+  pre { white-space: pre-wrap; font-size: 7pt; }
+  figure, tr { break-inside: avoid; }
+  h2 { break-after: avoid; }
+}
+"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page.
+
+    Attributes:
+        heading: its title.
+        body: HTML, made by the functions below.
+    """
+
+    heading: str
+    body: str
+
+
+def page(title: str, lead: str, sections: Sequence[Section]) -> str:
+    """The whole page.
+
+    Args:
+        title: of the page.
+        lead: one sentence below it.
+        sections: its parts, listed at the top.
+    """
+    links = "".join(f'<a href="#s{index}">{escape(it.heading)}</a> ' for index, it in enumerate(sections))
+    parts = [
+        f'<section id="s{index}"><h2>{escape(it.heading)}</h2>\n{it.body}\n</section>'
+        for index, it in enumerate(sections)
+    ]
+    return "\n".join(
+        [
+            '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            '<link rel="icon" href="data:,">',
+            f"<title>{escape(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>",
+            f"<h1>{escape(title)}</h1>\n<p>{escape(lead)}</p>\n<nav>{links}</nav>",
+            *parts,
+            "</body>\n</html>",
+        ]
+    )
+
+
+def figure(png: Path, caption: str) -> str:
+    """An embedded PNG, as wide as the page but never too small to read."""
+    data = base64.b64encode(png.read_bytes()).decode()
+    text = escape(caption)
+    return (
+        f'<figure><div class="scroll"><img src="data:image/png;base64,{data}" alt="{text}"></div>'
+        f"<figcaption>{text}</figcaption></figure>"
+    )
+
+
+def table(frame: pd.DataFrame) -> str:
+    """A table of finished text."""
+    head = "".join(f"<th>{escape(str(name))}</th>" for name in frame)
+    rows = [
+        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>"
+        for row in frame.to_numpy().tolist()
+    ]
+    return (
+        f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>'
+        + "\n".join(rows)
+        + "</tbody></table></div>"
+    )
+
+
+def items(sentences: Sequence[str], *, failed: bool = False) -> str:
+    """A list of sentences."""
+    kind = ' class="failed"' if failed else ""
+    return f"<ul{kind}>" + "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences) + "</ul>"
+
+
+def verbatim(text: str) -> str:
+    """Text as it is."""
+    return f"<pre>{escape(text)}</pre>"
