@@ -2,10 +2,11 @@
 # make demo      install, run 20 RiverGrid trials, draw the figures: minutes on two cores
 # make test      install, run the tests
 # make lint      install, check style and types
+# make chaos     install, kill whatever a sweep is made of for ten minutes: SECONDS=600 SEED=0
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test lint clean
+.PHONY: install demo test lint chaos clean
 .DEFAULT_GOAL := install
 
 install: .venv/installed
@@ -27,6 +28,9 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+chaos: install
+	$(BIN)/python tests/chaos.py --seconds $(or $(SECONDS),600) --seed $(or $(SEED),0) --log results/chaos/seed-$(or $(SEED),0).txt
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
