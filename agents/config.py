@@ -253,7 +253,7 @@ class IPOConfig(AscentConfig):
         default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
     )
     barrier_sharpness: Positive = Field(
-        default=500.0,
+        default=2000.0,
         description="t of the barrier log(slack) / t; at the optimum it gives away 1 / t of the reward "
         "advantages' standard deviation a step and constraint (ours; Liu et al. 2020: 20).",
     )
