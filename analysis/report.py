@@ -7,6 +7,7 @@
     diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence a method (PDF and PNG)
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
     return-against-cost         final policies under the frontier J*(d), where it is known (PDF and PNG)
+    performance-profiles        share of runs above each return, frozen policies (PDF and PNG)
     outcomes.csv                a row a trial and measure
     summary.csv                 averaged over seeds, with interquartile means
     comparisons.csv             paired differences to the student without a curriculum
@@ -36,6 +37,7 @@ from recrl.analysis.intervals import ENOUGH_RUNS
 from recrl.analysis.metrics import Measure
 from recrl.analysis.page import Section
 from recrl.analysis.policy_map import policy_maps
+from recrl.analysis.profiles import performance_profiles
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore
@@ -48,6 +50,7 @@ CAPTIONS = {
     "diagnostics": "Limit, cost, multiplier and KL divergence",
     "policies": "Final policies and their visits",
     "return-against-cost": "Final policies under the best return for each limit, J*(d)",
+    "performance-profiles": "Share of runs above each return",
 }
 
 
@@ -88,6 +91,8 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
             drawn += styles.save(maps, folder, f"policies_{_safe(agent)}")
     if (against := return_against_cost(sweep)) is not None:
         drawn += styles.save(against, folder, "return-against-cost")
+    if (profiles := performance_profiles(sweep, Measure.STOCHASTIC)) is not None:
+        drawn += styles.save(profiles, folder, "performance-profiles")
     written, shown = _tables(sweep, folder)
     pictures = [path for path in drawn if path.suffix == ".png"]
     text = [f"![{path.stem}]({path.name})" for path in pictures]

@@ -35,6 +35,8 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "diagnostics_river-a_my-cpo.png",
         "return-against-cost.pdf",
         "return-against-cost.png",
+        "performance-profiles.pdf",
+        "performance-profiles.png",
         "training.csv",
         "bounds.csv",
         "outcomes.csv",
