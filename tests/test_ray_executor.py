@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import ray
+from ray.exceptions import RayActorError
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
@@ -223,6 +224,9 @@ def test_a_teachers_own_error_comes_through_and_a_lost_teacher_is_told_apart() -
     with pytest.raises(type(inline_error.value), match=f"^{re.escape(str(inline_error.value))}$"):
         teacher.step(state, reports[5])
     ray.kill(service)
+    with pytest.raises(RayActorError):
+        while True:  # the order to die takes its time
+            ray.get(service.start.remote(spec))
     with pytest.raises(TeacherUnavailableError, match=r"has not answered for 0\.1 seconds"):
         teacher.step(state, reports[0])
 
