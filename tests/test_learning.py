@@ -46,10 +46,10 @@ LESSONS = [
     Lesson("focops", "two-state-2", (5.0, 2.0), 150),
     Lesson("p3o", "two-state", (3.0,), 200),
     Lesson("p3o", "two-state-2", (5.0, 2.0), 200),
-    Lesson("ipo", "two-state", (3.0,), 200, seeds=0),
+    Lesson("ipo", "two-state", (3.0,), 200),
     Lesson("ipo", "two-state-2", (5.0, 2.0), 200, seeds=0),
     Lesson("crpo", "two-state", (3.0,), 100),
-    Lesson("crpo", "two-state-2", (5.0, 2.0), 150, seeds=0),
+    Lesson("crpo", "two-state-2", (5.0, 2.0), 150),
 ]
 
 
