@@ -5,7 +5,7 @@
       - {name: rivergrid-1a, deploy_limits: 5}
       - {name: rivergrid-1b, deploy_limits: 1}
     agents: [ppo-lag, cpo]
-    methods: [none, linear, {name: dynamic, options: {window: 80}}]
+    methods: [none, linear, {name: dynamic, options: {window: 5}}]
     seeds: 5
     run: {total_steps: 960000}
 
