@@ -270,7 +270,7 @@ def test_a_hung_trial_starts_again_and_a_signal_to_the_group_saves_them_all(tmp_
     )
 
     def wait_for(what: str) -> None:
-        end = time.monotonic() + 120.0
+        end = time.monotonic() + 300.0
         while not conditions[what]() and time.monotonic() < end:
             assert process.poll() is None, process.stdout and process.stdout.read()
             threading.Event().wait(0.05)
