@@ -22,7 +22,7 @@ demo: install
 	$(BIN)/recrl-sweep launch grids/demo.yaml
 
 test: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 lint: install
 	$(BIN)/ruff check .
