@@ -35,6 +35,7 @@ from __future__ import annotations
 import fcntl
 import io
 import json
+import operator
 import os
 import secrets
 import socket
@@ -66,6 +67,7 @@ UPDATE_COLUMNS = (
     "update_seconds",
 )
 EVALUATION_COLUMNS = ("policy", "index", "length", "episode_return")
+_episode_values = operator.attrgetter(*EPISODE_COLUMNS)
 KEPT_CHECKPOINTS = 2
 RESERVE_BYTES = 16 * 1024  # a record and a traceback
 
@@ -473,6 +475,7 @@ class TrialWriter:
             store.updates_path: [],
             store.events_path: [],
         }
+        self._episode_rows = self._rows[store.episodes_path]
         self._lengths = {path.name: 0 for path in self._rows}
         self._cpu_origin = time.process_time()
         self._cpu_before = record.cpu_seconds
@@ -507,10 +510,12 @@ class TrialWriter:
 
     def append_episode(self, episode: EpisodeStats) -> None:
         """Add an episode's row to the next commit."""
-        row: dict[str, Any] = {name: getattr(episode, name) for name in EPISODE_COLUMNS}
-        row |= {f"cost_{i}": cost for i, cost in enumerate(episode.costs)}
-        row |= {f"limit_{i}": limit for i, limit in enumerate(episode.limits)}
-        self._append_csv(self.store.episodes_path, row)
+        rows = self._episode_rows
+        if not rows and self._lengths[self.store.episodes_path.name] == 0:
+            costs = (f"cost_{i}" for i in range(len(episode.costs)))
+            limits = (f"limit_{i}" for i in range(len(episode.limits)))
+            rows.append(_csv_line((*EPISODE_COLUMNS, *costs, *limits)))
+        rows.append(_csv_line((*_episode_values(episode), *episode.costs, *episode.limits.values)))
 
     def append_update(self, row: Mapping[str, Any]) -> None:
         """Add an update's row to the next commit; every row of a trial has the same keys."""

@@ -40,10 +40,17 @@ class Stretch:
     @classmethod
     def of_update(cls, episodes: Sequence[EpisodeStats], *, env_steps: int, num_costs: int) -> Stretch:
         """What one update's report says."""
-        single = [
-            cls(0, 1, episode.episode_return, episode.costs, (0.0,) * num_costs) for episode in episodes
-        ]
-        return cls.pooled([*single, cls(env_steps, 0, 0.0, (0.0,) * num_costs, (0.0,) * num_costs)])
+        count = len(episodes)
+        if count == 0:
+            return cls(env_steps, 0, 0.0, (0.0,) * num_costs, (0.0,) * num_costs)
+        costs = list(zip(*(episode.costs for episode in episodes), strict=True))
+        mean_return = math.fsum(episode.episode_return for episode in episodes) / count
+        mean_costs = tuple(math.fsum(column) / count for column in costs)
+        cost_scatter = tuple(
+            math.fsum((cost - mean) ** 2 for cost in column)
+            for column, mean in zip(costs, mean_costs, strict=True)
+        )
+        return cls(env_steps, count, mean_return, mean_costs, cost_scatter)
 
     @classmethod
     def pooled(cls, parts: Sequence[Stretch]) -> Stretch:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: a trial's sums do not depend on the machine
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
@@ -96,6 +97,13 @@ def played(spec: TeacherSpec, reports: tuple[ProgressReport, ...]) -> list[tuple
     for report in reports:
         answers.append(teacher.step(answers[-1][1], report))
     return answers
+
+
+@CONTRACT
+@given(histories())
+def test_a_report_reaches_another_process_as_it_is(history: History) -> None:
+    for report in history.reports:
+        assert pickle.loads(pickle.dumps(report)) == report  # noqa: S301  (our own bytes)
 
 
 @CONTRACT
