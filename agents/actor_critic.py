@@ -158,6 +158,7 @@ class ActorCritic:
         metrics["kl"] = float(mean_divergence(old, new, batch.row_weights))
         metrics["entropy"] = float(torch.dot(batch.row_weights, new.entropy()))
         metrics |= indexed("cost_gap", constraints.gaps)
+        metrics |= indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0))  # eps of Lemma 1
         metrics |= self._fit_critics(batch, targets)
         require_finite("policy parameters", self._policy.parameters.values.numpy())
         require_finite("critic parameters", self._critics.parameters.values.numpy())
