@@ -50,6 +50,7 @@ from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service,
 STOP_QUESTION_SECONDS = 0.5
 HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats
 CONNECT_SECONDS = 5.0
+CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
 LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
 
@@ -430,15 +431,28 @@ def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
         # No public switch keeps Ray from printing a paragraph about every dead process.
         ray._private.worker._worker_logs_enabled = False
         try:
-            with _own_signal_handlers(), _own_sessions():
-                ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
+            _connect(**settings)
         except SystemExit as error:  # Ray's own answer to a SIGTERM while it starts; nothing runs yet
             raise KeyboardInterrupt from error
-        except Exception as error:  # that a node is too slow to start, Ray says by a bare Exception
+        except Exception as error:
             raise ClusterError(f"{failure}: {_first_line(error)}{hint}") from error
         yield
     finally:
         ray.shutdown()
+
+
+def _connect(**settings: Any) -> None:
+    """``ray.init``, tried again where a busy machine took longer than the seconds that Ray allows."""
+    for tries_left in range(CONNECT_TRIES - 1, -1, -1):
+        try:
+            with _own_signal_handlers(), _own_sessions():
+                ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
+            return
+        except Exception as error:  # that a node is too slow to start, Ray says by a bare Exception
+            if tries_left == 0 or "timed out" not in str(error):
+                raise
+            logger.warning("Ray did not start in time; it is tried again")
+            ray.shutdown()
 
 
 @contextmanager
