@@ -3,10 +3,11 @@
 # make test      install, run the tests
 # make lint      install, check style and types
 # make chaos     install, kill whatever a sweep is made of for ten minutes: SECONDS=600 SEED=0
+# make cluster-test   install, run docker/compose.yaml's cluster in network namespaces and harm it: needs root, says so
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test lint chaos clean
+.PHONY: install demo test lint chaos cluster-test clean
 .DEFAULT_GOAL := install
 
 install: .venv/installed
@@ -31,6 +32,10 @@ lint: install
 
 chaos: install
 	$(BIN)/python tests/chaos.py --seconds $(or $(SECONDS),600) --seed $(or $(SEED),0) --log results/chaos/seed-$(or $(SEED),0).txt
+
+cluster-test: install
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt 'psycopg[binary]'
+	$(BIN)/python -m tests.cluster --log results/cluster/log.txt
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

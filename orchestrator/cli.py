@@ -71,7 +71,13 @@ def parser() -> argparse.ArgumentParser:
     launch.add_argument(
         "--address",
         metavar="HOST:PORT",
-        help="an existing Ray cluster, or 'auto' for this machine's; by default one is started here",
+        help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
+        "is started here",
+    )
+    launch.add_argument(
+        "--ship-package",
+        action="store_true",
+        help="with --address: send recrl itself, without its dependencies, to the cluster's nodes",
     )
     launch.add_argument(
         "--no-mlflow",
@@ -222,7 +228,7 @@ def _command(
     command = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
     if name != "validate":
         command.add_argument(
-            "--root", type=Path, default=Path("runs"), help="the folder of all sweeps (default: runs)"
+            "--root", type=_folder, default=Path("runs"), help="the folder of all sweeps (default: runs)"
         )
     return command
 
@@ -267,6 +273,14 @@ def _add_tracking(command: argparse.ArgumentParser) -> None:
         help="an MLflow server (http://host:port) or database (sqlite:///file.db); "
         "by default one in the sweep's folder",
     )
+
+
+def _folder(text: str) -> Path:
+    if "://" in text:  # trials append to their files and hold locks, which object stores know nothing of
+        raise argparse.ArgumentTypeError(
+            f"must be a folder, on a file system that all nodes share where there are several, got {text!r}"
+        )
+    return Path(text)
 
 
 def _at_least_one(text: str) -> int:

@@ -317,14 +317,18 @@ def _only(pairs: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _executor(grid: GridSpec, arguments: argparse.Namespace) -> Executor:
+    if arguments.ship_package and not arguments.address:
+        raise RecrlError("--ship-package: needs an --address to ship to")
     if arguments.executor == "inline":
         return InlineExecutor()
     from recrl.orchestrator.ray_executor import RayExecutor  # noqa: PLC0415  (imports ray)
 
     return RayExecutor(
         address=arguments.address,
+        ship_package=arguments.ship_package,
         cpus_per_trial=grid.resources.cpus_per_trial,
         gpus_per_trial=grid.resources.gpus_per_trial,
+        custom_per_trial=grid.resources.custom_per_trial,
         max_concurrent=arguments.max_concurrent or grid.resources.max_concurrent,
         silence_seconds=grid.resources.silence_seconds,
     )

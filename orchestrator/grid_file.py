@@ -68,6 +68,20 @@ def _read_seeds(value: Any) -> tuple[int, ...]:
     return tuple(value)
 
 
+def _read_custom(value: Any) -> dict[str, float]:
+    """Amounts by the names that a cluster's nodes were given; Ray's own names have settings of their own."""
+    if not isinstance(value, dict):
+        raise ValueError(f"must be a mapping of names to amounts, got {shown(value)}")
+    for name, amount in value.items():
+        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.:-]{0,63}", name):
+            raise ValueError(f"must have names of letters, digits and _ . : - only, got {shown(name)}")
+        if name.lower() in ("cpu", "gpu", "memory", "object_store_memory"):
+            raise ValueError(f"must not name {name}; see cpus_per_trial and gpus_per_trial")
+        if isinstance(amount, bool) or not isinstance(amount, int | float) or not 0.0 < amount <= 1e6:
+            raise ValueError(f"must be amounts above 0 and at most 1e6, got {shown(amount)} of {name}")
+    return {name: float(amount) for name, amount in value.items()}
+
+
 def _listed(value: Any) -> Any:
     return value if isinstance(value, list) else [value]
 
@@ -86,6 +100,7 @@ Number = Annotated[float, BeforeValidator(_not_a_truth_value), Field(allow_inf_n
 TrainLimits = Annotated[tuple[float, ...], PlainValidator(_read_train_limits)]
 DeployLimits = Annotated[tuple[float, ...], PlainValidator(_read_deploy_limits)]
 Seeds = Annotated[tuple[int, ...], PlainValidator(_read_seeds)]
+CustomResources = Annotated[dict[str, float], PlainValidator(_read_custom)]
 
 
 class _Written(BaseModel):
@@ -153,6 +168,11 @@ class Resources(_Written):
 
     cpus_per_trial: Number = Field(default=1.0, gt=0.0, le=1024.0, description="Cores a running trial holds.")
     gpus_per_trial: Number = Field(default=0.0, ge=0.0, le=64.0, description="GPUs a running trial holds.")
+    custom_per_trial: CustomResources = Field(
+        default_factory=dict,
+        description="What else a running trial holds, by the names that a cluster's nodes were started with "
+        "(ray start --resources); a launch on one machine has none.",
+    )
     max_concurrent: Whole | None = Field(
         default=None, ge=1, le=10_000, description="Trials at once, at most; by default as many as fit."
     )

@@ -13,7 +13,8 @@ which is the first case again.
 A signal to the launch and to its whole process group (Ctrl-C, ``timeout``) reaches the driver alone: Ray's
 processes have sessions of their own, and serve until the trials are saved.
 
-Assumes that every node sees the results folder under the same path. Leaves out growing with an elastic
+Assumes that every node sees the results folder under the same path, and has the same recrl: where the cluster
+is somebody else's, every node is asked for both before the first trial. Leaves out growing with an elastic
 cluster beyond ``max_concurrent``.
 """
 
@@ -30,7 +31,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
@@ -41,6 +42,8 @@ from ray.exceptions import RayTaskError
 from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import ClusterError, StorageError, TeacherUnavailableError
+from recrl.orchestrator.own_package import copy_package
+from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
 from recrl.orchestrator.scratch import scratch_folder
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import SILENCE_SECONDS
@@ -79,8 +82,10 @@ class RayExecutor:
     Attributes:
         num_cpus: cores of the cluster that is started on this machine; all of them if None.
         address: an existing cluster (``auto``, ``host:port``) to use instead.
+        ship_package: whether to send recrl itself to that cluster's nodes.
         cpus_per_trial: cores a trial takes, above 0; may be a fraction.
         gpus_per_trial: GPUs a trial takes, at least 0; may be a fraction.
+        custom_per_trial: what else a trial takes, by the names that the nodes were given, above 0.
         max_concurrent: trials at once, at least 1; if None, as many as fit when the run begins.
         teacher: ``service`` for one actor that teaches the whole sweep, ``inline`` for a teacher in every
             worker. The results are the same.
@@ -91,8 +96,10 @@ class RayExecutor:
 
     num_cpus: int | None = None
     address: str | None = None
+    ship_package: bool = False
     cpus_per_trial: float = 1.0
     gpus_per_trial: float = 0.0
+    custom_per_trial: Mapping[str, float] = field(default_factory=dict)
     max_concurrent: int | None = None
     teacher: Literal["service", "inline"] = "service"
     max_failures: int = 3
@@ -103,17 +110,22 @@ class RayExecutor:
         """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if it is.
 
         Raises:
-            ClusterError: Ray cannot be started or reached, or lacks what one trial asks for.
+            ClusterError: Ray cannot be started or reached, lacks what one trial asks for, or has nodes that
+                differ from this one.
         """
         if not specs or stop.is_set():
             return
         with _environment(QUIET | WORKER), self._cluster(), StopFile.open(store.folder) as stop_file:
+            if self.address:
+                check_nodes(stop_file.path)
             self._run_on_cluster(specs, store, stop, stop_file)
 
     def _cluster(self) -> AbstractContextManager[None]:
         if ray.is_initialized():
             return nullcontext()
-        return existing_cluster(self.address) if self.address else local_cluster(self.num_cpus)
+        if self.address:
+            return existing_cluster(self.address, ship_package=self.ship_package)
+        return local_cluster(self.num_cpus)
 
     def _run_on_cluster(
         self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event, stop_file: StopFile
@@ -124,7 +136,7 @@ class RayExecutor:
         service = start_teacher_service(service_name) if service_name else None
         with scratch_folder(tempfile.gettempdir()) as scratch:
             tuner = tune.Tuner(
-                tune.with_resources(TuneTrial, {"cpu": self.cpus_per_trial, "gpu": self.gpus_per_trial}),
+                tune.with_resources(TuneTrial, dict(self._wanted)),
                 param_space={
                     "spec": tune.grid_search([json.dumps(spec.to_json()) for spec in specs]),
                     "sweep": str(store.folder),
@@ -152,20 +164,24 @@ class RayExecutor:
                 tuner.fit()
         del service  # Ray ends an actor that nobody holds
 
+    @property
+    def _wanted(self) -> Mapping[str, float]:
+        """What one trial takes, by Ray's names."""
+        return {"CPU": self.cpus_per_trial, "GPU": self.gpus_per_trial, **self.custom_per_trial}
+
     def _slots(self) -> int:
         """How many trials may run at once."""
-        resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-        cpus, gpus = resources.get("CPU", 0.0), resources.get("GPU", 0.0)
-        fitting = [cpus / self.cpus_per_trial]
-        if self.gpus_per_trial:
-            fitting.append(gpus / self.gpus_per_trial)
-        slots = int(min(fitting) + 1e-9)
+        slots = trials_that_fit(self._wanted)
         if self.address:  # an existing cluster may grow
+            if not slots:
+                logger.warning("no node has room for a trial (%s) yet; they wait", _amounts(self._wanted))
             return self.max_concurrent or max(1, slots)
         if slots < 1:
+            resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+            there = {name: resources.get(name, 0.0) for name in self._wanted}
             raise ClusterError(
-                f"a trial asks for {self.cpus_per_trial:g} cores and {self.gpus_per_trial:g} GPUs, "
-                f"this cluster has {cpus:g} and {gpus:g}; ask for less or add machines"
+                f"a trial asks for {_amounts(self._wanted)}, this cluster has {_amounts(there)}; "
+                "ask for less or add machines"
             )
         return min(slots, self.max_concurrent or slots)
 
@@ -404,25 +420,38 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def existing_cluster(address: str) -> Iterator[None]:
+def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[None]:
     """A connection to a Ray cluster that somebody else runs.
 
     Args:
         address: ``auto`` for the one this machine belongs to, or ``host:port``.
+        ship_package: whether to send recrl itself, without its dependencies, to the nodes.
 
     Raises:
-        ClusterError: there is none, or it does not know our token.
+        ClusterError: there is none, this machine is no node of it, or it does not know our token.
     """
     failure = f"cannot use the Ray cluster at {address}"
+    if "://" in address:  # Ray itself advises against Tune beyond Ray Client
+        raise ClusterError(
+            f"{failure}: the driver must run on a node of the cluster, not beyond Ray Client; launch there "
+            "with --address auto, or make this machine a node: ray start --address=<host:port> --num-cpus=0"
+        )
     host, _, port = address.rpartition(":")
     if host:  # Ray itself would try for two minutes
         try:
             socket.create_connection((host, int(port)), timeout=CONNECT_SECONDS).close()
         except (OSError, ValueError) as error:
             raise ClusterError(f"{failure}: {error}; is it running, and is this host:port?") from error
-    hint = "; does it want a token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
-    with _connection(failure, hint, address=address, runtime_env={"env_vars": WORKER}):
-        yield
+    hint = (
+        "; is this machine a node of it (ray start --address=<host:port> --num-cpus=0), and does it want a "
+        "token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
+    )
+    with scratch_folder(tempfile.gettempdir()) as scratch:
+        environment: dict[str, Any] = {"env_vars": WORKER}
+        if ship_package:
+            environment["py_modules"] = [str(folder) for folder in copy_package(scratch)]
+        with _connection(failure, hint, address=address, runtime_env=environment):
+            yield
 
 
 @contextmanager
@@ -527,4 +556,11 @@ def _last_error(trial: Any) -> BaseException | None:
 
 
 def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), "")
+    """The first line, or all of them as one where the first only announces the others."""
+    first = next(iter(str(error).splitlines()), "")
+    return " ".join(str(error).split()) if first.endswith(":") else first
+
+
+def _amounts(resources: Mapping[str, float]) -> str:
+    """``1 CPU, 0 GPU``."""
+    return ", ".join(f"{amount:g} {name}" for name, amount in resources.items())

@@ -32,7 +32,7 @@ ADAPTERS = {
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\..*",
     "mujoco": r"environments\..*",
-    "ray": r"orchestrator\.(ray_executor|teacher_service)",
+    "ray": r"orchestrator\.(ray_executor|ray_nodes|teacher_service)",
     "mlflow": r"orchestrator\.tracking",
     "matplotlib": r"analysis\..*",
     "yaml": r"orchestrator\.located_yaml",
@@ -41,11 +41,11 @@ ADAPTERS = {
 }
 # The order inside the orchestrator: no module may import one that stands in a later line.
 LAYERS = (
-    ("errors", "exit_codes", "located_yaml", "provenance", "scratch"),
+    ("errors", "exit_codes", "located_yaml", "own_package", "provenance", "scratch"),
     ("spec", "checkpoint", "heartbeat"),
     ("store", "validation"),
     ("grid_file", "status", "tracking_points", "plan", "trial"),
-    ("grid", "executors", "tracking", "teacher_service"),
+    ("grid", "executors", "ray_nodes", "tracking", "teacher_service"),
     ("sweep", "ray_executor", "tracking_mirror", "tracking_ui"),
     ("display",),
     ("commands",),

@@ -20,6 +20,7 @@ from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.ray_executor import RayExecutor, StopFile, existing_cluster, local_cluster
+from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.teacher_service import RayTeacher, start_teacher_service
@@ -235,9 +236,29 @@ def test_a_teachers_own_error_comes_through_and_a_lost_teacher_is_told_apart() -
 def test_what_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         ClusterError,
-        match=r"^a trial asks for 3 cores and 0 GPUs, this cluster has 2 and 0; ask for less or add ",
+        match=r"^a trial asks for 3 CPU, 0 GPU, this cluster has 2 CPU, 0 GPU; ask for less or add machines$",
     ):
         RayExecutor(cpus_per_trial=3).run(SWEEP, SweepStore(tmp_path, "sweep"), threading.Event())
+
+
+@pytest.mark.usefixtures("cluster")
+def test_nodes_hold_as_many_trials_as_fit_on_each() -> None:
+    assert trials_that_fit({"CPU": 1.0, "GPU": 0.0}) == 2
+    assert trials_that_fit({"CPU": 0.5}) == 4
+    assert trials_that_fit({"CPU": 1.5}) == 1
+    assert trials_that_fit({"CPU": 1.0, "big_memory": 1.0}) == 0
+
+
+@pytest.mark.usefixtures("cluster")
+def test_nodes_are_asked_before_any_trial(tmp_path: Path) -> None:
+    (tmp_path / "probe").touch()
+    check_nodes(tmp_path / "probe")
+    with pytest.raises(
+        ClusterError,
+        match=r"^not every node of the cluster can run these trials: \S+ does not see /nowhere, which must "
+        r"be on a file system that all nodes share; give all of them the same environment or image ",
+    ):
+        check_nodes(Path("/nowhere/probe"))
 
 
 @pytest.mark.usefixtures("cluster")

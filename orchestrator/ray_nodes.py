@@ -1,0 +1,117 @@
+"""The nodes of a Ray cluster: how many trials they hold, and whether those of somebody else's can stand in.
+
+A trial's result is the same on every machine only if its code is, and it can be kept only where the results
+folder is. Ray itself refuses nodes with another Python or Ray than its head's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import ray
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from recrl.orchestrator.errors import ClusterError
+
+DISTRIBUTIONS = ("recrl", "ray", "torch", "numpy")
+ANSWER_SECONDS = 180.0  # a node may have to start its first process
+SIGHT = "the results folder"
+
+
+def trials_that_fit(wanted: Mapping[str, float]) -> int:
+    """How many trials the nodes that are there hold at once.
+
+    Args:
+        wanted: what one trial takes, by Ray's names of resources; at least 0 each.
+    """
+    asked = {name: amount for name, amount in wanted.items() if amount > 0.0}
+    nodes = (node["Resources"] for node in ray.nodes() if node["Alive"])
+    return sum(int(min(node.get(name, 0.0) / asked[name] for name in asked) + 1e-9) for node in nodes)
+
+
+def check_nodes(probe: Path) -> None:
+    """Hold every node that has cores against this machine, before any trial.
+
+    Args:
+        probe: a file that is there, in the sweep's folder.
+
+    Raises:
+        ClusterError: one sentence that names every node that differs, and in what.
+    """
+    look = _look()
+    task = ray.remote(look)
+    asked = {}
+    for node in ray.nodes():
+        if node["Alive"] and node["Resources"].get("CPU", 0.0) > 0.0:
+            there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            answer = task.options(num_cpus=0, scheduling_strategy=there).remote(DISTRIBUTIONS, str(probe))
+            asked[answer] = node["NodeManagerAddress"]
+    if not asked:
+        return
+    ready, _ = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_SECONDS)
+    here = look(DISTRIBUTIONS, str(probe))
+    problems = []
+    for answer, address in asked.items():
+        if answer not in ready:
+            problems.append(f"{address} has not answered for {ANSWER_SECONDS:g} seconds")
+            continue
+        try:
+            problems += differences(address, here, ray.get(answer), probe.parent)
+        except RayError as error:
+            problems.append(f"{address} cannot run anything: {next(iter(str(error).splitlines()), '')}")
+    if problems:
+        raise ClusterError(
+            f"not every node of the cluster can run these trials: {'; '.join(sorted(problems))}; "
+            "give all of them the same environment or image (docker/README.md), or leave them out"
+        )
+
+
+def differences(address: str, here: Mapping[str, str], there: Mapping[str, str], folder: Path) -> list[str]:
+    """What a node lacks or has otherwise, a sentence each.
+
+    Args:
+        address: the node's.
+        here: what this machine has, by name.
+        there: what the node has.
+        folder: that it must see.
+    """
+    others = [
+        f"{name} {there.get(name) or 'missing'} (here {value})"
+        for name, value in here.items()
+        if name != SIGHT and there.get(name) != value
+    ]
+    found = [f"{address} has {', '.join(others)}"] if others else []
+    if not there.get(SIGHT):
+        found.append(f"{address} does not see {folder}, which must be on a file system that all nodes share")
+    return found
+
+
+def _look() -> Callable[[tuple[str, ...], str], dict[str, str]]:
+    """What is run on the nodes. A closure is sent by value: they may have another recrl, or none."""
+
+    def look(distributions: tuple[str, ...], probe: str) -> dict[str, str]:
+        import importlib  # noqa: PLC0415
+        import importlib.metadata  # noqa: PLC0415
+        import platform  # noqa: PLC0415
+
+        found = {"Python": platform.python_version()}
+        for name in distributions:
+            try:  # torch's CPU and CUDA builds of one version differ behind the plus
+                found[name] = importlib.metadata.version(name).partition("+")[0]
+            except importlib.metadata.PackageNotFoundError:
+                found[name] = ""
+        try:
+            package = importlib.import_module("recrl.orchestrator.own_package")
+            found["recrl's source"] = package.source_digest()
+        except ImportError:
+            found["recrl's source"] = ""
+        try:  # a network file system may remember that a file is absent; opening it asks the server
+            with open(probe):
+                found["the results folder"] = probe
+        except OSError:
+            found["the results folder"] = ""
+        return found
+
+    return look
