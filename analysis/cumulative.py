@@ -14,14 +14,22 @@ Undiscounted (the unit of all limits here), a row a trial:
                      problem with limit D_b (``bounds.undiscounted_excess``), the first one is nobody's
     ceiling_sum      n H c_max, what n policies can cost at all
 
-Discounted, never to be added to the above:
+Discounted, as the paper has it, never to be added to the above:
 
-    discounted_excess_sum   the sum over b of Lemma 1's sqrt(2 delta_b) gamma eps / (1 - gamma)^2
+    discounted_excess_sum   the sum over b < n of Lemma 1's sqrt(2 delta_b) gamma eps_b / (1 - gamma)^2
+    discounted_bound        H c_max + sum_{b<n} min(D_b + discounted excess_b, H c_max): Proposition 1 on the
+                            limits that were in force
 
-delta_b is the mean KL divergence that the trial measured of the update from policy b. eps, the largest
-advantage, is not measured: H c_max and c_max / (1 - gamma) bound it. They are crude, and so the proven bound
-is near the ceiling; the overshoot is what can be planned with. Updates under an infinite limit (a d_t that
-is still being measured) have no bound but the ceiling.
+delta_b is the mean KL divergence that the trial measured of the update from policy b, gamma the student's
+own. eps_b is at most c_max / (1 - gamma). Where the student reports its largest cost advantage in the batch
+(``cost_advantage_max_i``), that is taken if it is less: an estimate, which no proof covers. The undiscounted
+advantages are not measured: H c_max bounds them, crudely, and so the undiscounted bound is near the ceiling.
+A policy's discounted cost, which is not recorded, is at most its undiscounted one: a run whose cost_sum is
+within ``discounted_bound`` keeps Proposition 1 all the more.
+
+Updates under an infinite limit (a d_t that is still being measured) have no bound but the ceiling. Where
+horizon and largest cost are unknown there is no ceiling: the first policy then counts with what it cost, and
+only ``discounted_bound`` can be told.
 
 Letters: b policies, n their number, C_b, D_b cost and limit, d_t, d_d training and deployment limit, H
 horizon, c_max largest cost of a step, delta, eps, gamma as in ``bounds``.
@@ -30,7 +38,8 @@ horizon, c_max largest cost of a step, delta, eps, gamma as in ``bounds``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,7 +47,7 @@ import pandas as pd
 
 from recrl.analysis.frames import GROUP, KEY, Sweep
 from recrl.analysis.tables import number
-from recrl.environments.cmdp import Phase
+from recrl.environments.cmdp import Floats, Phase
 from recrl.environments.finite_cmdp import FiniteVectorEnv
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import find_task, make_vector
@@ -51,6 +60,73 @@ from recrl.teachers.bounds import (
 )
 
 
+@dataclass(frozen=True)
+class TaskSizes:
+    """What bounds any policy's cost on a finite task.
+
+    Attributes:
+        horizon: H, most steps of an episode.
+        largest_cost: c_max, of a step.
+    """
+
+    horizon: int
+    largest_cost: float
+
+    @property
+    def ceiling(self) -> float:
+        """H c_max, the most that an episode can cost."""
+        return self.horizon * self.largest_cost
+
+
+def policy_costs(
+    updates: pd.DataFrame, *, cost: int, sizes: TaskSizes | None, discount: float | None
+) -> pd.DataFrame:
+    """What each policy of one trial's training phase cost, and at most was expected to: a row a policy.
+
+    Args:
+        updates: of the trial's training phase.
+        cost: i, which cost.
+        sizes: of the task, None if unknown.
+        discount: gamma of a CPO student; None for others, of which nothing is proven.
+
+    Returns:
+        end_step, cost, limit, ceiling, bound, discounted_excess (of the update that made the policy, 0 for
+        the first), discounted_bound: the summands of what the module's docstring lists; NaN where unknown.
+    """
+    costs = updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)  # none ended: as the one before
+    limits = updates[f"limit_{cost}"].to_numpy(np.float64)
+    ceiling = math.inf if sizes is None else sizes.ceiling
+    first = costs[0] if sizes is None else ceiling
+
+    def bounded(excesses: Sequence[float]) -> Floats:
+        return np.array([first, *np.minimum(limits[:-1] + np.array(excesses), ceiling)])
+
+    policies = pd.DataFrame({"end_step": updates["end_step"].to_numpy(), "cost": costs, "limit": limits})
+    policies["ceiling"] = math.nan if sizes is None else ceiling
+    policies[["bound", "discounted_excess", "discounted_bound"]] = math.nan
+    if discount is None or "kl" not in updates:
+        return policies
+    divergences = updates["kl"].to_numpy(np.float64)[:-1].clip(min=0.0).tolist()
+    advantages = _advantages(updates, cost, sizes, discount)[:-1].tolist()
+    discounted = [
+        discounted_excess(kl, eps, discount=discount) for kl, eps in zip(divergences, advantages, strict=True)
+    ]
+    policies["discounted_excess"] = [0.0, *discounted]
+    policies["discounted_bound"] = bounded(discounted)
+    if sizes is not None:
+        excesses = [undiscounted_excess(kl, ceiling, horizon=sizes.horizon) for kl in divergences]
+        policies["bound"] = bounded(excesses)
+    return policies
+
+
+def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, discount: float) -> Floats:
+    """The eps of each update: the largest that can be, or that the student saw, if that is less."""
+    largest = math.inf if sizes is None else sizes.largest_cost / (1.0 - discount)
+    name = f"cost_advantage_max_{cost}"
+    seen = updates[name].to_numpy(np.float64) if name in updates else np.full(len(updates), math.inf)
+    return np.fmin(seen, largest)
+
+
 def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
     """Measured sums and bounds: a row a trial whose training phase is done.
 
@@ -60,24 +136,22 @@ def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
 
     Returns:
         KEY, policies (n), episodes_per_policy, train_limit (the d_t in force at the start of the
-        curriculum), deploy_limit, and the quantities that the module's docstring lists; NaN where horizon
-        or largest cost of a step are unknown, and the two that Lemma 1 is about also for students but CPO.
+        curriculum), deploy_limit, and the quantities that the module's docstring lists; NaN where they are
+        unknown, the bounds also for students but CPO, of which nothing is proven.
     """
     trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
-    updates = sweep.updates[sweep.updates["phase"] == Phase.TRAINING.value]
-    runs = {key: rows for key, rows in updates.groupby(list(KEY), observed=True)}
+    runs = training_runs(sweep)
     lines = []
     for _, trial in trained[trained[f"deploy_limit_{cost}"].notna()].iterrows():
         key = tuple(trial[name] for name in KEY)
-        sizes = task_sizes(str(trial["task_name"]), sweep.task_options[str(trial["task"])], cost)
         start = trial[f"start_limit_{cost}"]
         given = trial[f"train_limit_{cost}"] if math.isnan(start) else start
         deploy = float(trial[f"deploy_limit_{cost}"])
         lines.append(
             dict(zip(KEY, key, strict=True))
             | {"train_limit": float(given), "deploy_limit": deploy}
-            | _sums(runs[key], cost, deploy)
-            | _bounds(runs[key], cost, sizes, _discount(sweep, trial))
+            | {"episodes_per_policy": float(runs[key]["episodes"].mean())}
+            | _sums(policies_of(sweep, trial, runs[key], cost=cost), deploy)
         )
     rows = pd.DataFrame(lines)
     for name in KEY[:3] if len(rows) else ():
@@ -130,7 +204,7 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
 
 
 def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """The sums of ``cumulative_costs`` as text: a row a GROUP, means over its runs, undiscounted."""
+    """The sums of ``cumulative_costs`` as text: a row a GROUP, means over its runs."""
     lines = []
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
         line = {name: str(label) for name, label in zip(GROUP, group, strict=True)}
@@ -141,6 +215,7 @@ def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
             ("over limits", "overshoot_sum"),
             ("over d_d", "violation_sum"),
             ("bound for CPO", "bound"),
+            ("discounted", "discounted_bound"),
             ("ceiling", "ceiling_sum"),
         ):
             line[title] = number(float(runs[name].mean()))
@@ -163,7 +238,26 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> tuple[int, float] | None:
+def training_runs(sweep: Sweep) -> dict[Any, pd.DataFrame]:
+    """The updates of every trial's training phase, by KEY."""
+    updates = sweep.updates[sweep.updates["phase"] == Phase.TRAINING.value]
+    return dict(iter(updates.groupby(list(KEY), observed=True)))
+
+
+def policies_of(sweep: Sweep, trial: pd.Series, updates: pd.DataFrame, *, cost: int) -> pd.DataFrame:
+    """``policy_costs`` of a trial.
+
+    Args:
+        sweep: what it is a trial of.
+        trial: its row of ``sweep.trials``.
+        updates: of its training phase.
+        cost: i, which cost.
+    """
+    sizes = task_sizes(str(trial["task_name"]), sweep.task_options[str(trial["task"])], cost)
+    return policy_costs(updates, cost=cost, sizes=sizes, discount=_discount(sweep, trial))
+
+
+def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | None:
     """Horizon and largest cost of a step of a finite task; None for others."""
     try:
         if find_task(name).optimum is None:  # no finite task is without, and others can be slow to build
@@ -174,7 +268,7 @@ def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> tuple[int, f
     if not isinstance(environment, FiniteVectorEnv):
         return None
     model = environment.finite_cmdp()
-    return model.horizon, float(model.costs[:, :, cost].max())
+    return TaskSizes(model.horizon, float(model.costs[:, :, cost].max()))
 
 
 def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
@@ -183,38 +277,23 @@ def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
     return float(options.get("discount", math.nan)) if trial["agent_name"] == "cpo" else None
 
 
-def _sums(updates: pd.DataFrame, cost: int, deploy: float) -> dict[str, float]:
-    """What was measured; a policy of which no episode ended has the cost of the one before it."""
-    costs = updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)
-    limits = updates[f"limit_{cost}"].to_numpy(np.float64)
+def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:
+    """The sums over the policies of a trial."""
+    costs, limits = policies["cost"].to_numpy(np.float64), policies["limit"].to_numpy(np.float64)
     return {
         "policies": len(costs),
-        "episodes_per_policy": float(updates["episodes"].mean()),
         "cost_sum": float(costs.sum()),
         "limit_sum": float(np.where(np.isfinite(limits), limits, costs).sum()),
         "overshoot_sum": float(np.maximum(costs - limits, 0.0).sum()),
         "violation_sum": float(np.maximum(costs - deploy, 0.0).sum()),
+        "bound": _sum(policies["bound"]),
+        "ceiling_sum": _sum(policies["ceiling"]),
+        "discounted_excess_sum": _sum(policies["discounted_excess"]),
+        "discounted_bound": _sum(policies["discounted_bound"]),
     }
 
 
-def _bounds(
-    updates: pd.DataFrame, cost: int, sizes: tuple[int, float] | None, discount: float | None
-) -> dict[str, float]:
-    """What is proven of the same policies."""
-    line = dict.fromkeys(("bound", "ceiling_sum", "discounted_excess_sum"), math.nan)
-    if sizes is None:
-        return line
-    horizon, largest = sizes
-    ceiling = horizon * largest
-    line["ceiling_sum"] = ceiling * len(updates)
-    if discount is None or "kl" not in updates:
-        return line
-    divergences = updates["kl"].to_numpy(np.float64)[:-1].clip(min=0.0)
-    limits = updates[f"limit_{cost}"].to_numpy(np.float64)[:-1]
-    excesses = np.array([undiscounted_excess(kl, ceiling, horizon=horizon) for kl in divergences])
-    line["bound"] = ceiling + float(np.minimum(limits + excesses, ceiling).sum())
-    advantage = largest / (1.0 - discount)
-    line["discounted_excess_sum"] = math.fsum(
-        discounted_excess(kl, advantage, discount=discount) for kl in divergences
-    )
-    return line
+def _sum(values: pd.Series[float]) -> float:
+    """NaN where one is unknown or infinite: then nothing is told."""
+    total = math.fsum(values) if np.isfinite(values).all() else math.nan
+    return float(total)

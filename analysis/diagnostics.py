@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 
 from recrl.analysis import panels, styles
 from recrl.analysis.frames import Sweep
-from recrl.analysis.metrics import learning_curve, step_grid
+from recrl.analysis.metrics import mean_curve, step_grid
 from recrl.analysis.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.environments.cmdp import Floats
 
@@ -80,9 +80,9 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
 def _panel(axes: Axes, updates: pd.DataFrame, quantity: str, edges: Floats, style: MethodStyle) -> None:
     if not _known(updates, quantity):
         return
-    curve = learning_curve(updates, quantity, edges)
-    drawn = np.isfinite(curve.mean)
-    axes.plot(curve.steps[drawn], curve.mean[drawn], color=style.colour, linewidth=1.1, zorder=3.0)
+    curve = mean_curve(updates, quantity, edges)
+    drawn = np.isfinite(curve.centre)
+    axes.plot(curve.steps[drawn], curve.centre[drawn], color=style.colour, linewidth=1.1, zorder=3.0)
     panels.draw_band(axes, curve, style)
 
 

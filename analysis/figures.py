@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 
 from recrl.analysis import panels, styles
 from recrl.analysis.frames import Sweep
-from recrl.analysis.metrics import learning_curve, step_grid
+from recrl.analysis.metrics import MEAN, Averaging, mean_curve, step_grid
 from recrl.analysis.styles import TEXT_WIDTH, MethodStyle
+from recrl.environments.cmdp import Floats
 
 BINS = 100
 DEPLOYMENT_BINS = 25
@@ -28,15 +29,13 @@ ROW_HEIGHT = 1.42
 WORTH_MARKING = 0.03  # of a trial: shorter spells of infinite limits (the measuring of d_t) are not marked
 
 
-def learning_curves(sweep: Sweep, agent: str) -> Figure:
+def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) -> Figure:
     """The paper's Figures 3 and 4: a row a task, return and cost over training and over deployment.
 
     Args:
         sweep: with at least one update of this student.
         agent: its label.
-
-    Returns:
-        Lines are means over seeds, bands one standard error.
+        averaging: what lines and bands are; means and standard errors as in the paper by default.
     """
     trials = sweep.trials[sweep.trials["agent"] == agent]
     updates = sweep.updates[sweep.updates["agent"] == agent]
@@ -52,16 +51,22 @@ def learning_curves(sweep: Sweep, agent: str) -> Figure:
             len(tasks), columns, squeeze=False, gridspec_kw={"width_ratios": [1.7, 1.0] * (columns // 2)}
         )
         for row, task in zip(grid, tasks, strict=True):
-            _task_row(row, trials[trials["task"] == task], updates[updates["task"] == task], look)
+            _task_row(
+                row,
+                trials[trials["task"] == task],
+                updates[updates["task"] == task],
+                look,
+                averaging=averaging,
+            )
         for axes, title in zip(grid[0], _column_titles(num_costs), strict=True):
             axes.set_title(title)
         for axes in grid[-1]:
             axes.set_xlabel("environment steps")
         present = [method for method in look if (updates["method"] == method).any()]
         optimum = bool(trials["optimal_return"].notna().any())
-        panels.legend(
-            figure, look, present, optimum=optimum, title=f"{agent}: mean ± standard error over seeds"
-        )
+        seeds = int(updates.groupby(["task", "method"], observed=True)["seed"].nunique().min())
+        title = f"{agent}: {averaging.describe(seeds)}"
+        panels.legend(figure, look, present, optimum=optimum, title=title)
     return figure
 
 
@@ -110,7 +115,12 @@ def curricula(sweep: Sweep) -> Figure:
 
 
 def _task_row(
-    row: Sequence[Axes], trials: pd.DataFrame, updates: pd.DataFrame, look: dict[str, MethodStyle]
+    row: Sequence[Axes],
+    trials: pd.DataFrame,
+    updates: pd.DataFrame,
+    look: dict[str, MethodStyle],
+    *,
+    averaging: Averaging,
 ) -> None:
     """One task's panels: return, return in deployment, then the same for each cost."""
     boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
@@ -129,7 +139,7 @@ def _task_row(
             (row[2 * position], whole, updates),
             (row[2 * position + 1], magnified, deployed),
         ):
-            _curves(axes, rows, quantity, edges, look)
+            _curves(axes, rows, quantity, edges, look, averaging=averaging)
             panels.step_axis(axes, edges[0], edges[-1])
             panels.reference_lines(axes, trials, quantity)
         panels.phase_boundary(row[2 * position], boundary, total)
@@ -146,14 +156,20 @@ def _task_row(
 
 
 def _curves(
-    axes: Axes, updates: pd.DataFrame, quantity: str, edges: np.ndarray, look: dict[str, MethodStyle]
+    axes: Axes,
+    updates: pd.DataFrame,
+    quantity: str,
+    edges: Floats,
+    look: dict[str, MethodStyle],
+    *,
+    averaging: Averaging,
 ) -> None:
-    """Every method's mean with its band; markers are staggered so that equal lines can be told apart."""
+    """Every method's line with its band; markers are staggered so that equal lines can be told apart."""
     for position, (method, style) in enumerate(look.items()):
         chosen = updates[updates["method"] == method]
         if not len(chosen):
             continue
-        curve = learning_curve(chosen, quantity, edges)
+        curve = averaging.curve(chosen, quantity, edges)
         panels.draw_curve(axes, curve, style, place=(position, len(look)))
         panels.draw_band(axes, curve, style)
 
@@ -179,7 +195,7 @@ def _curriculum_panel(
             )
         if not len(chosen):
             continue
-        curve = learning_curve(chosen, f"limit_{i}", edges)
+        curve = mean_curve(chosen, f"limit_{i}", edges)
         panels.draw_curve(axes, curve, style, place=(position, len(look)), wider=0.3)
         last = float(chosen["end_step"].where(np.isinf(chosen[f"limit_{i}"])).max())
         if last >= WORTH_MARKING * total:

@@ -21,6 +21,10 @@ task lacks are NaN. All returns and costs are undiscounted sums over an episode.
     events       a row an event: KEY, update, end_step, event
     policies     a row a state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
 
+Three sources give the same frames: the trials' files (``load``, here), MLflow alone
+(``recrl.analysis.tracked``) and the compact file of a finished sweep (``recrl.analysis.compact``). Each
+tells ``assemble`` the trials and, for each of the other frames, its rows.
+
 Episode files can hold 500,000 rows a trial. ``load`` reads them one at a time and keeps their sums
 (``phases``); ``load_episodes`` gives the rows themselves to whoever wants them.
 """
@@ -28,17 +32,21 @@ Episode files can hold 500,000 rows a trial. ``load`` reads them one at a time a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
 from recrl.environments.cmdp import Phase
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import optimal_return
-from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.phase_totals import phase_totals
+from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import (
     EPISODE_COLUMNS,
     EVALUATION_COLUMNS,
@@ -71,6 +79,33 @@ TRIAL_COLUMNS = (
 PHASE_COLUMNS = ("phase", "episodes", "steps", "episode_return", "episode_return_std")
 PHASE_COST_COLUMNS = (("cost", ""), ("cost", "_std"), ("cost", "_total"), ("excess", "_total"))
 EVENT_COLUMNS = ("update", "end_step", "event")
+TRIAL = "trial"  # in rows given to ``assemble``: the position of the trial they are of
+
+# The students' metrics that figures and tables read; MLflow and the compact file give no others.
+DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
+
+
+@dataclass(frozen=True)
+class TrialFacts:
+    """What is known of a trial as a whole.
+
+    Attributes:
+        spec: what it is.
+        status: where it stands.
+        error: one line saying why it failed, or empty.
+        env_steps: environment steps taken so far.
+        cpu_seconds: CPU time so far.
+        start_limits: the d_t that its teacher measured, [k], or None.
+        provenance: versions, commit and machine as its file has them; empty if unknown.
+    """
+
+    spec: TrialSpec
+    status: TrialState
+    error: str = ""
+    env_steps: int = 0
+    cpu_seconds: float = 0.0
+    start_limits: Sequence[float | str] | None = None
+    provenance: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,8 +120,8 @@ class Sweep:
         evaluations: a row an episode of the frozen policy.
         events: a row an event.
         policies: a row a state of a complete trial's final policy.
-        task_options: the options of every task, by its label.
-        agent_options: the options of every student, by its label.
+        facts: the trials themselves, in the order of the grid.
+        grid: the grid file of the last launch, or empty.
         notes: sentences on what a reader of the frames must know, for example an unknown optimum.
     """
 
@@ -97,8 +132,8 @@ class Sweep:
     evaluations: pd.DataFrame
     events: pd.DataFrame
     policies: pd.DataFrame
-    task_options: Mapping[str, Mapping[str, Any]]
-    agent_options: Mapping[str, Mapping[str, Any]]
+    facts: tuple[TrialFacts, ...] = ()
+    grid: str = ""
     notes: tuple[str, ...] = ()
 
     @property
@@ -106,18 +141,15 @@ class Sweep:
         """The largest k of the sweep's tasks; 0 for an empty sweep."""
         return int(self.trials["num_costs"].max()) if len(self.trials) else 0
 
+    @cached_property
+    def task_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """The options of every task, by its label."""
+        return {it.spec.task.label: it.spec.task.options for it in self.facts}
 
-@dataclass(frozen=True)
-class _Member:
-    """A trial with the labels it has in this sweep's frames."""
-
-    store: TrialStore
-    spec: TrialSpec
-    method: str
-
-    @property
-    def key(self) -> tuple[str, str, str, int]:
-        return (self.spec.task.label, self.spec.agent.label, self.method, self.spec.seed)
+    @cached_property
+    def agent_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """The options of every student, by its label."""
+        return {it.spec.agent.label: it.spec.agent.options for it in self.facts}
 
 
 def load(store: SweepStore) -> Sweep:
@@ -126,27 +158,20 @@ def load(store: SweepStore) -> Sweep:
     Args:
         store: the sweep's folder.
     """
-    members, notes = _members(store)
-    optima, unknown = _optima(members)
-    costs = range(max((len(member.spec.deploy_limits) for member in members), default=0))
-    cost_columns = [f"cost_{i}" for i in costs]
-    limit_columns = [f"limit_{i}" for i in costs]
-    phase_columns = [f"{name}_{i}{end}" for i in costs for name, end in PHASE_COST_COLUMNS]
+    specs, trials = _trials(store)
 
-    def frame(columns: Sequence[str], rows: Callable[[_Member], pd.DataFrame]) -> pd.DataFrame:
-        return _keyed(members, [rows(member) for member in members], columns)
+    def rows(of: Callable[[TrialStore], pd.DataFrame]) -> pd.DataFrame:
+        return joined([of(trial) for trial in trials])
 
-    return Sweep(
-        name=store.name,
-        trials=frame(TRIAL_COLUMNS, lambda member: _trial_row(member, optima[member.spec.trial_id])),
-        phases=frame((*PHASE_COLUMNS, *phase_columns), _phase_rows),
-        updates=frame((*UPDATE_COLUMNS, *cost_columns, *limit_columns), lambda it: it.store.updates()),
-        evaluations=frame((*EVALUATION_COLUMNS, *cost_columns), lambda it: it.store.evaluation()),
-        events=frame(EVENT_COLUMNS, lambda member: _event_rows(member.store)),
-        policies=frame(("state",), lambda member: _policy_rows(member.store)),
-        task_options={member.spec.task.label: member.spec.task.options for member in members},
-        agent_options={member.spec.agent.label: member.spec.agent.options for member in members},
-        notes=tuple(notes + unknown),
+    return assemble(
+        store.name,
+        [_facts(spec, trial) for spec, trial in zip(specs, trials, strict=True)],
+        phases=rows(_phase_rows),
+        updates=rows(TrialStore.updates),
+        evaluations=rows(TrialStore.evaluation),
+        events=rows(_event_rows),
+        policies=rows(_policy_rows),
+        grid=store.grid_path.read_text(encoding="utf-8") if store.grid_path.exists() else "",
     )
 
 
@@ -160,15 +185,85 @@ def load_episodes(
         columns: only these columns beside KEY.
         phase: only the episodes that ended in this phase.
     """
-    members, _ = _members(store)
+    specs, trials = _trials(store)
 
-    def rows(member: _Member) -> pd.DataFrame:
-        episodes = member.store.episodes()
+    def rows(trial: TrialStore) -> pd.DataFrame:
+        episodes = trial.episodes()
         if phase is not None and len(episodes):
             episodes = episodes[episodes["phase"] == phase.value]
         return episodes if columns is None else episodes.reindex(columns=list(columns))
 
-    return _keyed(members, [rows(member) for member in members], columns or EPISODE_COLUMNS)
+    keys, _ = _keys(specs)
+    return keys.put_before(joined([rows(trial) for trial in trials]), columns or EPISODE_COLUMNS)
+
+
+def assemble(
+    name: str,
+    facts: Sequence[TrialFacts],
+    *,
+    phases: pd.DataFrame,
+    updates: pd.DataFrame,
+    evaluations: pd.DataFrame,
+    events: pd.DataFrame,
+    policies: pd.DataFrame,
+    grid: str = "",
+    notes: Sequence[str] = (),
+) -> Sweep:
+    """The frames from what a source knows; those but ``trials`` are given as rows, in order for each trial.
+
+    Args:
+        name: of the sweep.
+        facts: its trials, in the order of the grid.
+        phases: rows with a column TRIAL, the position in ``facts``, and the frame's own but KEY.
+        updates: likewise.
+        evaluations: likewise.
+        events: likewise.
+        policies: likewise.
+        grid: the grid file, or empty.
+        notes: what the source has to say.
+    """
+    keys, doubles = _keys([it.spec for it in facts])
+    optima, unknown = _optima([it.spec for it in facts])
+    costs = range(max((len(it.spec.deploy_limits) for it in facts), default=0))
+    cost_columns, limit_columns = [f"cost_{i}" for i in costs], [f"limit_{i}" for i in costs]
+    phase_columns = [f"{kind}_{i}{end}" for i in costs for kind, end in PHASE_COST_COLUMNS]
+    rows = [
+        _trial_row(it, optimum) | {TRIAL: i}
+        for i, (it, optimum) in enumerate(zip(facts, optima, strict=True))
+    ]
+    return Sweep(
+        name=name,
+        trials=keys.put_before(pd.DataFrame(rows), TRIAL_COLUMNS),
+        phases=keys.put_before(phases, (*PHASE_COLUMNS, *phase_columns)),
+        updates=keys.put_before(updates, (*UPDATE_COLUMNS, *cost_columns, *limit_columns)),
+        evaluations=keys.put_before(evaluations, (*EVALUATION_COLUMNS, *cost_columns)),
+        events=keys.put_before(events, EVENT_COLUMNS),
+        policies=keys.put_before(policies, ("state",)),
+        facts=tuple(facts),
+        grid=grid,
+        notes=tuple(dict.fromkeys((*notes, *doubles, *unknown))),
+    )
+
+
+def joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """The trials' frames below each other, with the column TRIAL: their position among ``frames``."""
+    filled = [frame for frame in frames if len(frame)]
+    rows = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
+    return rows.assign(**{TRIAL: np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])})
+
+
+def drawn_columns(columns: Iterable[str]) -> list[str]:
+    """Those columns of ``updates`` that figures and tables read: all but timing and other metrics.
+
+    >>> drawn_columns(["update", "time", "collect_seconds", "cost_0", "limit_0", "entropy", "kl"])
+    ['update', 'cost_0', 'limit_0', 'kl']
+    """
+    kept = {*KEY, *UPDATE_COLUMNS} - {"time", "collect_seconds", "update_seconds"}
+    return [
+        name
+        for name in columns
+        if name in kept or re.fullmatch(r"(cost|limit)_\d+", name) or DRAWN_METRICS.fullmatch(name)
+    ]
 
 
 def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
@@ -181,57 +276,92 @@ def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
     return [label for label in first if label in present] + sorted(present - set(first))
 
 
-def _members(store: SweepStore) -> tuple[list[_Member], list[str]]:
-    """The trials of a sweep, with labels that tell different groups apart.
+@dataclass(frozen=True, eq=False)
+class _Keys:
+    """KEY of every trial.
+
+    Attributes:
+        labels: task, agent and method, a category a trial.
+        seeds: int64, [number of trials].
+    """
+
+    labels: Mapping[str, pd.Categorical]
+    seeds: npt.NDArray[np.int64]
+
+    def put_before(self, rows: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
+        """The rows sorted by KEY, behind KEY instead of TRIAL; ``columns`` exist even if there is no row."""
+        if not len(rows):
+            rows = pd.DataFrame(columns=[TRIAL, *columns], dtype=float).astype({TRIAL: np.int64})
+        codes = [self.labels[name].codes for name in GROUP]
+        rank = np.empty(len(self.seeds), dtype=np.int64)
+        rank[np.lexsort((self.seeds, *reversed(codes)))] = np.arange(len(rank))
+        of = rows[TRIAL].to_numpy(np.int64)
+        order = np.argsort(rank[of], kind="stable")
+        of = of[order]
+        keys = {name: self.labels[name].take(of) for name in GROUP} | {"seed": self.seeds[of]}
+        others = rows.drop(columns=TRIAL).iloc[order].reset_index(drop=True)
+        return pd.concat([pd.DataFrame(keys), others], axis=1)
+
+
+def _keys(specs: Sequence[TrialSpec]) -> tuple[_Keys, list[str]]:
+    """The trials' labels, and notes on those that had to be told apart.
 
     Two groups of trials may have the same labels but different settings (say, budgets). They must not be
     averaged: their method's name then carries the group.
     """
-    specs = store.specs() or [trial.spec for trial in store.trials()]
     groups: dict[tuple[str, ...], set[str]] = {}
-    for spec in specs:
-        groups.setdefault(_labels(spec), set()).add(spec.group)
+    identities = [spec.group for spec in specs]
+    for spec, group in zip(specs, identities, strict=True):
+        groups.setdefault(_labels(spec), set()).add(group)
     notes = [
         f"{' '.join(labels)}: {len(found)} groups of trials have these labels but different settings; "
         f"they are kept apart as {labels[2]} [...]"
         for labels, found in sorted(groups.items())
         if len(found) > 1
     ]
-
-    def method(spec: TrialSpec) -> str:
-        several = len(groups[_labels(spec)]) > 1
-        return f"{spec.method.label} [{spec.group}]" if several else spec.method.label
-
-    return [_Member(store.trial(spec), spec, method(spec)) for spec in specs], notes
+    methods = [
+        f"{spec.method.label} [{group}]" if len(groups[_labels(spec)]) > 1 else spec.method.label
+        for spec, group in zip(specs, identities, strict=True)
+    ]
+    columns: dict[str, tuple[list[str], Sequence[str]]] = {
+        "task": ([spec.task.label for spec in specs], ()),
+        "agent": ([spec.agent.label for spec in specs], AGENT_ORDER),
+        "method": (methods, METHOD_ORDER),
+    }
+    labels = {
+        name: pd.Categorical(values, categories=ordered(values, first), ordered=True)
+        for name, (values, first) in columns.items()
+    }
+    return _Keys(labels, np.array([spec.seed for spec in specs], dtype=np.int64)), notes
 
 
 def _labels(spec: TrialSpec) -> tuple[str, str, str]:
     return (spec.task.label, spec.agent.label, spec.method.label)
 
 
-def _optima(members: Sequence[_Member]) -> tuple[dict[str, float], list[str]]:
-    """J*(d_d) by trial_id, NaN where unknown, and a note for each task that is not installed here."""
-    optima: dict[str, float] = {}
+def _optima(specs: Sequence[TrialSpec]) -> tuple[list[float], list[str]]:
+    """J*(d_d) of every trial, NaN where unknown, and a note for each task that is not installed here."""
+    optima: list[float] = []
     notes: dict[str, str] = {}
-    for member in members:
-        task = member.spec.task
+    for spec in specs:
+        task = spec.task
         try:
-            optimum = optimal_return(task.name, task.options, member.spec.deploy_limits)
+            optimum = optimal_return(task.name, task.options, spec.deploy_limits)
         except UnknownNameError as error:
             optimum = None
             notes[task.label] = f"{task.label}: the optimum is unknown here, because {error}"
-        optima[member.spec.trial_id] = math.nan if optimum is None else optimum
+        optima.append(math.nan if optimum is None else optimum)
     return optima, list(notes.values())
 
 
-def _trial_row(member: _Member, optimum: float) -> pd.DataFrame:
-    spec, record = member.spec, member.store.record()
+def _trial_row(trial: TrialFacts, optimum: float) -> dict[str, Any]:
+    spec = trial.spec
     size = spec.steps_per_update
     row: dict[str, Any] = {
         "trial_id": spec.trial_id,
         "group": spec.group,
-        "status": record.status.value,
-        "error": record.error,
+        "status": trial.status.value,
+        "error": trial.error,
         "task_name": spec.task.name,
         "agent_name": spec.agent.name,
         "method_name": spec.method.name,
@@ -240,77 +370,46 @@ def _trial_row(member: _Member, optimum: float) -> pd.DataFrame:
         "boundary_step": -(-spec.train_steps // size) * size,
         "total_steps": spec.num_updates * size,
         "steps_per_update": size,
-        "env_steps": record.env_steps,
-        "cpu_seconds": record.cpu_seconds,
+        "env_steps": trial.env_steps,
+        "cpu_seconds": trial.cpu_seconds,
         "optimal_return": optimum,
     }
-    start: Sequence[float | str] = record.start_limits or [math.nan] * len(spec.deploy_limits)
+    start: Sequence[float | str] = trial.start_limits or [math.nan] * len(spec.deploy_limits)
     for i, (train, deploy, measured) in enumerate(
         zip(spec.train_limits, spec.deploy_limits, start, strict=True)
     ):
         row |= {f"train_limit_{i}": train, f"deploy_limit_{i}": deploy, f"start_limit_{i}": float(measured)}
-    return pd.DataFrame([row])
+    return row
 
 
-def _phase_rows(member: _Member) -> pd.DataFrame:
-    """The sums over the trial's episodes, a row a phase that has any."""
-    episodes = member.store.episodes()
-    rows = []
-    for phase in Phase if len(episodes) else ():
-        chosen = episodes[episodes["phase"] == phase.value]
-        if not len(chosen):
-            continue
-        row: dict[str, Any] = {
-            "phase": phase.value,
-            "episodes": len(chosen),
-            "steps": int(chosen["length"].sum()),
-            "episode_return": chosen["episode_return"].mean(),
-            "episode_return_std": chosen["episode_return"].std(),
-        }
-        for i, limit in enumerate(member.spec.deploy_limits):
-            costs = chosen[f"cost_{i}"].to_numpy()
-            row |= {
-                f"cost_{i}": costs.mean(),
-                f"cost_{i}_std": chosen[f"cost_{i}"].std(),
-                f"cost_{i}_total": costs.sum(),
-                f"excess_{i}_total": np.maximum(costs - limit, 0.0).sum(),
-            }
-        rows.append(row)
-    return pd.DataFrame(rows)
+def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialStore]]:
+    """The trials of the sweep's last launch, or else all that are on disk."""
+    specs = store.specs() or [trial.spec for trial in store.trials()]
+    return specs, [store.trial(spec) for spec in specs]
 
 
-def _event_rows(store: TrialStore) -> pd.DataFrame:
-    return pd.DataFrame([{name: event.get(name) for name in EVENT_COLUMNS} for event in store.events()])
-
-
-def _policy_rows(store: TrialStore) -> pd.DataFrame:
-    policy = store.policy()
-    return policy.rename_axis("state").reset_index() if len(policy) else policy
-
-
-def _keyed(
-    members: Sequence[_Member], frames: Sequence[pd.DataFrame], columns: Sequence[str]
-) -> pd.DataFrame:
-    """The trials' frames below each other, behind KEY; ``columns`` exist even if no trial has a row."""
-    filled = [frame for frame in frames if len(frame)]
-    rows = (
-        pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(columns), dtype=float)
+def _facts(spec: TrialSpec, trial: TrialStore) -> TrialFacts:
+    record, path = trial.record(), trial.provenance_path
+    return TrialFacts(
+        spec=spec,
+        status=record.status,
+        error=record.error,
+        env_steps=record.env_steps,
+        cpu_seconds=record.cpu_seconds,
+        start_limits=record.start_limits,
+        provenance=path.read_text(encoding="utf-8") if path.exists() else "",
     )
-    keys = dict(zip(KEY, _repeated_keys(members, [len(frame) for frame in frames]), strict=True))
-    rows = pd.concat([pd.DataFrame(keys), rows], axis=1)
-    return rows.sort_values(list(KEY), kind="stable", ignore_index=True)
 
 
-def _repeated_keys(members: Sequence[_Member], lengths: Sequence[int]) -> Iterator[Any]:
-    """A column for each of KEY: every trial's value as often as it has rows."""
-    orders: Mapping[str, Sequence[str]] = {"task": (), "agent": AGENT_ORDER, "method": METHOD_ORDER}
-    for position, name in enumerate(KEY):
-        values: list[Any] = [member.key[position] for member in members]
-        if name not in orders:
-            yield np.repeat(np.array(values, dtype=np.int64), lengths)
-            continue
-        categories = ordered(values, orders[name])
-        codes = [categories.index(value) for value in values]
-        yield pd.Categorical.from_codes(
-            np.repeat(np.array(codes, dtype=np.int64), lengths), categories=pd.Index(categories), ordered=True
-        )
+def _phase_rows(trial: TrialStore) -> pd.DataFrame:
+    episodes = trial.episodes()  # none where the trial was never started: then it has no spec on disk
+    return pd.DataFrame(phase_totals(episodes, trial.spec.deploy_limits.values) if len(episodes) else [])
+
+
+def _event_rows(trial: TrialStore) -> pd.DataFrame:
+    return pd.DataFrame([{name: event.get(name) for name in EVENT_COLUMNS} for event in trial.events()])
+
+
+def _policy_rows(trial: TrialStore) -> pd.DataFrame:
+    policy = trial.policy()
+    return policy.rename_axis("state").reset_index() if len(policy) else policy

@@ -11,6 +11,7 @@ coin's toss, which is why both are reported.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -21,6 +22,8 @@ import pandas as pd
 
 from recrl.analysis.frames import GROUP, KEY, Sweep
 from recrl.analysis.intervals import (
+    CONFIDENCE,
+    ENOUGH_RUNS,
     Interval,
     improvement_interval,
     interquartile_mean,
@@ -31,6 +34,9 @@ from recrl.analysis.intervals import (
 )
 from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.spec import TrialState
+
+BAND_REPLICATIONS = 500  # a band has a hundred intervals
+BAND_ENDS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 
 
 class Measure(StrEnum):
@@ -196,21 +202,43 @@ def _ends(name: str, interval: Interval) -> dict[str, float]:
     return {name: interval.estimate, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """A quantity over training, averaged over seeds on a grid of environment steps.
 
     Attributes:
         steps: centres of the grid's bins, [g].
-        mean: over the runs that have data in the bin, [g]; NaN where none has.
-        standard_error: of that mean, [g]; NaN where fewer than two have.
+        centre: mean or interquartile mean over the runs that have data in the bin, [g]; NaN where none has.
+        low: lower end of the band, [g]; NaN where fewer than two have.
+        high: upper end, likewise.
         runs: how many have, int [g].
     """
 
     steps: Floats
-    mean: Floats
-    standard_error: Floats
+    centre: Floats
+    low: Floats
+    high: Floats
     runs: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Averaging:
+    """A way to make one line with a band of several runs.
+
+    Attributes:
+        description: of line and band, for legends.
+        curve: (updates, column, edges) as of ``mean_curve``.
+        enough_runs: with fewer the band is narrower than it says.
+    """
+
+    description: str
+    curve: Callable[[pd.DataFrame, str, Floats], Curve]
+    enough_runs: int = 1
+
+    def describe(self, runs: int) -> str:
+        """The description, with a warning where there are too few runs."""
+        warning = f"; {runs} seeds are too few for it: the band is too narrow"
+        return self.description + (warning if runs < self.enough_runs else "")
 
 
 def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) -> Floats:
@@ -261,7 +289,7 @@ def binned_runs(updates: pd.DataFrame, column: str, edges: Floats) -> Floats:
     return np.reshape(means, (len(seeds), count))
 
 
-def learning_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
+def mean_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
     """Mean and standard error over seeds of ``binned_runs``.
 
     Args:
@@ -275,7 +303,58 @@ def learning_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
     mean = _divided(np.where(present, runs, 0.0).sum(axis=0), count)
     squares = np.where(present, (runs - mean) ** 2, 0.0).sum(axis=0)
     error = np.sqrt(_divided(squares, (count - 1) * count))
-    return Curve((edges[:-1] + edges[1:]) / 2.0, mean, error, count.astype(np.int64))
+    return Curve(_centres(edges), mean, mean - error, mean + error, count.astype(np.int64))
+
+
+def interquartile_curve(
+    updates: pd.DataFrame, column: str, edges: Floats, generator: np.random.Generator
+) -> Curve:
+    """Interquartile mean over seeds of ``binned_runs``, with its 95% percentile bootstrap band.
+
+    Whole runs are resampled, so that a band's neighbouring bins rest on the same resamples.
+
+    Args:
+        updates: of one task, student and method.
+        column: what to average.
+        edges: ascending, [g + 1].
+        generator: draws the resamples.
+    """
+    runs = binned_runs(updates, column, edges)
+    present = np.isfinite(runs)
+    centre, low, high = np.full((3, runs.shape[1]), np.nan)
+    patterns, pattern_of = np.unique(present, axis=1, return_inverse=True)
+    for index, members in enumerate(patterns.T):
+        bins = np.flatnonzero(pattern_of.reshape(-1) == index)
+        scores = runs[np.ix_(members, bins)].T  # [b, n] of the n runs that have data in these b bins
+        count = scores.shape[1]
+        if count == 0:
+            continue
+        centre[bins] = interquartile_mean(scores[:, :, None])
+        if count > 1:
+            resampled = generator.integers(count, size=(BAND_REPLICATIONS, count))
+            replicated = interquartile_mean(scores[:, resampled][..., None])
+            low[bins], high[bins] = np.quantile(replicated, BAND_ENDS, axis=-1)
+    return Curve(_centres(edges), centre, low, high, present.sum(axis=0).astype(np.int64))
+
+
+MEAN = Averaging("mean ± standard error over seeds", mean_curve)
+
+
+def interquartile(generator: np.random.Generator) -> Averaging:
+    """Interquartile means with bootstrap bands.
+
+    Args:
+        generator: draws the resamples.
+    """
+    return Averaging(
+        "interquartile mean and its 95% bootstrap band over seeds",
+        lambda updates, column, edges: interquartile_curve(updates, column, edges, generator),
+        ENOUGH_RUNS,
+    )
+
+
+def _centres(edges: Floats) -> Floats:
+    return (edges[:-1] + edges[1:]) / 2.0
 
 
 def _divided(numerator: Floats, denominator: npt.NDArray[np.integer]) -> Floats:

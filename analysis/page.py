@@ -62,24 +62,26 @@ class Section:
     body: str
 
 
-def page(title: str, lead: str, sections: Sequence[Section]) -> str:
+def page(title: str, lead: str, sections: Sequence[Section], *, reload_seconds: int | None = None) -> str:
     """The whole page.
 
     Args:
         title: of the page.
         lead: one sentence below it.
         sections: its parts, listed at the top.
+        reload_seconds: an open page loads itself again so often; None if nothing will change.
     """
     links = "".join(f'<a href="#s{index}">{escape(it.heading)}</a> ' for index, it in enumerate(sections))
     parts = [
         f'<section id="s{index}"><h2>{escape(it.heading)}</h2>\n{it.body}\n</section>'
         for index, it in enumerate(sections)
     ]
+    reload = f'<meta http-equiv="refresh" content="{reload_seconds}">' if reload_seconds else ""
     return "\n".join(
         [
             '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<link rel="icon" href="data:,">',
+            f'<link rel="icon" href="data:,">{reload}',
             f"<title>{escape(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>",
             f"<h1>{escape(title)}</h1>\n<p>{escape(lead)}</p>\n<nav>{links}</nav>",
             *parts,

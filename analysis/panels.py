@@ -23,7 +23,7 @@ DASHED = (0.0, (4.0, 2.0))
 def draw_curve(
     axes: Axes, curve: Curve, style: MethodStyle, *, place: tuple[int, int], wider: float = 0.0
 ) -> None:
-    """A method's mean over seeds; methods that coincide can be told apart.
+    """A method's line; methods that coincide can be told apart.
 
     Markers are staggered from method to method, and dashed lines lie on top of solid ones.
 
@@ -34,13 +34,13 @@ def draw_curve(
         place: the method's position and the number of methods.
         wider: points added to the line's width.
     """
-    drawn = np.isfinite(curve.mean)
+    drawn = np.isfinite(curve.centre)
     position, methods = place
     bins = max(1, int(drawn.sum()))
     gap = max(methods, bins // MARKERS_A_LINE)
     axes.plot(
         curve.steps[drawn],
-        curve.mean[drawn],
+        curve.centre[drawn],
         color=style.colour,
         linestyle=style.linestyle,
         linewidth=style.width + wider,
@@ -52,13 +52,12 @@ def draw_curve(
 
 
 def draw_band(axes: Axes, curve: Curve, style: MethodStyle) -> None:
-    """One standard error to either side of the mean."""
-    drawn = np.isfinite(curve.mean)
-    mean, error = curve.mean[drawn], curve.standard_error[drawn]
+    """The band around the line."""
+    drawn = np.isfinite(curve.centre)
     axes.fill_between(
         curve.steps[drawn],
-        mean - error,
-        mean + error,
+        curve.low[drawn],
+        curve.high[drawn],
         color=style.colour,
         alpha=0.18,
         linewidth=0.0,

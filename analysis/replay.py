@@ -33,7 +33,7 @@ def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
         method: the teacher and its options.
 
     Returns:
-        update, phase, end_step, limit_i and noise as recorded, replayed_limit_i and replayed_noise.
+        update, phase, end_step, cost_i, limit_i and noise as recorded, replayed_limit_i and replayed_noise.
 
     Raises:
         RecrlError: the run has no update yet.
@@ -56,7 +56,8 @@ def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
         else:
             lesson = Lesson(spec.deploy_limits)
     costs = range(len(spec.deploy_limits))
-    columns = ["update", "phase", "end_step", *(f"limit_{i}" for i in costs), "noise"]
+    recorded = (f"{name}_{i}" for name in ("cost", "limit") for i in costs)
+    columns = ["update", "phase", "end_step", *recorded, "noise"]
     limits = {f"replayed_limit_{i}": [each.limits[i] for each in lessons] for i in costs}
     return updates[columns].assign(**limits, replayed_noise=[each.policy_noise for each in lessons])
 

@@ -3,6 +3,7 @@
     report.html                 all of it on one self-contained page, with settings and provenance
     report.md                   what is missing, the tables, the list of the rest
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
+    bounds_<agent>              cumulative cost of training beside Proposition 1 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
     diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence a method (PDF and PNG)
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
@@ -14,6 +15,7 @@
     training.csv                what relaxed training cost, a row a trial
     bounds.csv                  the same beside Proposition 1, a row a trial and cost
     outcomes.tex                the first table for LaTeX (booktabs)
+    outcomes.parquet            outcomes.csv with its types, for programs
 
 Equal sweeps give equal bytes: no time is written, and the bootstrap's generator is seeded here.
 """
@@ -28,24 +30,26 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from recrl.analysis import figures, frames, metrics, page, styles, tables
+from recrl.analysis import figures, metrics, page, styles, tables
+from recrl.analysis.bound_figure import cumulative_bounds
 from recrl.analysis.cumulative import bound_table, cumulative_costs
 from recrl.analysis.diagnostics import curriculum_diagnostics
 from recrl.analysis.frames import GROUP, Sweep, ordered
 from recrl.analysis.frontier import return_against_cost
 from recrl.analysis.intervals import ENOUGH_RUNS
-from recrl.analysis.metrics import Measure
+from recrl.analysis.metrics import MEAN, Averaging, Measure, interquartile
 from recrl.analysis.page import Section
 from recrl.analysis.policy_map import policy_maps
 from recrl.analysis.profiles import performance_profiles
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.store import SweepStore
 
 BOOTSTRAP_SEED = 0
+RELOAD_SECONDS = 120  # of the page of a sweep that runs
 NO_TABLE = "No trial is complete yet: no table."
 CAPTIONS = {
     "learning-curves": "Return and cost over training and over deployment",
+    "bounds": "Cumulative cost of training beside its bounds",
     "curricula": "Cost limits in force",
     "diagnostics": "Limit, cost, multiplier and KL divergence",
     "policies": "Final policies and their visits",
@@ -58,12 +62,13 @@ class NothingToDrawError(RecrlError):
     """The sweep has no policy update on disk yet."""
 
 
-def draw(store: SweepStore, folder: Path) -> list[Path]:
+def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
     """Draw every figure and write every table of a sweep, as far as it has come.
 
     Args:
-        store: the sweep; nothing in it is changed.
-        folder: where the files go, for example ``store.figures_folder``.
+        sweep: its frames, from whatever source.
+        folder: where the files go, for example ``SweepStore.figures_folder``.
+        averaging: what lines and bands of the learning curves are.
 
     Returns:
         The files written, ``report.html`` and ``report.md`` first.
@@ -71,17 +76,16 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
     Raises:
         NothingToDrawError: no trial has committed a policy update yet.
     """
-    sweep = frames.load(store)
     if not len(sweep.updates):
         raise NothingToDrawError(
-            f"{store.folder}: nothing to draw yet, because none of its {len(sweep.trials)} trials has "
+            f"{sweep.name}: nothing to draw yet, because none of its {len(sweep.trials)} trials has "
             f"committed a policy update"
         )
     drawn = []
     for agent in sweep.updates["agent"].cat.categories:
         if (sweep.updates["agent"] == agent).any():
             stem = f"learning-curves_{_safe(agent)}"
-            drawn += styles.save(figures.learning_curves(sweep, agent), folder, stem)
+            drawn += styles.save(figures.learning_curves(sweep, agent, averaging=averaging), folder, stem)
     drawn += styles.save(figures.curricula(sweep), folder, "curricula")
     for task, agent in sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist():
         stem = f"diagnostics_{_safe(task)}_{_safe(agent)}"
@@ -89,6 +93,9 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
     for agent in ordered(list(sweep.policies["agent"]), list(sweep.trials["agent"].cat.categories)):
         if (maps := policy_maps(sweep, agent)) is not None:
             drawn += styles.save(maps, folder, f"policies_{_safe(agent)}")
+    for agent in ordered(list(sweep.trials["agent"]), list(sweep.trials["agent"].cat.categories)):
+        if (bounds := cumulative_bounds(sweep, agent)) is not None:
+            drawn += styles.save(bounds, folder, f"bounds_{_safe(agent)}")
     if (against := return_against_cost(sweep)) is not None:
         drawn += styles.save(against, folder, "return-against-cost")
     if (profiles := performance_profiles(sweep, Measure.STOCHASTIC)) is not None:
@@ -102,10 +109,15 @@ def draw(store: SweepStore, folder: Path) -> list[Path]:
         text += ["", NO_TABLE]
     state = [_count(sweep), "", *(f"- {sentence}" for sentence in missing(sweep))]
     reports = [
-        tables.write_text(_html(sweep, store, pictures, shown), folder / "report.html"),
+        tables.write_text(_html(sweep, pictures, shown), folder / "report.html"),
         tables.write_text("\n".join([f"# {sweep.name}", "", *state, "", *text]), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
+
+
+def averagings() -> dict[str, Averaging]:
+    """What lines and bands can be, by the name that the command line has for it."""
+    return {"mean": MEAN, "iqm": interquartile(np.random.default_rng(BOOTSTRAP_SEED))}
 
 
 def _safe(label: str) -> str:
@@ -179,6 +191,7 @@ def _tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str, pd.
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
     written += [
         tables.write_csv(rows, folder / "outcomes.csv"),
+        tables.write_parquet(rows, folder / "outcomes.parquet"),
         tables.write_csv(whole, folder / "summary.csv"),
         tables.write_csv(compared, folder / "comparisons.csv"),
         tables.write_text("\n".join(latex), folder / "outcomes.tex"),
@@ -186,9 +199,7 @@ def _tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str, pd.
     return written, shown
 
 
-def _html(
-    sweep: Sweep, store: SweepStore, pictures: list[Path], shown: list[tuple[str, pd.DataFrame]]
-) -> str:
+def _html(sweep: Sweep, pictures: list[Path], shown: list[tuple[str, pd.DataFrame]]) -> str:
     """The page: what is missing, figures, tables, settings, provenance."""
     failed = bool((sweep.trials["status"] == TrialState.FAILED.value).any())
     sections = []
@@ -200,20 +211,20 @@ def _html(
         sections.append(Section("Tables", page.items([NO_TABLE])))
     settings = {
         f"{kind} {choice['label']}": choice
-        for spec in store.specs()
-        for kind, choice in spec.to_json().items()
+        for trial in sweep.facts
+        for kind, choice in trial.spec.to_json().items()
         if kind in ("task", "agent", "method")
     }
-    grid = store.grid_path.read_text(encoding="utf-8") if store.grid_path.exists() else ""
     sections.append(
         Section(
             "Settings",
-            page.verbatim(grid)
+            page.verbatim(sweep.grid)
             + page.verbatim("\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)),
         )
     )
-    sections.append(Section("Provenance", page.verbatim("\n".join(_provenance(store)))))
-    return page.page(sweep.name, _count(sweep), sections)
+    sections.append(Section("Provenance", page.verbatim("\n".join(_provenance(sweep)))))
+    goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
+    return page.page(sweep.name, _count(sweep), sections, reload_seconds=RELOAD_SECONDS if goes_on else None)
 
 
 def _caption(path: Path) -> str:
@@ -221,8 +232,7 @@ def _caption(path: Path) -> str:
     return " ".join([CAPTIONS[kind], *(["for", of.replace("_", ", ")] if of else [])])
 
 
-def _provenance(store: SweepStore) -> list[str]:
+def _provenance(sweep: Sweep) -> list[str]:
     """Every different origin of the trials, and how many have it."""
-    paths = [trial.provenance_path for trial in store.trials() if trial.provenance_path.exists()]
-    origins = Counter(path.read_text(encoding="utf-8") for path in paths)
+    origins = Counter(trial.provenance for trial in sweep.facts if trial.provenance)
     return [f"{count} trials:\n{text}" for text, count in sorted(origins.items())]

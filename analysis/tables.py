@@ -143,6 +143,13 @@ def write_csv(frame: pd.DataFrame, path: Path) -> Path:
     return path
 
 
+def write_parquet(frame: pd.DataFrame, path: Path) -> Path:
+    """A frame with its types, for programs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame.to_parquet(path, index=False)
+    return path
+
+
 def write_text(text: str, path: Path) -> Path:
     """A text file that ends with a line feed."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,8 @@
 Metrics are drawn against environment steps and sorted into the UI's chart sections by their first word:
 
     train/return, train/cost_0            means over the episodes of an update, training phase
-    deploy/return, deploy/cost_0          the same, deployment phase
+    train/episodes                        how many those are
+    deploy/return, deploy/cost_0, ...     the same, deployment phase
     curriculum/limit_0, curriculum/noise  what the teacher set
     student/<name>                        what the student reported: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
@@ -128,7 +129,11 @@ def thinned(rows: Iterable[tuple[int, Row]], num_updates: int) -> Iterator[tuple
 def points(row: Row, spec: TrialSpec) -> list[Point]:
     """The points of one row of ``updates.csv``."""
     section = "train" if row["phase"] == Phase.TRAINING else "deploy"
-    values = {f"{section}/return": float(row["episode_return"]), "curriculum/noise": float(row["noise"])}
+    values = {
+        f"{section}/return": float(row["episode_return"]),
+        f"{section}/episodes": float(row["episodes"]),
+        "curriculum/noise": float(row["noise"]),
+    }
     cpu_seconds = float(row["collect_seconds"]) + float(row["update_seconds"])
     if cpu_seconds > 0.0:
         values["perf/steps_per_second"] = spec.steps_per_update / cpu_seconds

@@ -3,10 +3,12 @@
 import dataclasses
 import math
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from recrl.analysis import cumulative, frames
+from recrl.analysis.bound_figure import cumulative_bounds
 from recrl.analysis.frames import Sweep
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli import main
@@ -51,7 +53,10 @@ def test_measured_cost_lies_under_the_bound_on_river_grid(river_grid: SweepStore
         20.0 + sum(min(20.0, d + excess) for d, excess in zip(updates["limit_0"][:9], excesses, strict=True))
     )
     assert row["discounted_excess_sum"] == pytest.approx(
-        sum(math.sqrt(2 * kl) * 0.9 * 10.0 / 0.1**2 for kl in updates["kl"][:9])
+        sum(
+            math.sqrt(2 * kl) * 0.9 * min(eps, 10.0) / 0.1**2
+            for kl, eps in zip(updates["kl"][:9], updates["cost_advantage_max_0"][:9], strict=True)
+        )
     )
 
 
@@ -109,3 +114,46 @@ def test_the_command_says_it(river_grid: SweepStore, capsys: pytest.CaptureFixtu
     out = capsys.readouterr().out
     assert "rivergrid-1a" in out
     assert "The largest d_t within 1000 of cost above d_d over all episodes:" in out
+
+
+def with_discount(sweep: Sweep, discount: float) -> Sweep:
+    """The sweep of students with this discount."""
+    cpo = Choice("cpo", {"discount": discount})
+    facts = [dataclasses.replace(it, spec=dataclasses.replace(it.spec, agent=cpo)) for it in sweep.facts]
+    return dataclasses.replace(sweep, facts=tuple(facts))
+
+
+def test_measured_advantages_make_the_discounted_bound_tighter(finished: Sweep) -> None:
+    sweep = with_discount(three_policies(finished), 0.9)
+    updates = sweep.updates.assign(kl=[1e-8, 1e-8, 0.0], limit_0=[6.0, 5.0, 5.0])
+    (crude,) = cumulative.cumulative_costs(dataclasses.replace(sweep, updates=updates)).to_dict("records")
+    seen = updates.assign(cost_advantage_max_0=[0.5, 0.25, 0.0])
+    (own,) = cumulative.cumulative_costs(dataclasses.replace(sweep, updates=seen)).to_dict("records")
+    assert own["discounted_bound"] < crude["discounted_bound"] <= crude["ceiling_sum"]
+    assert own["bound"] == crude["bound"]
+    # the first policy 10, then 6 and 5 and what Lemma 1 adds
+    excess = math.sqrt(2e-8) * 0.9 * (0.5 + 0.25) / 0.1**2
+    assert own["discounted_excess_sum"] == pytest.approx(excess)
+    assert own["discounted_bound"] == pytest.approx(21.0 + excess)
+
+
+def test_without_horizon_the_first_policy_counts_with_its_cost(finished: Sweep) -> None:
+    updates = three_policies(finished).updates.assign(
+        cost_advantage_max_0=1.0, limit_0=[20.0, 10.0, 5.0], kl=0.0
+    )
+    policies = cumulative.policy_costs(updates, cost=0, sizes=None, discount=0.99)
+    assert policies["discounted_bound"].tolist() == [30.0, 20.0, 10.0]
+    assert policies[["bound", "ceiling"]].isna().all(axis=None)
+
+
+def test_the_figure_adds_up_what_the_table_sums(finished: Sweep) -> None:
+    rows = cumulative.cumulative_costs(finished)
+    figure = cumulative_bounds(finished, "cpo")
+    assert figure is not None
+    axes = figure.axes[1]  # linear on river-a
+    chosen = rows.query("task == 'river-a' and agent == 'cpo' and method == 'linear'")
+    ends = [np.asarray(line.get_ydata(), dtype=float)[-1] for line in axes.get_lines()]
+    assert ends[:3] == pytest.approx(chosen["cost_sum"].tolist())
+    assert ends[3] == pytest.approx(chosen["cost_sum"].mean())
+    assert ends[4] == pytest.approx(chosen["limit_sum"].mean())
+    assert ends[-1] == pytest.approx(chosen["ceiling_sum"].mean())

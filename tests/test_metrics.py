@@ -10,6 +10,7 @@ import pytest
 
 from recrl.analysis import frames, metrics
 from recrl.analysis.frames import Sweep
+from recrl.analysis.intervals import interquartile_mean, stratified_bootstrap
 from recrl.orchestrator.store import SweepStore
 
 
@@ -141,11 +142,11 @@ def test_limits_weigh_every_update_once() -> None:
 
 def test_a_curve_is_the_mean_and_standard_error_over_seeds() -> None:
     rows = curve_rows([(0, 10, 1, 1.0), (1, 10, 7, 2.0), (2, 10, 1, 6.0), (0, 20, 1, 5.0)])
-    curve = metrics.learning_curve(rows, "episode_return", np.array([0.0, 10.0, 20.0]))
+    curve = metrics.mean_curve(rows, "episode_return", np.array([0.0, 10.0, 20.0]))
     assert curve.steps.tolist() == [5.0, 15.0]
-    assert curve.mean.tolist() == [3.0, 5.0]
-    assert curve.standard_error[0] == pytest.approx(math.sqrt(7.0 / 3.0))
-    assert math.isnan(curve.standard_error[1])
+    assert curve.centre.tolist() == [3.0, 5.0]
+    assert curve.high[0] - curve.centre[0] == pytest.approx(math.sqrt(7.0 / 3.0))
+    assert math.isnan(curve.low[1])
     assert curve.runs.tolist() == [3, 1]
 
 
@@ -157,3 +158,32 @@ def test_curves_on_one_bin_equal_the_phase_means(finished: Sweep) -> None:
         key = {"task": "river-a", "agent": "cpo", "method": "linear", "seed": seed}
         row = only(finished.phases, **key, phase="deployment")
         assert runs[seed, 1] == pytest.approx(row["episode_return"], abs=1e-3)
+
+
+def test_an_interquartile_curve_is_robust_and_has_a_band() -> None:
+    rows = curve_rows(
+        [(seed, 10, 1, value) for seed, value in enumerate([-90.0, 1.0, 2.0, 6.0, 90.0])] + [(0, 20, 1, 5.0)]
+    )
+    edges = np.array([0.0, 10.0, 20.0, 30.0])
+    curve = metrics.interquartile_curve(rows, "episode_return", edges, np.random.default_rng(0))
+    assert curve.centre.tolist()[:2] == [3.0, 5.0]
+    assert curve.low[0] < 3.0 < curve.high[0]
+    assert np.isnan([curve.low[1], curve.high[1], curve.centre[2]]).all()
+    assert curve.runs.tolist() == [5, 1, 0]
+
+
+def test_a_band_is_the_bootstrap_interval_of_each_bin() -> None:
+    scores = np.random.default_rng(1).normal(size=12)
+    rows = curve_rows([(seed, 10, 1, value) for seed, value in enumerate(scores.tolist())])
+    curve = metrics.interquartile_curve(
+        rows, "episode_return", np.array([0.0, 10.0]), np.random.default_rng(0)
+    )
+    interval = stratified_bootstrap(scores[:, None], interquartile_mean, np.random.default_rng(2))
+    assert (curve.low[0], curve.high[0]) == pytest.approx((interval.low, interval.high), abs=0.1)
+
+
+def test_too_few_seeds_for_a_band_are_named() -> None:
+    averaging = metrics.interquartile(np.random.default_rng(0))
+    assert averaging.describe(10) == "interquartile mean and its 95% bootstrap band over seeds"
+    assert averaging.describe(5).endswith("; 5 seeds are too few for it: the band is too narrow")
+    assert metrics.MEAN.describe(2) == "mean ± standard error over seeds"

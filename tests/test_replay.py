@@ -3,9 +3,11 @@
 from dataclasses import replace as changed
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from recrl.analysis.replay import progress_reports, replay, replay_summary
+from recrl.analysis.replay_figure import Replayed, replayed_limits
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli import main
 from recrl.orchestrator.errors import RecrlError
@@ -89,9 +91,20 @@ def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest
     command = ["replay", "--root", str(root), "--teacher"]
     assert main([*command, "dynamic", "--option", "window=4"]) == ExitCode.OK
     assert "two-state ppo-lag dynamic seed 1" in capsys.readouterr().out
-    (written,) = (root / "sweep" / "replays").iterdir()
-    assert written.name == f"{trial.folder.name}__dynamic.csv"
+    written = {path.name for path in (root / "sweep" / "replays").iterdir()}
+    assert written == {f"{trial.folder.name}__dynamic.csv", "dynamic.pdf", "dynamic.png"}
     assert main([*command, "dynamik"]) == ExitCode.WRONG_INPUT
     assert "did you mean 'dynamic'?" in capsys.readouterr().err
     assert main([*command, "dynamic", "--option", "window=0"]) == ExitCode.WRONG_INPUT
     assert "recrl-sweep: teacher dynamic: window: " in capsys.readouterr().err
+
+
+def test_the_figure_shows_what_was_and_what_would_have_been(trial: TrialStore) -> None:
+    rows = replay(trial, Choice("none"))
+    figure = replayed_limits([Replayed(SPEC, rows)], "none")
+    (axes,) = figure.axes
+    limits = [line for line in axes.get_lines() if line.get_drawstyle() == "steps-pre"]
+    recorded, replayed = (np.asarray(line.get_ydata(), dtype=float) for line in limits)
+    known = rows["limit_0"].iloc[:37]
+    assert recorded.tolist() == pytest.approx(known.where(np.isfinite(known)).tolist(), nan_ok=True)
+    assert replayed.tolist() == [1.0] * 37

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from recrl.analysis import report
+from recrl.analysis import frames, report
 from recrl.analysis.report import NothingToDrawError
 from recrl.orchestrator.store import SweepStore
 
@@ -23,7 +23,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         unfinished=["river-a my cpo linear seed 0"],
         failed=["river-a my cpo linear seed 1"],
     )
-    written = report.draw(store, tmp_path / "first")
+    written = report.draw(frames.load(store), tmp_path / "first")
     assert [path.name for path in written] == [
         "report.html",
         "report.md",
@@ -33,6 +33,8 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "curricula.png",
         "diagnostics_river-a_my-cpo.pdf",
         "diagnostics_river-a_my-cpo.png",
+        "bounds_my-cpo.pdf",
+        "bounds_my-cpo.png",
         "return-against-cost.pdf",
         "return-against-cost.png",
         "performance-profiles.pdf",
@@ -40,6 +42,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "training.csv",
         "bounds.csv",
         "outcomes.csv",
+        "outcomes.parquet",
         "summary.csv",
         "comparisons.csv",
         "outcomes.tex",
@@ -50,7 +53,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
     )
     assert "- river-a my cpo linear seed 0: still running, 50% of its steps done" in text
-    again = report.draw(store, tmp_path / "second")
+    again = report.draw(frames.load(store), tmp_path / "second")
     assert [path.read_bytes() for path in written] == [path.read_bytes() for path in again]
 
 
@@ -60,7 +63,7 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
     store = made_up_sweep(
         seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 0"]
     )
-    names = [path.name for path in report.draw(store, tmp_path)]
+    names = [path.name for path in report.draw(frames.load(store), tmp_path)]
     assert "curricula.png" in names
     assert "outcomes.csv" not in names
     assert "No trial is complete yet: no table." in (tmp_path / "report.md").read_text()
@@ -69,9 +72,9 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "empty")
     with pytest.raises(NothingToDrawError) as caught:
-        report.draw(store, tmp_path / "figures")
+        report.draw(frames.load(store), tmp_path / "figures")
     assert str(caught.value) == (
-        f"{store.folder}: nothing to draw yet, because none of its 0 trials has committed a policy update"
+        "empty: nothing to draw yet, because none of its 0 trials has committed a policy update"
     )
     assert not (tmp_path / "figures").exists()
 
@@ -119,7 +122,7 @@ def test_the_page_holds_everything_and_fetches_nothing(
     trial.provenance_path.write_text('{"torch": "9.9"}')
     store.specs_path.write_text(json.dumps(trial.spec.to_json()) + "\n")
     store.grid_path.write_text("name: made-up  # <script>alert(1)</script>\n")
-    report.draw(store, tmp_path / "figures")
+    report.draw(frames.load(store), tmp_path / "figures")
     reader = Strict()
     reader.feed((tmp_path / "figures" / "report.html").read_text())
     assert reader.open == []

@@ -102,6 +102,7 @@ def test_points_are_sorted_into_chart_sections(made_up_sweep: Callable[..., Swee
     }
     assert {point.key: point.value for point in points(row, spec)} == {
         "train/return": -1.5,
+        "train/episodes": 3.0,
         "curriculum/noise": 0.0,
         "perf/steps_per_second": pytest.approx(400 / 0.4),
         "student/kl": 0.01,

@@ -27,7 +27,7 @@ from recrl.orchestrator.tracking_mirror import start_mirror
 STEPS_PER_UPDATE = 3200
 STUDENT_METRICS = (
     *("kl", "entropy", "clip_fraction", "policy_steps", "multiplier_0", "cost_gap_0", "surrogate_reward"),
-    *("surrogate_cost_0", "value_loss_reward", "value_loss_cost_0"),
+    *("surrogate_cost_0", "value_loss_reward", "value_loss_cost_0", "cost_advantage_max_0", "case"),
 )
 
 

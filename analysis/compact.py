@@ -1,0 +1,141 @@
+"""A finished sweep in one small file, from which all its figures and tables can be drawn again.
+
+A zip archive of plain text, so that any tool can open it:
+
+    sweep.json         name, notes, grid file, and the trials: spec, standing, provenance
+    phases.csv, ...    the other frames of ``recrl.analysis.frames`` but KEY: ``trial`` is the position of the
+                       trial in sweep.json
+
+Left out are single episodes (``phases`` has their sums), timing, and the students' metrics that no figure
+reads. What was measured at single updates, and the policies' tables, are rounded to DIGITS significant
+digits; outcomes (phases, evaluations) are exact. Equal sweeps give equal bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from recrl.analysis.frames import KEY, TRIAL, Sweep, TrialFacts, assemble, drawn_columns
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.store import write_atomically
+
+SUFFIX = ".zip"
+FORMAT = 1
+DIGITS = 6
+FRAMES = ("phases", "updates", "evaluations", "events", "policies")
+ROUNDED = ("updates", "policies")
+LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: zip knows none before
+
+
+def save(sweep: Sweep, path: Path) -> Path:
+    """Write the compact file of a sweep.
+
+    Args:
+        sweep: finished or not.
+        path: of the file; its folder is made if it is not there.
+    """
+    positions = {key: position for position, key in enumerate(_keys(sweep))}
+    members = {"sweep.json": json.dumps(_told(sweep), indent=1, allow_nan=False) + "\n"}
+    for name in FRAMES:
+        frame: pd.DataFrame = getattr(sweep, name)
+        kept = frame[drawn_columns(frame)] if name == "updates" else frame
+        of = [positions[key] for key in zip(*(frame[label] for label in KEY), strict=True)]
+        rows = kept.drop(columns=list(KEY))
+        rows.insert(0, TRIAL, of)
+        members[f"{name}.csv"] = (_rounded(rows) if name in ROUNDED else rows).to_csv(
+            index=False, lineterminator="\n"
+        )
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for name, text in members.items():
+            archive.writestr(zipfile.ZipInfo(name, LONG_AGO), text, zipfile.ZIP_LZMA)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, data.getvalue())
+    return path
+
+
+def load(path: Path) -> Sweep:
+    """Read a compact file back.
+
+    Raises:
+        RecrlError: the file is not there, or is none.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            told = json.loads(archive.read("sweep.json"))
+            rows = {name: pd.read_csv(io.BytesIO(archive.read(f"{name}.csv"))) for name in FRAMES}
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({error})") from error
+    if told.get("format") != FORMAT:
+        raise RecrlError(f"{path}: its format must be {FORMAT}, got {told.get('format')!r}")
+    return assemble(
+        told["name"],
+        [_facts(trial, told["provenance"]) for trial in told["trials"]],
+        **rows,
+        grid=told["grid"],
+        notes=told["notes"],
+    )
+
+
+def _keys(sweep: Sweep) -> list[tuple[Any, ...]]:
+    """KEY of every trial, in the order of ``Sweep.facts``; a method's label may carry its group."""
+    by_id = {
+        row[0]: tuple(row[1:]) for row in sweep.trials[["trial_id", *KEY]].itertuples(index=False, name=None)
+    }
+    return [by_id[it.spec.trial_id] for it in sweep.facts]
+
+
+def _told(sweep: Sweep) -> dict[str, Any]:
+    """Everything but the frames; equal provenances are there once."""
+    origins = list(Counter(it.provenance for it in sweep.facts))
+    return {
+        "format": FORMAT,
+        "name": sweep.name,
+        "notes": list(sweep.notes),
+        "grid": sweep.grid,
+        "provenance": origins,
+        "trials": [
+            {
+                "spec": it.spec.to_json(),
+                "status": it.status.value,
+                "error": it.error,
+                "env_steps": it.env_steps,
+                "cpu_seconds": it.cpu_seconds,
+                "start_limits": it.start_limits,
+                "provenance": origins.index(it.provenance),
+            }
+            for it in sweep.facts
+        ],
+    }
+
+
+def _facts(value: dict[str, Any], origins: list[str]) -> TrialFacts:
+    facts = TrialFacts(
+        **{**value, "spec": TrialSpec.from_json(value["spec"]), "provenance": origins[value["provenance"]]}
+    )
+    return replace(facts, status=TrialState(facts.status))
+
+
+def _rounded(rows: pd.DataFrame) -> pd.DataFrame:
+    """Floats with DIGITS significant digits, as the shortest text."""
+    floats = rows.select_dtypes("float").columns
+    return rows.assign(**{name: _significant(rows[name].to_numpy(np.float64)) for name in floats})
+
+
+def _significant(values: np.ndarray) -> np.ndarray:
+    """Each value at DIGITS significant digits.
+
+    >>> _significant(np.array([0.0012345678, -98765.4321, 0.0, np.inf, np.nan]))
+    array([ 1.23457e-03, -9.87654e+04,  0.00000e+00,          inf,          nan])
+    """
+    return np.array([float(f"{value:.{DIGITS}g}") for value in values.tolist()])

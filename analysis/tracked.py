@@ -1,0 +1,155 @@
+"""A sweep's frames from MLflow alone, for whoever has a tracking address and no files.
+
+What MLflow holds is equal to what the files say, with these exceptions:
+
+    trials       those that have begun; of a grid that was cut down, the others too
+    updates      about ``tracking_points.POINTS_PER_METRIC`` of a trial's updates (noise: the largest since
+                 the one before); of the students' metrics only those that figures and tables read
+                 (``frames.DRAWN_METRICS``); no ``collect_seconds`` and ``update_seconds``
+    phases, evaluations, events, policies    of complete trials only
+
+An infinite limit and the mean of no episodes have no point in MLflow: they are put back where an update is
+shown but the value is not.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from recrl.analysis.frames import DRAWN_METRICS, EVENT_COLUMNS, TRIAL, Sweep, TrialFacts, assemble, joined
+from recrl.environments.cmdp import Phase
+from recrl.orchestrator.tracking_reader import History, TrackedSweep, TrackedTrial, find_sweep
+
+SHOWN_WITH_EVERY_UPDATE = "curriculum/noise"
+SECTIONS = {Phase.TRAINING: "train", Phase.DEPLOYMENT: "deploy"}
+
+
+def load(uri: str, name: str | None = None) -> Sweep:
+    """Read a sweep from an MLflow server or database.
+
+    Args:
+        uri: http(s)://host:port, sqlite:///file.db or another database's address.
+        name: of the sweep; may be left out where MLflow shows only one.
+
+    Raises:
+        TrackingError: MLflow cannot be reached, or shows no such sweep.
+    """
+    tracked = find_sweep(uri, name)
+    complete = [bool(trial.phases) for trial in tracked.trials]
+    provenance = tracked.files("provenance.json")
+
+    def rows(file: str, read: Callable[[bytes], pd.DataFrame]) -> pd.DataFrame:
+        found = tracked.files(file) if any(complete) else [None] * len(complete)
+        return joined([pd.DataFrame() if data is None else read(data) for data in found])
+
+    notes = ["Read from MLflow, which holds only some of the updates of a long trial."]
+    if tracked.untold:
+        notes.append(
+            f"{tracked.untold} trials: sent to MLflow by an older version, left out; "
+            f"recrl-sweep sync --rebuild sends them again"
+        )
+    grid = tracked.own_file("grid.yaml")
+    return assemble(
+        tracked.name,
+        [_facts(trial, data) for trial, data in zip(tracked.trials, provenance, strict=True)],
+        phases=joined([pd.DataFrame(trial.phases) for trial in tracked.trials]),
+        updates=_updates(tracked),
+        evaluations=rows("evaluation.csv", lambda data: pd.read_csv(io.BytesIO(data))),
+        events=rows("events.jsonl", _events),
+        policies=rows("policy.csv", _policy),
+        grid=grid.decode() if grid else "",
+        notes=notes,
+    )
+
+
+def _facts(trial: TrackedTrial, provenance: bytes | None) -> TrialFacts:
+    progress = trial.progress
+    return TrialFacts(
+        spec=trial.spec,
+        status=trial.status,
+        error=trial.error,
+        env_steps=int(progress.get("env_steps", 0)),
+        cpu_seconds=float(progress.get("cpu_seconds", 0.0)),
+        start_limits=progress.get("start_limits"),
+        provenance=provenance.decode() if provenance else "",
+    )
+
+
+def _updates(tracked: TrackedSweep) -> pd.DataFrame:
+    """The shown updates of all trials at once: a row for every point that each update has."""
+    shown = tracked.history(SHOWN_WITH_EVERY_UPDATE, with_time=True)
+    assert shown.milliseconds is not None
+    specs = [trial.spec for trial in tracked.trials]
+    sizes = np.array([spec.steps_per_update for spec in specs], dtype=np.int64)
+    budgets = np.array([spec.train_steps for spec in specs], dtype=np.int64)
+    trained = shown.steps - sizes[shown.trials] < budgets[shown.trials]
+    cells = _Cells(shown)
+    names = set().union(*(trial.metrics for trial in tracked.trials))
+
+    def of_phases(name: str) -> npt.NDArray[np.float64]:
+        return cells.fill(
+            [tracked.history(f"{it}/{name}") for it in SECTIONS.values() if f"{it}/{name}" in names]
+        )
+
+    columns: dict[str, Any] = {
+        TRIAL: shown.trials,
+        "update": shown.steps // sizes[shown.trials],
+        "phase": np.where(trained, Phase.TRAINING.value, Phase.DEPLOYMENT.value),
+        "end_step": shown.steps,
+        "episodes": of_phases("episodes"),
+        "episode_return": of_phases("return"),
+        "noise": shown.values,
+        "time": shown.milliseconds / 1000.0,
+        "collect_seconds": math.nan,
+        "update_seconds": math.nan,
+    }
+    num_costs = max((len(spec.deploy_limits) for spec in specs), default=0)
+    numbers = np.array([len(spec.deploy_limits) for spec in specs], dtype=np.int64)[shown.trials]
+    for i in range(num_costs):
+        columns[f"cost_{i}"] = of_phases(f"cost_{i}")
+    for i in range(num_costs):
+        limits = cells.fill([tracked.history(f"curriculum/limit_{i}")])
+        columns[f"limit_{i}"] = np.where(np.isnan(limits) & (numbers > i), math.inf, limits)
+    for metric in sorted(names):
+        section, _, name = metric.partition("/")
+        if section == "student" and DRAWN_METRICS.fullmatch(name):
+            columns[name] = cells.fill([tracked.history(metric)])
+    return pd.DataFrame(columns)
+
+
+class _Cells:
+    """The (trial, step) pairs of the shown updates, to which points of other metrics are brought."""
+
+    def __init__(self, shown: History) -> None:
+        self._scale = int(shown.steps.max(initial=0)) + 1
+        self._known = self._numbered(shown)  # ascending, as a history is in order
+
+    def fill(self, histories: list[History]) -> npt.NDArray[np.float64]:
+        """The points' values, one for every shown update, NaN where there is none."""
+        values = np.full(len(self._known), math.nan)
+        for history in histories:
+            wanted = self._numbered(history)
+            at = np.searchsorted(self._known, wanted)
+            found = (at < len(self._known)) & (wanted == self._known[np.minimum(at, len(self._known) - 1)])
+            values[at[found]] = history.values[found]
+        return values
+
+    def _numbered(self, history: History) -> npt.NDArray[np.int64]:
+        return history.trials * self._scale + np.minimum(history.steps, self._scale - 1)
+
+
+def _events(data: bytes) -> pd.DataFrame:
+    lines = [json.loads(line) for line in data.splitlines()]
+    return pd.DataFrame([{name: event.get(name) for name in EVENT_COLUMNS} for event in lines])
+
+
+def _policy(data: bytes) -> pd.DataFrame:
+    return pd.read_csv(io.BytesIO(data)).rename_axis("state").reset_index()

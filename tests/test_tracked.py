@@ -1,0 +1,172 @@
+"""MLflow alone gives the frames that the files give, as far as it holds them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from recrl.analysis import compact, frames, tracked
+from recrl.analysis.frames import KEY, Sweep
+from recrl.orchestrator.cli import main
+from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.store import SweepStore, write_json
+from recrl.orchestrator.tracking import sync, tracking_uri
+from recrl.orchestrator.tracking_reader import find_sweep
+from recrl.orchestrator.tracking_ui import UI, open_ui
+
+# MLflow 3.17 maps its tables in a way that SQLAlchemy 2.1 calls deprecated; not ours to mend.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")
+
+NOT_IN_MLFLOW = ["collect_seconds", "update_seconds"]
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory, finished_sweep: SweepStore) -> SweepStore:
+    """Part of a finished sweep, with policies and a grid, and told to MLflow."""
+    root = tmp_path_factory.mktemp("runs")
+    store = SweepStore(root, finished_sweep.name)
+    for trial in finished_sweep.trials():
+        if trial.spec.task.label == "river-a" and trial.spec.method.label != "linear":
+            shutil.copytree(trial.folder, store.trial(trial.spec).folder)
+    trial = store.trials()[0]
+    trial.policy_path.write_text("action_0,action_1\n0.25,0.75\n1.0,0.0\n")
+    trial.provenance_path.write_text('{"torch": "9.9"}')
+    store.grid_path.write_text("name: made-up\n")
+    store.info_path.write_text("{}")
+    assert sync(store, tracking_uri(store, None)).problem == ""
+    return store
+
+
+@pytest.fixture(scope="module")
+def from_files(sweep: SweepStore) -> Sweep:
+    return frames.load(sweep)
+
+
+@pytest.fixture(scope="module")
+def from_mlflow(sweep: SweepStore) -> Sweep:
+    return tracked.load(tracking_uri(sweep, None))
+
+
+@pytest.mark.parametrize("name", ["trials", "phases", "evaluations", "events", "policies"])
+def test_mlflow_holds_the_same_outcomes(from_mlflow: Sweep, from_files: Sweep, name: str) -> None:
+    found, expected = getattr(from_mlflow, name), getattr(from_files, name)
+    assert len(expected)
+    pd.testing.assert_frame_equal(found[expected.columns], expected, check_exact=True)
+
+
+def test_every_update_of_a_short_trial_is_there(from_mlflow: Sweep, from_files: Sweep) -> None:
+    expected = from_files.updates.drop(columns=NOT_IN_MLFLOW)
+    found = from_mlflow.updates[expected.columns].astype({"episodes": np.int64})
+    pd.testing.assert_frame_equal(found, expected, check_exact=True)
+
+
+def test_settings_and_provenance_are_there(from_mlflow: Sweep, from_files: Sweep) -> None:
+    assert from_mlflow.grid == "name: made-up\n"
+    assert sorted(it.provenance for it in from_mlflow.facts) == sorted(
+        it.provenance for it in from_files.facts
+    )
+    assert from_mlflow.task_options == from_files.task_options
+
+
+def test_an_infinite_limit_and_a_cost_of_no_episodes_come_back(
+    made_up_sweep: Callable[..., SweepStore], sweep: SweepStore
+) -> None:
+    store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["unconstrained"])
+    trial = store.trials()[0]
+    text = trial.updates_path.read_text().splitlines()
+    header = text[0].split(",")
+    cells = text[5].split(",")
+    for name in ("cost_0", "episode_return"):
+        cells[header.index(name)] = "nan"
+    text[5] = ",".join(cells)
+    length = trial.updates_path.write_text("\n".join(text) + "\n")
+    record = trial.record()
+    record.committed[trial.updates_path.name] = length
+    write_json(trial.state_path, asdict(record))
+    shutil.copy(sweep.mlflow_database, store.mlflow_database)
+    assert sync(store, tracking_uri(store, None), rebuild=True).problem == ""
+    updates = tracked.load(tracking_uri(store, None), store.name).updates
+    assert np.isinf(updates["limit_0"].iloc[:38]).all()
+    assert updates["limit_0"].iloc[38:].tolist() == [5.0, 5.0]
+    assert np.isnan(updates[["cost_0", "episode_return"]].iloc[4]).all()
+    assert updates["cost_0"].notna().sum() == 39
+
+
+def test_a_long_trial_is_thinned_but_true(
+    made_up_sweep: Callable[..., SweepStore], sweep: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.tracking_points.POINTS_PER_METRIC", 10)
+    store = made_up_sweep(seeds=2, tasks=["a"], agents=["cpo"], methods=["none"])
+    assert sync(store, tracking_uri(store, None)).problem == ""
+    found, whole = tracked.load(tracking_uri(store, None)).updates, frames.load(store).updates
+    assert found["update"].tolist() == [1, *range(4, 41, 4)] * 2
+    kept = whole.merge(found[["seed", "update"]])
+    for name in ("phase", "end_step", "episodes", "episode_return", "cost_0", "limit_0", "kl", "time"):
+        assert found[name].tolist() == kept[name].tolist()
+
+
+@pytest.fixture(scope="module")
+def server(sweep: SweepStore) -> Iterator[UI]:
+    ui = open_ui(sweep, tracking_uri(sweep, None), port=5713)
+    yield ui
+    ui.close()
+
+
+def test_a_server_says_what_its_database_says(server: UI, from_mlflow: Sweep) -> None:
+    found = tracked.load("http://127.0.0.1:5713", "made-up")
+    for name in ("trials", "phases", "updates", "evaluations", "events", "policies"):
+        pd.testing.assert_frame_equal(getattr(found, name), getattr(from_mlflow, name), check_exact=True)
+
+
+def test_what_an_older_version_sent_is_named(sweep: SweepStore, tmp_path: Path) -> None:
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415
+
+    database = tmp_path / "old.db"
+    shutil.copy(sweep.mlflow_database, database)
+    uri = f"sqlite:///{database}"
+    MlflowClient(uri).delete_tag(find_sweep(uri, None).trials[0].run_id, "recrl.spec")
+    assert (
+        "1 trials: sent to MLflow by an older version, left out; recrl-sweep sync --rebuild sends them again"
+        in (tracked.load(uri).notes)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [("other", "shows no sweep 'other'; it shows made-up"), ("mad'e", "shows no sweep")],
+)
+def test_a_sweep_that_mlflow_does_not_show_is_named(sweep: SweepStore, name: str, sentence: str) -> None:
+    with pytest.raises(TrackingError) as caught:
+        tracked.load(tracking_uri(sweep, None), name)
+    assert sentence in str(caught.value)
+
+
+def test_a_database_that_is_not_there_is_not_made(tmp_path: Path) -> None:
+    with pytest.raises(TrackingError, match="no such file"):
+        tracked.load(f"sqlite:///{tmp_path / 'none.db'}")
+    assert not (tmp_path / "none.db").exists()
+
+
+def test_commands_take_mlflow_or_a_compact_file_for_the_files(
+    sweep: SweepStore, from_files: Sweep, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    uri = tracking_uri(sweep, None)
+    file = tmp_path / "made-up.zip"
+    assert main(["export", "--tracking-uri", uri, "--to", str(file)]) == ExitCode.OK
+    assert "12 trials" in capsys.readouterr().out
+    assert len(compact.load(file).updates) == len(from_files.updates)
+    assert main(["figures", str(file), "--band", "iqm"]) == ExitCode.OK
+    assert (tmp_path / "figures" / "report.html").exists()
+    assert main(["bound", str(file)]) == ExitCode.OK
+
+
+def test_key_columns_have_one_type_from_every_source(from_mlflow: Sweep, from_files: Sweep) -> None:
+    for name in KEY:
+        assert from_mlflow.updates[name].dtype == from_files.updates[name].dtype
