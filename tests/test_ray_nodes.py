@@ -112,7 +112,7 @@ def test_custom_resources_come_from_the_grid() -> None:
         ("[big]", 'must be a mapping of names to amounts, got ["big"]'),
         ("{CPU: 2}", "must not name CPU; see cpus_per_trial and gpus_per_trial"),
         ("{big: 0}", "must be amounts above 0 and at most 1e6, got 0 of big"),
-        ("{'a b': 1}", 'must have names of letters, digits and _ . : - only, got "a b"'),
+        ("{'a b': 1}", "must have names of letters, digits and _ . : - only, got 'a b'"),
     ],
 )
 def test_wrong_custom_resources_are_a_sentence(custom: str, sentence: str) -> None:
