@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import ray
 from ray.exceptions import RayError
@@ -27,8 +28,9 @@ def trials_that_fit(wanted: Mapping[str, float]) -> int:
         wanted: what one trial takes, by Ray's names of resources; at least 0 each.
     """
     asked = {name: amount for name, amount in wanted.items() if amount > 0.0}
-    nodes = (node["Resources"] for node in ray.nodes() if node["Alive"])
-    return sum(int(min(node.get(name, 0.0) / asked[name] for name in asked) + 1e-9) for node in nodes)
+    return sum(
+        int(min(node["Resources"].get(name, 0.0) / asked[name] for name in asked) + 1e-9) for node in _nodes()
+    )
 
 
 def check_nodes(probe: Path) -> None:
@@ -43,10 +45,10 @@ def check_nodes(probe: Path) -> None:
     look = _look()
     task = ray.remote(look)
     asked = {}
-    for node in ray.nodes():
-        if node["Alive"] and node["Resources"].get("CPU", 0.0) > 0.0:
-            there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-            answer = task.options(num_cpus=0, scheduling_strategy=there).remote(DISTRIBUTIONS, str(probe))
+    for node in _nodes():
+        if node["Resources"].get("CPU", 0.0) > 0.0:
+            only = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            answer = task.options(num_cpus=0, scheduling_strategy=only).remote(DISTRIBUTIONS, str(probe))
             asked[answer] = node["NodeManagerAddress"]
     if not asked:
         return
@@ -58,7 +60,8 @@ def check_nodes(probe: Path) -> None:
             problems.append(f"{address} has not answered for {ANSWER_SECONDS:g} seconds")
             continue
         try:
-            problems += differences(address, here, ray.get(answer), probe.parent)
+            there = ray.get(answer)
+            problems += differences(address, here, there, probe.parent)
         except RayError as error:
             problems.append(f"{address} cannot run anything: {next(iter(str(error).splitlines()), '')}")
     if problems:
@@ -86,6 +89,12 @@ def differences(address: str, here: Mapping[str, str], there: Mapping[str, str],
     if not there.get(SIGHT):
         found.append(f"{address} does not see {folder}, which must be on a file system that all nodes share")
     return found
+
+
+def _nodes() -> list[dict[str, Any]]:
+    """The nodes that are there, as Ray describes them."""
+    described: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
+    return [node for node in described if node["Alive"]]
 
 
 def _look() -> Callable[[tuple[str, ...], str], dict[str, str]]:

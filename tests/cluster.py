@@ -157,7 +157,7 @@ class Container:
         seen[sys.base_prefix] = Path(sys.base_prefix)
         for target, source in seen.items():
             if target == "/usr" or not target.startswith("/usr/"):
-                yield f"mkdir -p {root}{target} && mount -o bind,ro {source} {root}{target}"
+                yield f"mkdir -p {root}{target} && mount -o rbind,ro {source} {root}{target}"
         yield f"mount -t tmpfs -o mode=755 tmpfs {root}/usr/local/bin"
         yield f"install -m 755 {ROOT}/docker/recrl-node {root}/usr/local/bin/"
         for name, text in (("hosts", self._hosts()), ("passwd", "recrl:x:10001:10001::/tmp:/bin/sh\n")):
@@ -260,7 +260,7 @@ class Cluster:
         )
         subprocess.run([self.folder / "docker/prepare"], check=True, stdout=subprocess.DEVNULL)
         settings = dict(line.split("=") for line in (self.folder / "docker/.env").read_text().splitlines())
-        text = interpolated((self.folder / "docker/compose.yaml").read_text(), settings | self.variables)
+        text = interpolated((self.folder / "docker/compose.yaml").read_text(), {**settings, **self.variables})
         self.compose = yaml.safe_load(text)
         self.environment = image_environment((ROOT / "docker/Dockerfile").read_text())
 
@@ -603,6 +603,8 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=300_000, help="of a trial")
     parser.add_argument("--log", type=Path, default=Path(os.devnull), help="write what happened there too")
     given = parser.parse_args()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)  # also in the background
     reason = reason_not_to_run()
     if reason:
         print(f"skipped: {reason}")
