@@ -1,26 +1,31 @@
-"""Frozen-policy evaluation: what a policy earns and costs when it no longer learns.
+"""Frozen-policy evaluation: what a policy earns and costs when it no longer learns, and how it looks.
 
 Episodes are counted per environment, not in the order in which they end: taking the first that end would
 favour short ones, and on RiverGrid short means good.
 
-Letters: B environments, n observation components.
+Letters: B environments, k costs, n observation components.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
 
 from recrl.agents.agent import Agent
 from recrl.agents.collect import Collector, FinishedEpisode
+from recrl.agents.spaces import environment_actions
+from recrl.environments.cmdp import Floats
 from recrl.environments.vector import CMDPVectorEnv
 
 CHUNK_STEPS = 100
 MAX_STEPS = 10_000_000
+MAX_FILMED_STEPS = 10_000
 
 
 class FrozenPolicy(StrEnum):
@@ -66,9 +71,7 @@ def evaluate(
     Raises:
         RuntimeError: the episodes do not end.
     """
-    environment_seed, policy_seed = np.random.SeedSequence(
-        entropy=seed.entropy, spawn_key=seed.spawn_key
-    ).spawn(2)
+    environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
     collector = Collector(environments, num_steps=CHUNK_STEPS)
     collector.reset(seed=int(environment_seed.generate_state(1)[0]))
@@ -85,3 +88,80 @@ def evaluate(
             if len(done[episode.environment]) < shares[episode.environment]:
                 done[episode.environment].append(episode)
     return tuple(episode for episodes in done for episode in episodes)
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture of a filmed episode.
+
+    Attributes:
+        picture: RGB, uint8 [height, width, 3].
+        step: steps taken, from 0.
+        episode_return: undiscounted sum of the rewards so far.
+        costs: undiscounted sums of the costs so far, [k]; all 0 before the first step.
+    """
+
+    picture: npt.NDArray[np.uint8]
+    step: int
+    episode_return: float
+    costs: Floats
+
+
+def film(
+    agent: Agent,
+    environment: gymnasium.Env[Any, Any],
+    policy: FrozenPolicy,
+    *,
+    num_costs: int,
+    seed: np.random.SeedSequence,
+    every: int = 1,
+) -> Iterator[Shot]:
+    """Look at a frozen policy for an episode: before the first step, and as it goes on.
+
+    Args:
+        agent: whose policy acts; it is not changed.
+        environment: one that draws itself and reports ``info["cost"]``, as ``registry.make_drawn`` gives it.
+        policy: stochastic or deterministic.
+        num_costs: k.
+        seed: of the environment and of the policy's randomness.
+        every: steps from one shot to the next, at least 1; drawing may take longer than all else.
+
+    Yields:
+        Shots, that of the last step included; none after ``MAX_FILMED_STEPS`` steps, should the episode not
+        have ended.
+
+    Raises:
+        ValueError: what the environment draws is no picture.
+    """
+    environment_seed, policy_seed = _spawned(seed)
+    generator = np.random.default_rng(policy_seed)
+    actor = _Actor(agent, policy)
+    # Some simulators take signed seeds only.
+    observation, _ = environment.reset(seed=int(environment_seed.generate_state(1)[0] >> 1))
+    episode_return, costs = 0.0, np.zeros(num_costs)
+    yield Shot(_picture(environment), 0, episode_return, costs)
+    for step in range(1, MAX_FILMED_STEPS + 1):
+        flat = gymnasium.spaces.flatten(environment.observation_space, observation)
+        chosen = actor.act(np.asarray(flat, np.float32)[None], generator)
+        action = environment_actions(environment.action_space, chosen)[0]
+        observation, reward, terminated, truncated, info = environment.step(action)
+        episode_return += float(reward)
+        costs = costs + np.asarray(info["cost"], np.float64).reshape(-1)
+        if step % every == 0 or terminated or truncated:
+            yield Shot(_picture(environment), step, episode_return, costs)
+        if terminated or truncated:
+            return
+
+
+def _picture(environment: gymnasium.Env[Any, Any]) -> npt.NDArray[np.uint8]:
+    drawn: Any = environment.render()
+    if not (isinstance(drawn, np.ndarray) and drawn.dtype == np.uint8 and drawn.shape[2:] == (3,)):
+        kind = f"{drawn.dtype} {drawn.shape}" if isinstance(drawn, np.ndarray) else type(drawn).__name__
+        raise ValueError(f"a picture must be uint8 of shape [height, width, 3], got {kind}")
+    picture: npt.NDArray[np.uint8] = drawn
+    return picture
+
+
+def _spawned(seed: np.random.SeedSequence) -> list[np.random.SeedSequence]:
+    """Seeds of the environments and of the policy; the same however often they are asked for."""
+    return np.random.SeedSequence(entropy=seed.entropy, spawn_key=seed.spawn_key).spawn(2)

@@ -13,13 +13,20 @@ import functools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.plugins import load_attribute, resolve
 from recrl.environments.vector import CMDPVectorEnv
+
+if TYPE_CHECKING:
+    import gymnasium
+
+
+class NotDrawnError(ValueError):
+    """A task of which there are no pictures."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +38,8 @@ class Task:
         options: a frozen pydantic model of what can be set.
         make: callable (name, num_envs, options) -> CMDPVectorEnv.
         optimum: callable (name, options, limits) -> J*(d), or None where nobody knows it.
+        drawn: callable (name, options) -> one scalar Gymnasium environment of the task that draws itself
+            (``render_mode`` is ``rgb_array``) and reports ``info["cost"]``, or None.
         sample_options: options under which the contract suite runs it: whatever is required, and short
             episodes.
     """
@@ -39,6 +48,7 @@ class Task:
     options: str | type[BaseModel]
     make: str | Callable[[str, int, Any], CMDPVectorEnv]
     optimum: str | Callable[[str, Any, CostLimits], float] | None = None
+    drawn: str | Callable[[str, Any], gymnasium.Env[Any, Any]] | None = None
     sample_options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -75,6 +85,7 @@ TASKS: dict[str, Task] = {
         options="recrl.environments.river_grid:RiverGridOptions",
         make="recrl.environments.river_grid:make_river_grid",
         optimum="recrl.environments.river_grid:river_grid_optimum",
+        drawn="recrl.environments.river_minigrid:draw_river_grid",
         sample_options={"horizon": 20, "costs": ("river", "turns")},
     ),
     "rivergrid-1b": Task(
@@ -82,6 +93,7 @@ TASKS: dict[str, Task] = {
         options="recrl.environments.river_grid:RiverGridOptions",
         make="recrl.environments.river_grid:make_river_grid",
         optimum="recrl.environments.river_grid:river_grid_optimum",
+        drawn="recrl.environments.river_minigrid:draw_river_grid",
         sample_options={"horizon": 20},
     ),
     "rivergrid": Task(
@@ -89,12 +101,14 @@ TASKS: dict[str, Task] = {
         options="recrl.environments.river_grid:RiverGridMapOptions",
         make="recrl.environments.river_grid:make_river_grid",
         optimum="recrl.environments.river_grid:river_grid_optimum",
+        drawn="recrl.environments.river_minigrid:draw_river_grid",
         sample_options={"horizon": 20, "generate": {"seed": 3}},
     ),
     "gymnasium": Task(
         summary="Any environment that is registered with Gymnasium, by its id.",
         options="recrl.environments.vectorize:GymnasiumOptions",
         make="recrl.environments.vectorize:make_gymnasium",
+        drawn="recrl.environments.vectorize:draw_gymnasium",
         sample_options={"id": "CartPole-v1", "costless": True},
     ),
     **{
@@ -102,6 +116,7 @@ TASKS: dict[str, Task] = {
             summary=f"Safety Gym: the {robot} {what}{OBSTACLES[level]}.",
             options="recrl.environments.safety_gym:SafetyGymOptions",
             make="recrl.environments.safety_gym:make_safety_gym",
+            drawn="recrl.environments.safety_gym:draw_safety_gym",
             sample_options={"horizon": 12},
         )
         for robot in ("Car", "Point")
@@ -133,6 +148,7 @@ def find_task(name: str) -> Task:
         summary=f"The environment that {name} returns.",
         options=KeywordOptions,
         make=functools.partial(load_attribute("recrl.environments.vectorize:make_from_callable"), found),
+        drawn=functools.partial(load_attribute("recrl.environments.vectorize:draw_from_callable"), found),
     )
 
 
@@ -157,6 +173,19 @@ def make_vector(name: str, num_envs: int, *, options: Mapping[str, Any] | None =
     """
     task = find_task(name)
     environment: CMDPVectorEnv = _loaded(task.make)(name, num_envs, task_options(name, options or {}))
+    return environment
+
+
+def make_drawn(name: str, *, options: Mapping[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
+    """One environment of a task that draws itself: ``render()`` gives uint8 [height, width, 3].
+
+    Raises:
+        NotDrawnError: the task has no pictures.
+    """
+    task = find_task(name)
+    if task.drawn is None:
+        raise NotDrawnError(f"the task {name} has no pictures")
+    environment: gymnasium.Env[Any, Any] = _loaded(task.drawn)(name, task_options(name, options or {}))
     return environment
 
 

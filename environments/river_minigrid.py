@@ -31,6 +31,8 @@ from recrl.environments.river_grid import (
     HORIZON,
     STEP_REWARD,
     CostName,
+    RiverGridOptions,
+    task_map,
 )
 from recrl.environments.river_maps import GOAL, MAPS, RIVER, WALL, Cell, RiverMap, parse_map
 
@@ -117,6 +119,13 @@ class RiverGridEnv(MiniGridEnv):
             "turns": action != FORWARD,
         }
         return np.array([costs[name] for name in self.cost_names], np.float64)
+
+
+def draw_river_grid(name: str, options: RiverGridOptions) -> RiverGridEnv:
+    """A RiverGrid task that draws itself, for the registry of tasks."""
+    return RiverGridEnv(
+        str(task_map(name, options)), max_steps=options.horizon, costs=options.costs, render_mode="rgb_array"
+    )
 
 
 def _register() -> None:

@@ -316,6 +316,11 @@ def make_safety_gym(name: str, num_envs: int, options: SafetyGymOptions) -> Safe
     return SafetyGymVectorEnv(name, num_envs, **options.model_dump())
 
 
+def draw_safety_gym(name: str, options: SafetyGymOptions) -> SafetyGymEnv:
+    """A task that draws itself, by its name, for the registry of tasks."""
+    return SafetyGymEnv(name, render_mode="rgb_array", **options.model_dump())
+
+
 def register_safety_gym(tasks: Mapping[str, SafetyTask] = SAFETY_TASKS) -> None:
     """Make the tasks known to Gymnasium as ``recrl/<task>-v0``."""
     for name in tasks:

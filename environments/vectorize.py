@@ -247,6 +247,30 @@ def make_from_callable(
     return SyncCMDPVectorEnv(name, [functools.partial(factory, **options.model_dump())] * num_envs)
 
 
+def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
+    """An environment of a registered id that draws itself."""
+    keywords: dict[str, Any] = {**options.keywords, "render_mode": "rgb_array"}
+    environment: Environment = gymnasium.make(options.id, disable_env_checker=True, **keywords)
+    return _Costless(environment, len(options.cost_names or ("cost",))) if options.costless else environment
+
+
+def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:
+    """An environment of a user's callable that draws itself; the callable must take ``render_mode``."""
+    return factory(**{**options.model_dump(), "render_mode": "rgb_array"})
+
+
+class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment that reports a cost of 0 for each of ``num_costs``."""
+
+    def __init__(self, environment: Environment, num_costs: int) -> None:
+        super().__init__(environment)
+        self._num_costs = num_costs
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated, truncated, {**info, "cost": np.zeros(self._num_costs)}
+
+
 def _float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:
     flat = spaces.flatten_space(space)
     if not isinstance(flat, spaces.Box):

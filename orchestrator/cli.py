@@ -33,6 +33,7 @@ Going on:
                                           trials are kept, begun ones go on from their last checkpoint
   recrl-sweep stop demo                   from another terminal: trials save where they are, the launch ends
   recrl-sweep logs demo 3f2a --follow     a trial's log, by the beginning of its id or title
+  recrl-sweep evaluate demo 3f2a --video  run its policy again, and film an episode
   recrl-sweep launch grids/demo.yaml --retry-failed
   recrl-sweep launch grids/demo.yaml --only method=dynamic task=rivergrid-1b
 
@@ -117,10 +118,65 @@ def parser() -> argparse.ArgumentParser:
     logs.add_argument("--follow", action="store_true", help="wait for more as long as the trial runs")
     logs.add_argument("--folder", action="store_true", help="print the trial's folder instead")
 
-    _add_sweep(_command(commands, "figures", "draw the figures and tables of what is there so far"))
+    evaluate = _command(
+        commands, "evaluate", "run the frozen policies of trials for whole episodes; film them on demand"
+    )
+    _add_sweep(evaluate)
+    evaluate.add_argument(
+        "trial",
+        nargs="*",
+        metavar="TRIAL",
+        help="the beginning of its id, title or folder, or of several; by default all that have a checkpoint",
+    )
+    _add_only(evaluate)
+    evaluate.add_argument(
+        "--episodes",
+        type=_at_least_one,
+        metavar="N",
+        help="of each policy; by default as many as the trial itself evaluates at its end",
+    )
+    evaluate.add_argument(
+        "--seed",
+        type=_at_least_zero,
+        metavar="S",
+        help="of the episodes; by default that of the trial's own evaluation, which then comes out again",
+    )
+    evaluate.add_argument(
+        "--policy",
+        choices=("stochastic", "deterministic", "both"),
+        default="both",
+        help="act as in training, by the most likely action, or one after the other (default)",
+    )
+    evaluate.add_argument(
+        "--video",
+        choices=("gif", "mp4"),
+        nargs="?",
+        const="gif",
+        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; MLflow gets it",
+    )
+    _add_tracking(evaluate)
+
+    figures = _command(commands, "figures", "draw the figures, tables and report of what is there so far")
+    _add_source(figures)
+    figures.add_argument(
+        "--to", type=Path, metavar="FOLDER", help="where to; by default the sweep's figures folder"
+    )
+    figures.add_argument(
+        "--band",
+        choices=("mean", "iqm"),
+        default="mean",
+        help="of learning curves: mean and standard error (default), or interquartile mean and 95%% "
+        "bootstrap band",
+    )
+
+    export = _command(commands, "export", "write one small file that figures and tables can be drawn from")
+    _add_source(export)
+    export.add_argument(
+        "--to", type=Path, metavar="FILE.zip", help="by default the sweep's name, in this folder"
+    )
 
     bound = _command(commands, "bound", "what training cost beside its bounds; which d_t a budget allows")
-    _add_sweep(bound)
+    _add_source(bound)
     bound.add_argument(
         "--budget",
         type=float,
@@ -241,6 +297,17 @@ def _add_sweep(command: argparse.ArgumentParser) -> None:
     command.add_argument("sweep", nargs="?", metavar="SWEEP", help=SWEEP_HELP)
 
 
+def _add_source(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "sweep", nargs="?", metavar="SWEEP", help=f"{SWEEP_HELP}; or a file that export wrote (.zip)"
+    )
+    command.add_argument(
+        "--tracking-uri",
+        metavar="URI",
+        help="read MLflow alone, no files: a server (http://host:port) or database (sqlite:///file.db)",
+    )
+
+
 def _add_only(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--only",
@@ -287,6 +354,13 @@ def _at_least_one(text: str) -> int:
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
+    return number
+
+
+def _at_least_zero(text: str) -> int:
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"must be at least 0, got {number}")
     return number
 
 

@@ -28,6 +28,7 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid
 from recrl.orchestrator.plan import Plan, estimate, make_plan, select, trials_at_once
+from recrl.orchestrator.refresh import refreshing
 from recrl.orchestrator.spec import Choice
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
 from recrl.orchestrator.store import SweepStore, TrialStore
@@ -39,7 +40,7 @@ from recrl.orchestrator.sweep import (
     request_stop,
     stopping_on_signals,
 )
-from recrl.orchestrator.tracking import last_report, sync, tracking_uri
+from recrl.orchestrator.tracking import checked_uri, last_report, sync, tracking_uri
 from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_ui import open_ui
 from recrl.orchestrator.validation import nearest
@@ -48,8 +49,11 @@ from recrl.teachers.registry import teacher_config
 if TYPE_CHECKING:
     import pandas as pd
 
+    from recrl.analysis.frames import Sweep
+
 DEFAULT_ROOT = Path("runs")
 MIRROR_INTERVAL_SECONDS = 5.0
+DEFAULT_EPISODES = 100  # of an evaluation, for trials that make none themselves
 
 Command = Callable[[argparse.Namespace, Console], ExitCode]
 
@@ -92,11 +96,17 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
         if plan.to_do:
             chosen = [trial.spec for trial in plan.trials]
             shown.enter_context(display.live_progress(lambda: progress(chosen, store), console))
+            if arguments.figures:
+                shown.enter_context(refreshing(store))
 
     def finish(after: SweepProgress) -> None:
         shown.close()
         if arguments.figures and not stop.is_set() and after.counts[Standing.COMPLETE]:
-            _draw(store, console)
+            from recrl.analysis import frames  # noqa: PLC0415  (imports pandas)
+
+            _draw(frames.load(store), store.figures_folder, console)
+        if not stop.is_set():
+            _film(grid, after, store, stop, console)
 
     def say_stopping() -> None:
         _say(console, "Stopping: running trials save where they are. Once more to stop at once.")
@@ -171,22 +181,109 @@ def _trial(store: SweepStore, text: str) -> TrialStore:
     raise RecrlError(f"{store.name}: {len(found) or 'no'} {what}; {which}")
 
 
-def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
-    """Draw the figures and tables of what is on disk."""
-    _draw(_store(arguments), console)
+def run_evaluate(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Run the frozen policies of trials for whole episodes, and film them where that is asked for."""
+    import pandas as pd  # noqa: PLC0415
+
+    from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415  (imports gymnasium)
+    from recrl.orchestrator.frozen import FrozenTrial, NoCheckpointError, summary  # noqa: PLC0415  (torch)
+    from recrl.orchestrator.videos import VideoFormat  # noqa: PLC0415
+
+    store = _store(arguments)
+    policies = tuple(FrozenPolicy) if arguments.policy == "both" else (FrozenPolicy(arguments.policy),)
+    rows, written, videos = [], [], []
+    for trial in _chosen(store, arguments):
+        try:
+            frozen = FrozenTrial.thaw(trial)
+        except NoCheckpointError as error:
+            _say(console, f"left out: {error}")
+            continue
+        num_episodes = arguments.episodes or frozen.spec.evaluation_episodes or DEFAULT_EPISODES
+        episodes, path = frozen.evaluate(policies, num_episodes=num_episodes, seed=arguments.seed)
+        rows += summary(episodes, frozen)
+        written.append(path)
+        if arguments.video:
+            kind = VideoFormat(arguments.video)
+            videos += [frozen.film(policy, kind, seed=arguments.seed) for policy in policies]
+    if not rows:
+        raise RecrlError(f"{store.name}: none of the chosen trials has a checkpoint yet")
+    _show(pd.DataFrame(rows), console)
+    _say(console, "Means and standard errors; within: episodes in which no cost exceeded its d_d.")
+    for name, paths in (("Episodes", written), ("Videos", videos)):
+        for path in paths:
+            _say(console, f"{name:<10} {_short(path)}")
+    if videos:
+        _tell_mlflow(store, arguments, console)
     return ExitCode.OK
+
+
+def _chosen(store: SweepStore, arguments: argparse.Namespace) -> list[TrialStore]:
+    """The trials on disk whose name begins so, and that ``--only`` leaves."""
+    text = " ".join(arguments.trial)
+    found = store.find(text)
+    kept = {spec.folder_name for spec in select([trial.spec for trial in found], _only(arguments.only))}
+    if not kept:
+        begin = f" begin with {text!r}" if text else ""
+        raise RecrlError(f"{store.name}: no trials on disk{begin}; status names them")
+    return [trial for trial in found if trial.folder.name in kept]
+
+
+def _tell_mlflow(store: SweepStore, arguments: argparse.Namespace, console: Console) -> None:
+    """Bring MLflow up to the files, if it was ever told of the sweep."""
+    uri = tracking_uri(store, arguments.tracking_uri)
+    if last_report(store, uri) is None:
+        return
+    report = sync(store, uri)
+    if not report.is_up_to_date:
+        _say(
+            console, f"MLflow     is not up to date ({report.problem}); later: recrl-sweep sync {store.name}"
+        )
+
+
+def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Draw the figures and tables of what is on disk, in a compact file or in MLflow."""
+    sweep, folder = _source(arguments)
+    _draw(sweep, arguments.to or folder, console, band=arguments.band)
+    return ExitCode.OK
+
+
+def run_export(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Write the compact file of a sweep."""
+    from recrl.analysis import compact  # noqa: PLC0415  (imports pandas)
+
+    sweep, _ = _source(arguments)
+    path = compact.save(sweep, arguments.to or Path(f"{sweep.name}{compact.SUFFIX}"))
+    _say(console, f"{_short(path)}: {len(sweep.trials)} trials, {path.stat().st_size / 1000:,.0f} kB")
+    return ExitCode.OK
+
+
+def _source(arguments: argparse.Namespace) -> tuple[Sweep, Path]:
+    """The sweep that is meant, from its files, a compact file or MLflow; and a place for figures."""
+    from recrl.analysis import compact, frames, tracked  # noqa: PLC0415  (imports pandas and SciPy)
+
+    given: str | None = arguments.sweep
+    if arguments.tracking_uri:
+        name = read_grid(Path(given)).name if given and given.endswith((".yaml", ".yml")) else given
+        sweep = tracked.load(checked_uri(arguments.tracking_uri), name)
+        return sweep, Path(f"{sweep.name}-figures")
+    if given and given.endswith(compact.SUFFIX):
+        return compact.load(Path(given)), Path(given).with_name("figures")
+    store = _store(arguments)
+    return frames.load(store), store.figures_folder
 
 
 def run_bound(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Say what training cost beside its bounds, and which d_t a budget would have allowed."""
-    from recrl.analysis import cumulative, frames  # noqa: PLC0415  (imports pandas and SciPy)
+    from recrl.analysis import cumulative  # noqa: PLC0415  (imports pandas and SciPy)
 
-    sweep = frames.load(_store(arguments))
+    sweep, _ = _source(arguments)
     rows = cumulative.cumulative_costs(sweep, cost=arguments.cost - 1)
     if not len(rows):
         raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
     _show(cumulative.bound_table(rows), console)
-    _say(console, "Undiscounted, summed over policies, one expected episode each; means over runs.")
+    _say(
+        console, "Summed over policies, one expected episode each; means over runs; undiscounted but for one."
+    )
     if arguments.budget is not None:
         allowed = cumulative.admissible_limits(rows, sweep, budget=arguments.budget)
         _say(console, f"\nThe largest d_t within {arguments.budget:g} of cost above d_d over all episodes:")
@@ -198,24 +295,31 @@ def run_replay(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Say what limits another teacher would have set on the recorded episodes."""
     import pandas as pd  # noqa: PLC0415  (commands that do not need it are quick to start)
 
+    from recrl.analysis import styles  # noqa: PLC0415
     from recrl.analysis.replay import replay, replay_summary  # noqa: PLC0415
+    from recrl.analysis.replay_figure import Replayed, replayed_limits  # noqa: PLC0415
     from recrl.analysis.tables import write_csv  # noqa: PLC0415
 
     store = _store(arguments)
     specs = select(store.specs(), _only(arguments.only))
     method = _teacher(store, arguments)
-    written, summaries = [], []
+    called = re.sub("[^A-Za-z0-9.+-]+", "-", method.label)
+    folder, runs, summaries = store.folder / "replays", [], []
     for trial in (store.trial(spec) for spec in specs):
         if trial.record().update:
             rows = replay(trial, method)
-            name = f"{trial.folder.name}__{re.sub('[^A-Za-z0-9.+-]+', '-', method.label)}.csv"
-            written.append(write_csv(rows, store.folder / "replays" / name))
+            write_csv(rows, folder / f"{trial.folder.name}__{called}.csv")
+            runs.append(Replayed(trial.spec, rows))
             summaries.append(replay_summary(trial, rows))
-    if not written:
+    if not runs:
         raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials has a policy update yet")
     _say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
     _show(pd.concat(summaries), console)
-    _say(console, f"Every update  {_short(written[0].parent)}")
+    for i in range(max(len(run.spec.deploy_limits) for run in runs)):
+        figure = replayed_limits(runs, method.label, cost=i)
+        _, picture = styles.save(figure, folder, called if i == 0 else f"{called}_cost-{i + 1}")
+        _say(console, f"Figure        {_short(picture)}")
+    _say(console, f"Every update  {_short(folder)}")
     return ExitCode.OK
 
 
@@ -338,11 +442,34 @@ def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
     return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
 
 
-def _draw(store: SweepStore, console: Console) -> None:
-    from recrl.analysis.report import draw  # noqa: PLC0415  (imports matplotlib)
+def _draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean") -> None:
+    from recrl.analysis.report import averagings, draw  # noqa: PLC0415  (imports matplotlib)
 
-    draw(store, store.figures_folder)
-    _say(console, f"Figures    {_short(store.figures_folder)}")
+    draw(sweep, folder, averaging=averagings()[band])
+    _say(console, f"Figures    {_short(folder)}")
+
+
+def _film(
+    grid: GridSpec, after: SweepProgress, store: SweepStore, stop: threading.Event, console: Console
+) -> None:
+    """Film the complete trials that the grid wants filmed and that have no video yet."""
+    seeds = {"none": (), "first-seed": grid.seeds[:1], "all": grid.seeds}[grid.run.videos]
+    complete = [trial.spec for trial in after.standing(Standing.COMPLETE) if trial.spec.seed in seeds]
+    unseen = [store.trial(spec) for spec in complete if not any(store.trial(spec).videos_folder.glob("*"))]
+    if not unseen:
+        return
+    from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
+    from recrl.orchestrator.frozen import FrozenTrial  # noqa: PLC0415  (imports torch)
+    from recrl.orchestrator.videos import VideoFormat  # noqa: PLC0415
+
+    _say(console, f"Videos     {_short(store.trials_folder)}/*/{unseen[0].videos_folder.name}")
+    for trial in unseen:
+        if stop.is_set():
+            return
+        try:
+            FrozenTrial.thaw(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+        except RecrlError as error:  # a picture is no reason to call a finished sweep broken
+            _say(console, f"           no video: {error}")
 
 
 def _show(table: pd.DataFrame, console: Console) -> None:
@@ -430,7 +557,9 @@ COMMANDS: Mapping[str, Command] = {
     "status": run_status,
     "stop": run_stop,
     "logs": run_logs,
+    "evaluate": run_evaluate,
     "figures": run_figures,
+    "export": run_export,
     "bound": run_bound,
     "replay": run_replay,
     "ui": run_ui,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, model_validator
 
@@ -160,6 +160,10 @@ class Run(_Written):
     )
     evaluation_episodes: Whole = Field(
         default=100, ge=0, le=1_000_000, description="Episodes of each frozen-policy evaluation (ours)."
+    )
+    videos: Literal["none", "first-seed", "all"] = Field(
+        default="none",
+        description="Which complete trials a launch films, an episode each; no result depends on it.",
     )
 
 

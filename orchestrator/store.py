@@ -17,6 +17,8 @@
             events.jsonl        a line an event: noise added, limits measured, phase changed
             evaluation.csv      a row an episode of the frozen-policy evaluations: EVALUATION_COLUMNS
             policy.csv          of finite tasks: the final policy, a row a state, action_j for each action
+            evaluations/        what ``recrl-sweep evaluate`` measured afterwards; no part of the trial
+            videos/             episodes filmed by ``recrl-sweep evaluate --video``; no part of the trial
             checkpoints/        the newest two checkpoints
             provenance.json     versions, commit, machine
             log.txt, error.txt  the trial's log; the traceback of a failed trial
@@ -88,6 +90,12 @@ def write_atomically(path: Path, data: bytes) -> None:
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write strict JSON atomically."""
     write_atomically(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a CSV file atomically: at least one row, all with the same keys."""
+    lines = [_csv_line(rows[0]), *(_csv_line(row.values()) for row in rows)]
+    write_atomically(path, "".join(lines).encode())
 
 
 @dataclass(frozen=True)
@@ -296,6 +304,16 @@ class TrialStore:
     def policy_path(self) -> Path:
         """The final policy's table, where the task is finite."""
         return self.folder / "policy.csv"
+
+    @property
+    def evaluations_folder(self) -> Path:
+        """What ``recrl-sweep evaluate`` measured afterwards."""
+        return self.folder / "evaluations"
+
+    @property
+    def videos_folder(self) -> Path:
+        """Filmed episodes."""
+        return self.folder / "videos"
 
     @property
     def checkpoints_folder(self) -> Path:
@@ -593,8 +611,7 @@ class TrialWriter:
 
     def _write_csv(self, path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         with self._lease():
-            lines = [_csv_line(rows[0]), *(_csv_line(row.values()) for row in rows)]
-            write_atomically(path, "".join(lines).encode())
+            write_rows(path, rows)
 
     def _append_csv(self, path: Path, row: Mapping[str, Any]) -> None:
         if self._lengths[path.name] == 0 and not self._rows[path]:

@@ -13,6 +13,10 @@ child run for a trial. What a run shows is in ``tracking_points``. Run states ar
     complete                                                    FINISHED
     failed                                                      FAILED, with the tag ``recrl.error``
 
+Three tags hold JSON, so that MLflow alone is enough to draw the figures (``tracking_reader``):
+``recrl.spec``, the TrialSpec; ``recrl.progress``, where the trial stands; and of a complete trial
+``recrl.phases``, what its episodes come to (``phase_totals``).
+
 A run that goes on after an end is RUNNING again; its old end time stays until the next end, as MLflow's
 client has no way to clear it.
 
@@ -29,6 +33,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import math
 import os
 import time
 from collections import Counter
@@ -39,6 +44,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.phase_totals import phase_totals
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.status import Standing, standing_of
 from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
@@ -62,6 +68,9 @@ if TYPE_CHECKING:
 
 BATCH = 1_000  # metrics of a request; MLflow takes no more, and a row costs least in a full one
 MAX_ERROR = 5_000  # characters of a failed trial's error
+MAX_TAG = 8_000  # characters; MLflow cuts longer ones off, and half a JSON value is none
+SPEC_TAG, PROGRESS_TAG, PHASES_TAG = "recrl.spec", "recrl.progress", "recrl.phases"
+PROGRESS = ("update", "env_steps", "cpu_seconds", "start_limits")  # of the TrialRecord
 
 # Read by mlflow when it is imported. A lost server must cost seconds, not MLflow's own four minutes; the
 # mirror tries again by itself. A user's own settings stand.
@@ -114,8 +123,15 @@ def tracking_uri(store: SweepStore, given: str | None) -> str:
     Raises:
         TrackingError: MLflow has no such kind of store.
     """
-    if given is None:
-        return f"sqlite:///{store.mlflow_database}"
+    return f"sqlite:///{store.mlflow_database}" if given is None else checked_uri(given)
+
+
+def checked_uri(given: str) -> str:
+    """The address, made absolute, if MLflow takes it.
+
+    Raises:
+        TrackingError: MLflow has no such kind of store.
+    """
     scheme, separator, rest = given.partition("://")
     if scheme == "sqlite" and rest.startswith("/") and len(rest) > 1:
         return f"sqlite:///{Path(rest.removeprefix('/')).absolute()}"
@@ -203,7 +219,7 @@ class Position:
         run_id: the run that shows it.
         offset: the byte of ``updates.csv`` behind the last row sent.
         last_row: that row; if the file says otherwise, it was cut back and written anew.
-        shown: the status, attempt, committed bytes and error that the run shows.
+        shown: the status, attempt, committed bytes, error and later additions that the run shows.
         artifacts: name, size and time of the files sent.
         summary: the means a complete trial ended with.
     """
@@ -263,7 +279,14 @@ class _View:
         record = trial.record()
         status = run_status(record, live=live)
         committed = record.committed.get(trial.updates_path.name, 0)
-        shown = {"status": status, "attempt": record.attempt, "committed": committed, "error": record.error}
+        added = _added_afterwards(trial)
+        shown = {
+            "status": status,
+            "attempt": record.attempt,
+            "committed": committed,
+            "error": record.error,
+            "added": [_mark(path) for path in added],
+        }
         position = self._position(trial, record)
         if position.shown == shown:
             return 0
@@ -282,7 +305,9 @@ class _View:
         for start in range(0, len(metrics), BATCH):
             self.client.log_batch(position.run_id, metrics=metrics[start : start + BATCH])
         position = self._send_results(trial, record, position)
-        self._send_state(record, status, position)
+        for path in added:
+            position = self._send_files(position, [path], path.parent.name)
+        self._send_state(trial, record, status, position)
         self._save(trial, replace(position, shown=shown))
         return len(metrics)
 
@@ -379,6 +404,7 @@ class _View:
             **self._sweep_tags,
             "recrl.kind": "trial",
             "recrl.trial_id": spec.trial_id,
+            SPEC_TAG: _json_tag(spec.to_json()),
             "recrl.group": f"{spec.method.label}, {spec.agent.label}, {spec.task.label}",
             "mlflow.parentRunId": self.parent_run_id,
         }
@@ -412,7 +438,7 @@ class _View:
         write_json(self._position_path(trial), asdict(position))
         self._positions[trial.folder.name] = position
 
-    def _send_state(self, record: TrialRecord, status: str, position: Position) -> None:
+    def _send_state(self, trial: TrialStore, record: TrialRecord, status: str, position: Position) -> None:
         from mlflow.entities import RunTag  # noqa: PLC0415
 
         tags = {
@@ -420,7 +446,11 @@ class _View:
             "recrl.attempt": str(record.attempt),
             "recrl.host": record.host,
             "recrl.error": record.error[:MAX_ERROR],
+            PROGRESS_TAG: _json_tag({name: getattr(record, name) for name in PROGRESS}),
         }
+        if record.status is TrialState.COMPLETE:
+            totals = phase_totals(trial.episodes(), trial.spec.deploy_limits.values)
+            tags[PHASES_TAG] = _json_tag(totals)
         self.client.log_batch(position.run_id, tags=[RunTag(key, tags[key]) for key in tags if tags[key]])
         if position.shown.get("error") and not record.error:
             self.client.delete_tag(position.run_id, "recrl.error")
@@ -437,7 +467,7 @@ class _View:
         """Send the trial's small files, and at the end what it learnt."""
         paths = [trial.spec_path, trial.provenance_path]
         if record.status is TrialState.COMPLETE:
-            paths += [trial.evaluation_path, trial.events_path, *trial.checkpoints()[:1]]
+            paths += [trial.evaluation_path, trial.events_path, trial.policy_path, *trial.checkpoints()[:1]]
         if record.status is TrialState.FAILED:
             paths += [trial.error_path]
         return self._send_files(position, paths)
@@ -447,12 +477,23 @@ class _View:
         sent = list(position.artifacts)
         for path in paths:
             with suppress(FileNotFoundError):
-                stat = path.stat()
-                mark = f"{path.name} {stat.st_size} {stat.st_mtime_ns}"
-                if mark not in sent and stat.st_size and path.is_file():
+                mark = _mark(path)
+                if mark not in sent and path.stat().st_size and path.is_file():
                     self.client.log_artifact(position.run_id, str(path), folder)
                     sent.append(mark)
         return replace(position, artifacts=sent)
+
+
+def _added_afterwards(trial: TrialStore) -> list[Path]:
+    """What was measured and filmed of the trial's frozen policy, for artifacts in folders of these names."""
+    folders = (trial.evaluations_folder, trial.videos_folder)
+    return [path for folder in folders for path in sorted(folder.glob("update-*"))]
+
+
+def _mark(path: Path) -> str:
+    """What tells a file from what it was before."""
+    stat = path.stat()
+    return f"{path.name} {stat.st_size} {stat.st_mtime_ns}"
 
 
 def run_status(record: TrialRecord, *, live: bool) -> str:
@@ -576,6 +617,20 @@ def _head(path: Path, length: int) -> bytes:
 def is_server(uri: str) -> bool:
     """Whether the address is that of a running MLflow server."""
     return uri.startswith(("http://", "https://"))
+
+
+def _json_tag(value: Any) -> str:
+    """JSON without blanks; NaN is null; empty where MLflow would cut it off."""
+    text = json.dumps(_without_nan(value), separators=(",", ":"), allow_nan=False)
+    return text if len(text) <= MAX_TAG else ""
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(each) for each in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _milliseconds(seconds: float) -> int:

@@ -17,7 +17,8 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -44,6 +45,28 @@ HEARTBEAT_SECONDS = 2.0
 logger = logging.getLogger("recrl.trial")
 
 
+@dataclass(frozen=True)
+class TrialSeeds:
+    """The independent sources of a trial's randomness, all from its one seed.
+
+    Attributes:
+        environment: of the environments it learns in.
+        agent: of the student's initial parameters.
+        exploration: of the actions it takes while it learns.
+        evaluation: of the frozen policy's environments and actions.
+    """
+
+    environment: np.random.SeedSequence
+    agent: np.random.SeedSequence
+    exploration: np.random.SeedSequence
+    evaluation: np.random.SeedSequence
+
+    @classmethod
+    def of(cls, spec: TrialSpec) -> Self:
+        """The sources of a trial; the same seed gives the same under every task, student and method."""
+        return cls(*np.random.SeedSequence(spec.seed).spawn(4))
+
+
 class Trial:
     """A trial in memory, advanced one policy update at a time.
 
@@ -58,15 +81,16 @@ class Trial:
         self.spec = spec
         self._writer = writer
         self._teacher = teacher
-        environment, agent, exploration, self._evaluation_seed = np.random.SeedSequence(spec.seed).spawn(4)
-        self._generator = np.random.default_rng(exploration)
+        seeds = TrialSeeds.of(spec)
+        self._evaluation_seed = seeds.evaluation
+        self._generator = np.random.default_rng(seeds.exploration)
         self._environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
         self._cmdp = self._environments.cmdp
-        self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, agent)
+        self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, seeds.agent)
         self._collector = Collector(self._environments, num_steps=spec.rollout_steps)
         tree = writer.restore()
         if tree is None:
-            self._collector.reset(seed=int(environment.generate_state(1)[0]))
+            self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
             self._lesson, self._teacher_state = teacher.start()
             self.update = self.env_steps = self._episodes = 0
             logger.info("started: %s", spec.title)
@@ -128,25 +152,14 @@ class Trial:
         Environments and generators are fresh and seeded from the trial's seed: nothing of training is
         touched, and every method of a seed is evaluated on the same environment stream.
         """
-        spec, rows = self.spec, []
-        for policy in FrozenPolicy:
-            episodes = evaluate(
-                self._agent,
-                make_vector(spec.task.name, spec.num_envs, options=spec.task.options),
-                policy,
-                num_episodes=spec.evaluation_episodes,
-                seed=self._evaluation_seed,
-            )
-            rows += [
-                {
-                    "policy": policy,
-                    "index": index,
-                    "length": episode.length,
-                    "episode_return": episode.episode_return,
-                    **{f"cost_{i}": cost for i, cost in enumerate(episode.costs)},
-                }
-                for index, episode in enumerate(episodes)
-            ]
+        spec = self.spec
+        rows = evaluation_rows(
+            self._agent,
+            spec,
+            tuple(FrozenPolicy),
+            num_episodes=spec.evaluation_episodes,
+            seed=self._evaluation_seed,
+        )
         if rows:
             self._writer.write_evaluation(rows)
         if table := policy_table(self._agent, self._environments):
@@ -219,6 +232,40 @@ class Trial:
         self._environments.load_state_dict(tree["environments"])
         self._collector.load_state_dict(tree["collector"])
         self._generator.bit_generator.state = tree["generator"]
+
+
+def evaluation_rows(
+    agent: Agent,
+    spec: TrialSpec,
+    policies: Sequence[FrozenPolicy],
+    *,
+    num_episodes: int,
+    seed: np.random.SeedSequence,
+) -> list[dict[str, Any]]:
+    """Evaluate a frozen policy on fresh environments of a trial; a row of ``evaluation.csv`` an episode.
+
+    Args:
+        agent: whose policy acts; it is not changed.
+        spec: the trial.
+        policies: how it chooses; each is evaluated on the same environment stream.
+        num_episodes: of each, at least 0.
+        seed: of the environments and of the policy's randomness.
+    """
+    rows = []
+    for policy in policies:
+        environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
+        episodes = evaluate(agent, environments, policy, num_episodes=num_episodes, seed=seed)
+        rows += [
+            {
+                "policy": policy,
+                "index": index,
+                "length": episode.length,
+                "episode_return": episode.episode_return,
+                **{f"cost_{i}": cost for i, cost in enumerate(episode.costs)},
+            }
+            for index, episode in enumerate(episodes)
+        ]
+    return rows
 
 
 def policy_table(agent: Agent, environments: CMDPVectorEnv) -> list[dict[str, float]]:

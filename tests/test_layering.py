@@ -20,20 +20,24 @@ ALLOWED = {
     "analysis": (
         "recrl.environments",
         "recrl.orchestrator.errors",
+        "recrl.orchestrator.phase_totals",
         "recrl.orchestrator.spec",
         "recrl.orchestrator.store",
+        "recrl.orchestrator.tracking_reader",
         "recrl.teachers",
     ),
     "orchestrator": ("recrl.agents", "recrl.environments", "recrl.teachers"),
 }
 # Third-party modules that only some of our modules may import.
 ADAPTERS = {
+    "PIL": r"orchestrator\.videos",
+    "av": r"orchestrator\.videos",
     "torch": r"agents\..*|orchestrator\.(trial|ray_executor)",
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\..*",
     "mujoco": r"environments\..*",
     "ray": r"orchestrator\.(ray_executor|ray_nodes|teacher_service)",
-    "mlflow": r"orchestrator\.tracking",
+    "mlflow": r"orchestrator\.tracking(_reader)?",
     "matplotlib": r"analysis\..*",
     "yaml": r"orchestrator\.located_yaml",
     "rich": r"orchestrator\.(cli|commands|display)",
@@ -41,12 +45,12 @@ ADAPTERS = {
 }
 # The order inside the orchestrator: no module may import one that stands in a later line.
 LAYERS = (
-    ("errors", "exit_codes", "located_yaml", "own_package", "provenance", "scratch"),
+    ("errors", "exit_codes", "located_yaml", "own_package", "phase_totals", "provenance", "scratch"),
     ("spec", "checkpoint", "heartbeat"),
     ("store", "validation"),
-    ("grid_file", "status", "tracking_points", "plan", "trial"),
-    ("grid", "executors", "ray_nodes", "tracking", "teacher_service"),
-    ("sweep", "ray_executor", "tracking_mirror", "tracking_ui"),
+    ("grid_file", "status", "tracking_points", "plan", "trial", "videos"),
+    ("grid", "executors", "frozen", "ray_nodes", "tracking", "teacher_service"),
+    ("sweep", "ray_executor", "refresh", "tracking_mirror", "tracking_reader", "tracking_ui"),
     ("display",),
     ("commands",),
     ("cli",),
