@@ -15,10 +15,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from recrl.agents.registry import AGENTS
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialStore
 from recrl.orchestrator.trial import run_recorded
+from recrl.teachers.registry import TEACHERS
 
 SMALL = {"hidden_sizes": [16]}
 SPEC = TrialSpec(
@@ -75,18 +77,45 @@ def test_equal_seeds_give_equal_bytes(undisturbed: TrialStore, tmp_path: Path) -
     np.testing.assert_equal(final_tree(again), final_tree(undisturbed))
 
 
+def assert_pieces_make_the_whole(folder: Path, spec: TrialSpec, stops: tuple[int, ...]) -> None:
+    """That a trial stopped and resumed at ``stops`` leaves the bytes of one that never was."""
+    whole = run(folder / "whole", spec)
+    pieces = run(folder / "pieces", spec, stops=stops)
+    assert pieces.record().attempt == len(stops) + 1
+    assert whole.episodes_path.stat().st_size > 0
+    assert pieces.episodes_path.read_bytes() == whole.episodes_path.read_bytes()
+    assert pieces.events() == whole.events()
+    assert pieces.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
+    np.testing.assert_equal(final_tree(pieces), final_tree(whole))
+
+
 @pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
-@pytest.mark.parametrize("method", ["linear", "dynamic"])
+@pytest.mark.parametrize("method", TEACHERS)
 def test_interrupted_equals_uninterrupted(tmp_path: Path, agent: str, method: str) -> None:
     options = {"window": 8} if method == "dynamic" else {}
     spec = replace(SPEC, agent=Choice(agent, SMALL), method=Choice(method, options))
-    whole = run(tmp_path / "whole", spec)
-    pieces = run(tmp_path / "pieces", spec, stops=(1, 0, 7, 11))
-    assert pieces.record().attempt == 5
-    assert pieces.episodes_path.read_bytes() == whole.episodes_path.read_bytes()
-    assert pieces.events_path.read_bytes() == whole.events_path.read_bytes()
-    assert pieces.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
-    np.testing.assert_equal(final_tree(pieces), final_tree(whole))
+    assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 0, 7, 11))
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_every_student_interrupted_equals_itself_uninterrupted(tmp_path: Path, agent: str) -> None:
+    spec = replace(SPEC, agent=Choice(agent, SMALL))
+    assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 8))
+
+
+@pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
+@pytest.mark.parametrize("task", ["rivergrid-1b", "CarGoal2", "CarButton2", "CarPush2", "PointGoal1"])
+def test_physics_and_maps_interrupted_equal_themselves_uninterrupted(
+    tmp_path: Path, agent: str, task: str
+) -> None:
+    spec = replace(
+        SPEC,
+        task=Choice(task, {"horizon": 25}),
+        agent=Choice(agent, SMALL),
+        method=Choice("dynamic", {"window": 2, "start_updates": 1}),
+        train_steps=7 * 60,
+    )
+    assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 3, 0))
 
 
 def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path: Path) -> None:
