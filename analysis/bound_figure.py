@@ -7,6 +7,9 @@ proven bounds are far from what happens; each panel says how far.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -20,7 +23,7 @@ from recrl.analysis.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.environments.cmdp import Floats
 
 # Colour, dashes and name of every sum but the measured one.
-REFERENCES = {
+REFERENCES: dict[str, tuple[str, Literal["-"] | tuple[float, Sequence[float]], str]] = {
     "limit": (LIMIT_COLOUR, panels.DASHED, "limits in force"),
     "discounted_bound": ("#5b3a8c", (0.0, (1.2, 1.2)), "Proposition 1, discounted cost"),
     "bound": ("black", (0.0, (6.0, 1.5, 1.2, 1.5)), "bound, undiscounted cost"),
@@ -67,7 +70,8 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
             row[0].set_ylabel(f"{task}\ncumulative cost")
         for axes in grid[-1]:
             axes.set_xlabel("environment steps")
-        _legend(figure, agent)
+        drawn = {str(line.get_label()) for axes in grid.flat for line in axes.get_lines()}
+        _legend(figure, agent, drawn)
     return figure
 
 
@@ -79,12 +83,13 @@ def _panel(axes: Axes, series: list[pd.DataFrame], style: MethodStyle) -> None:
     for run in measured:
         axes.plot(steps, run, color=style.colour, linewidth=0.4, alpha=0.55)
     axes.plot(steps, measured.mean(axis=0), color=style.colour, linewidth=1.5, zorder=4.0)
-    for name, (colour, dashes, _) in REFERENCES.items():
+    for name, (colour, dashes, label) in REFERENCES.items():
         mean = _sums(series, name).mean(axis=0)
-        axes.plot(steps, mean, color=colour, linestyle=dashes, linewidth=0.9, zorder=3.0)
-    bound = _sums(series, "discounted_bound").mean(axis=0)[-1]
+        if np.isfinite(mean).any():
+            axes.plot(steps, mean, color=colour, linestyle=dashes, linewidth=0.9, label=label, zorder=3.0)
+    bound = _sums(series, "bound").mean(axis=0)[-1]
     if np.isfinite(bound):
-        note = f"bound {bound / measured.mean(axis=0)[-1]:.1f} times\nwhat it cost"
+        note = f"bound {bound / measured.mean(axis=0)[-1]:.3g} times\nwhat it cost"
         axes.text(0.97, 0.04, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.0)
     panels.step_axis(axes, 0.0, float(steps[-1]))
 
@@ -100,11 +105,13 @@ def _sums(series: list[pd.DataFrame], name: str) -> Floats:
     return np.array(rows)
 
 
-def _legend(figure: Figure, agent: str) -> None:
+def _legend(figure: Figure, agent: str, drawn: set[str]) -> None:
+    """What is drawn: students but CPO have no bounds, unknown tasks no ceiling."""
     handles = [Line2D([], [], color="0.2", linewidth=1.5, label="measured cost, undiscounted")]
     handles += [
         Line2D([], [], color=colour, linestyle=dashes, linewidth=0.9, label=name)
         for colour, dashes, name in REFERENCES.values()
+        if name in drawn
     ]
     title = f"{agent}: cost of the training phase, summed over its policies; every run thin, the mean thick"
     figure.legend(handles=handles, loc="outside upper center", ncols=3, title=title)

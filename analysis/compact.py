@@ -48,7 +48,7 @@ def save(sweep: Sweep, path: Path) -> Path:
     members = {"sweep.json": json.dumps(_told(sweep), indent=1, allow_nan=False) + "\n"}
     for name in FRAMES:
         frame: pd.DataFrame = getattr(sweep, name)
-        kept = frame[drawn_columns(frame)] if name == "updates" else frame
+        kept = frame[drawn_columns(map(str, frame))] if name == "updates" else frame
         of = [positions[key] for key in zip(*(frame[label] for label in KEY), strict=True)]
         rows = kept.drop(columns=list(KEY))
         rows.insert(0, TRIAL, of)

@@ -124,7 +124,7 @@ def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, disco
     largest = math.inf if sizes is None else sizes.largest_cost / (1.0 - discount)
     name = f"cost_advantage_max_{cost}"
     seen = updates[name].to_numpy(np.float64) if name in updates else np.full(len(updates), math.inf)
-    return np.fmin(seen, largest)
+    return np.asarray(np.fmin(seen, largest))
 
 
 def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:

@@ -73,9 +73,9 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) ->
 def curricula(sweep: Sweep) -> Figure:
     """The paper's Figure 5: the cost limits in force; a row a task and cost, a column a student.
 
-    Every run is a thin line, the mean over seeds a thick one. Infinite limits, which no axis reaches, are
-    drawn along the upper edge and marked with the sign of infinity, unless they only last as long as the
-    measuring of d_t.
+    Every run is a thin line, the mean over seeds a thick one; the student's own cost, a mean over seeds too,
+    is a faint line. Infinite limits, which no axis reaches, are drawn along the upper edge and marked with
+    the sign of infinity, unless they only last as long as the measuring of d_t.
 
     Args:
         sweep: with at least one update.
@@ -109,7 +109,7 @@ def curricula(sweep: Sweep) -> Figure:
             look,
             present,
             optimum=False,
-            title="cost limits in force: every run thin, their mean thick",
+            title="cost limits in force: every run thin, their mean thick; the student's own cost faint",
         )
     return figure
 
@@ -195,6 +195,8 @@ def _curriculum_panel(
             )
         if not len(chosen):
             continue
+        cost = mean_curve(chosen, f"cost_{i}", edges)
+        axes.plot(cost.steps, cost.centre, color=style.colour, linewidth=1.0, alpha=0.35, zorder=1.8)
         curve = mean_curve(chosen, f"limit_{i}", edges)
         panels.draw_curve(axes, curve, style, place=(position, len(look)), wider=0.3)
         last = float(chosen["end_step"].where(np.isinf(chosen[f"limit_{i}"])).max())

@@ -285,7 +285,7 @@ class _Keys:
         seeds: int64, [number of trials].
     """
 
-    labels: Mapping[str, pd.Categorical]
+    labels: Mapping[str, pd.Categorical[str]]
     seeds: npt.NDArray[np.int64]
 
     def put_before(self, rows: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:

@@ -50,7 +50,8 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
                     runs = chosen[(chosen["agent"] == agent) & (chosen["method"] == method)]
                     if len(runs):
                         scores = runs["episode_return"].to_numpy(np.float64)[:, None]
-                        axes.plot(thresholds, performance_profile(scores, thresholds), **style.line)
+                        shares = performance_profile(scores, thresholds)
+                        axes.plot(thresholds, shares, **style.line, zorder=3.0 + bool(style.dashes))
                 for optimum in sorted(set(chosen["optimal_return"].dropna())):
                     axes.axvline(optimum, color=OPTIMUM_COLOUR, linewidth=0.7, zorder=1.0)
                 axes.set_title(f"{task}, {agent}", loc="left", pad=3.0)

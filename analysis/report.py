@@ -206,7 +206,7 @@ def _html(sweep: Sweep, pictures: list[Path], shown: list[tuple[str, pd.DataFram
     if sentences := missing(sweep):
         sections.append(Section("To be known", page.items(sentences, failed=failed)))
     sections.append(Section("Figures", "\n".join(page.figure(path, _caption(path)) for path in pictures)))
-    sections += [Section(heading, page.table(table)) for heading, table in shown]
+    sections += [Section(heading.replace("`", ""), page.table(table)) for heading, table in shown]
     if not shown:
         sections.append(Section("Tables", page.items([NO_TABLE])))
     settings = {

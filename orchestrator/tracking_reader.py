@@ -126,7 +126,7 @@ class TrackedSweep:
         positions = {trial.run_id: position for position, trial in enumerate(self.trials)}
         trials = rows["run"].map(positions)
         shown = trials.notna().to_numpy()
-        of = trials[shown].to_numpy(np.int64)
+        of = np.asarray(trials[shown], dtype=np.int64)
         steps = rows["step"].to_numpy(np.int64)[shown]
         order = np.lexsort((steps, of))
         return History(
@@ -170,7 +170,8 @@ class TrackedSweep:
         store: Any = self._client._tracking_client.store  # it knows the credentials
         asked = [("run_ids", run) for run in runs]
         asked += [("metric_key", metric), ("max_results", str(POINTS_A_RUN))]
-        reply = http_request_safe(store.get_host_creds(), HISTORY, "GET", params=asked)
+        request: Any = http_request_safe  # not annotated
+        reply = request(store.get_host_creds(), HISTORY, "GET", params=asked)
         points: list[dict[str, Any]] = reply.json().get("metrics", [])
         return points
 
@@ -275,7 +276,7 @@ def _fetch(place: str, name: str, uri: str, folder: Path) -> bytes | None:
         get_artifact_repository,
     )
 
-    repository = get_artifact_repository(place, uri)
+    repository: Any = get_artifact_repository(place, uri)
     if name not in {file.path for file in repository.list_artifacts()}:
         return None
     folder.mkdir()

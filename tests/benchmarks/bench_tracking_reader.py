@@ -1,6 +1,6 @@
 """How long figures wait for MLflow: a large sweep from a sqlite store to frames.
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/bench_tracking_reader.py [--trials 1000] [--updates 300]
+    OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_tracking_reader [--trials 1000] [--updates 300]
 
 A store is made with as many runs and points as are asked for, with the columns of real trials and random
 numbers; rows are written to MLflow's tables directly, as MLflow itself would take half an hour. Then
@@ -21,11 +21,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from bench_tracking import STEPS_PER_UPDATE, STUDENT_METRICS, write_sweep
 
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.tracking import PROGRESS_TAG, SPEC_TAG, sync, tracking_uri
+from tests.benchmarks.bench_tracking import STEPS_PER_UPDATE, STUDENT_METRICS, write_sweep
 
 INSERT = "INSERT INTO {table} (key, value, timestamp, run_uuid, step, is_nan) VALUES (?, ?, ?, ?, ?, 0)"
 READ = """
