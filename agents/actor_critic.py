@@ -3,92 +3,46 @@
 A student is an ``ActorCritic`` with a *rule* that improves the policy; PPO-Lagrangian and CPO are rules. An
 update collapses the rollout, estimates advantages, lets the rule improve the policy, and fits the critics.
 
+A student lives on the device that was PyTorch's default one when it was made (``with torch.device("cuda")``):
+there it learns, with equal initial parameters on all. Rollouts come, and actions go, as NumPy arrays.
+
 Letters: T steps, B environments, N = T B samples, k costs, C = 1 + k signals, U distinct rows, M truncated
 steps, E finished episodes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
+from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from recrl.agents.advantages import generalised_advantages, next_values
 from recrl.agents.agent import Rollout
 from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.config import StudentConfig
+from recrl.agents.constraint_forms import MeanCost, TailCost
 from recrl.agents.distributions import mean_divergence
 from recrl.agents.errors import require_finite
+from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import INITIALISERS, Adam, Critics, NetworkForm
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.spaces import observation_size
+from recrl.agents.surrogates import surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
-@dataclass(frozen=True, eq=False)
-class Constraints:
-    """What is known about the constraints after a rollout.
-
-    Attributes:
-        limits: d, [k], possibly infinite.
-        gaps: mean undiscounted cost of the finished episodes minus limit, [k]; -inf where the limit is
-            infinite, NaN where no episode finished.
-        episode_length: mean steps of an episode, above 0: environment steps over finished episodes; NaN if
-            none finished.
-    """
-
-    limits: Floats
-    gaps: Floats
-    episode_length: float
-
-    @classmethod
-    def measure(
-        cls, rollout: Rollout, episode_costs: Floats, limits: Floats, horizon: int | None
-    ) -> Constraints:
-        """Compare the finished episodes, costs [E, k], with the limits, [k]."""
-        count = len(episode_costs)
-        if count == 0:
-            return cls(limits, np.full_like(limits, np.nan), float("nan"))
-        length = rollout.rewards.size / count
-        # A rollout that ends few of the episodes it carries on would make them look longer than they can be.
-        return cls(limits, episode_costs.mean(axis=0) - limits, min(length, horizon or length))
-
-    @property
-    def known(self) -> bool:
-        """Whether any episode finished."""
-        return not bool(np.isnan(self.episode_length))
-
-
-class PolicyRule(Protocol):
-    """How a student's policy gets better: what tells the algorithms apart."""
-
-    def improve(
-        self,
-        policy: StochasticPolicy,
-        batch: LearningBatch,
-        advantages: Floats,
-        constraints: Constraints,
-    ) -> dict[str, float]:
-        """Change the policy once.
-
-        Args:
-            policy: the one that collected the samples; changed in place.
-            batch: the collapsed samples.
-            advantages: raw estimates for the reward, then each cost, [N, 1 + k].
-            constraints: limits and gaps.
-
-        Returns:
-            Metrics, the same keys every time: ``policy_steps``, ``surrogate_reward``, ``surrogate_cost_i``,
-            ``multiplier_i``, and the rule's own.
-        """
-        ...
+class Stateful(Protocol):
+    """Something that is saved and restored with a student."""
 
     def state_dict(self) -> dict[str, Any]:
-        """What the rule has learnt and adapted."""
+        """All it has learnt and adapted: a tree of dicts, lists, JSON scalars and NumPy arrays."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -96,10 +50,57 @@ class PolicyRule(Protocol):
         ...
 
 
+class PolicyRule(Protocol):
+    """How a student's policy gets better: what tells the algorithms apart."""
+
+    @property
+    def parts(self) -> Mapping[str, Stateful]:
+        """What the rule keeps from one update to the next, by name."""
+        ...
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Change the policy once.
+
+        Args:
+            policy: the one that collected the samples; changed in place.
+            experience: the samples, raw advantages, and how the constraints stand.
+            generator: the student's own randomness.
+
+        Returns:
+            Metrics, the same keys every time: ``policy_steps``, ``multiplier_i``, and the rule's own.
+        """
+        ...
+
+
 def indexed(name: str, values: npt.NDArray[np.floating]) -> dict[str, float]:
     """One metric a cost, [k]: ``name_0``, ``name_1``, ...; infinite values are NaN, as metrics must be."""
     return {
         f"{name}_{i}": float(value) if np.isfinite(value) else float("nan") for i, value in enumerate(values)
+    }
+
+
+def improve_and_measure(
+    rule: PolicyRule, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+) -> dict[str, float]:
+    """Let a rule improve the policy; its metrics, and how far the policy has come.
+
+    Returns:
+        The rule's metrics; ``kl``, the mean KL from the old policy in nats; the mean ``entropy``; and
+        ``surrogate_reward`` and ``surrogate_cost_i``, the gains to first order in the advantages' unit.
+    """
+    metrics = rule.improve(policy, experience, generator)
+    batch, advantages = experience.batch, experience.advantages
+    new = policy.distribution(batch.rows)
+    centred = batch.per_decision(advantages - advantages.mean(axis=0))
+    gains = surrogate(experience.ratios(new), centred).numpy(force=True)
+    return {
+        **metrics,
+        "kl": float(mean_divergence(experience.old, new, batch.row_weights)),
+        "entropy": float(torch.dot(batch.row_weights, new.entropy())),
+        "surrogate_reward": float(gains[0]),
+        **indexed("surrogate_cost", gains[1:]),
     }
 
 
@@ -112,15 +113,18 @@ class ActorCritic:
         policy: of the task's spaces.
         critics: of the reward and the k costs.
         rule: improves the policy.
+        generator: of the minibatches.
     """
 
     def __init__(
         self,
         cmdp: CMDPSpec,
         config: StudentConfig,
+        *,
         policy: StochasticPolicy,
         critics: Critics,
         rule: PolicyRule,
+        generator: np.random.Generator,
     ) -> None:
         self._cmdp = cmdp
         self._config = config
@@ -128,6 +132,15 @@ class ActorCritic:
         self._critics = critics
         self._critic_optimiser = Adam(critics.parameters, config.critic_learning_rate)
         self._rule = rule
+        self._generator = generator
+        self._form = (
+            TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
+        )
+        self._parts: dict[str, Stateful] = {
+            "critic_optimiser": self._critic_optimiser,
+            "constraint": self._form,
+            **rule.parts,
+        }
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
@@ -147,31 +160,39 @@ class ActorCritic:
         Raises:
             DivergedError: a reward, a loss or a parameter is not finite.
         """
-        observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
-        actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
-        batch = LearningBatch.gather(observations, actions, compact=self._config.compaction)
-        advantages, targets = self._estimate(rollout, batch)
-        constraints = Constraints.measure(rollout, episode_costs, limits, self._cmdp.horizon)
-        old = self._policy.distribution(batch.rows)
-        metrics = self._rule.improve(self._policy, batch, advantages, constraints)
-        new = self._policy.distribution(batch.rows)
-        metrics["kl"] = float(mean_divergence(old, new, batch.row_weights))
-        metrics["entropy"] = float(torch.dot(batch.row_weights, new.entropy()))
-        metrics |= indexed("cost_gap", constraints.gaps)
-        metrics |= indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0))  # eps of Lemma 1
-        metrics |= self._fit_critics(batch, targets)
-        require_finite("policy parameters", self._policy.parameters.values.numpy())
-        require_finite("critic parameters", self._critics.parameters.values.numpy())
+        with self._on_its_device():
+            metrics = self._learn(rollout, episode_costs, limits)
+        self._policy.publish()
+        require_finite("policy parameters", self._policy.parameters.to_numpy())
+        require_finite("critic parameters", self._critics.parameters.to_numpy())
         return metrics
 
-    def _estimate(self, rollout: Rollout, batch: LearningBatch) -> tuple[Floats, Floats]:
-        """Advantages and value targets of all signals, both [N, C]."""
+    def _learn(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
         config = self._config
-        signals = np.concatenate([rollout.rewards[..., None], rollout.costs], axis=2)
+        observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
+        actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
+        batch = LearningBatch.gather(
+            observations, actions, compact=config.compaction, most_rows=config.minibatch_size
+        )
+        costs, values = self._form.judge(rollout, episode_costs, limits)
+        advantages, targets = self._estimate(rollout, costs, batch)
+        constraints = Constraints.measure(rollout, len(episode_costs), values, limits, self._cmdp.horizon)
+        experience = Experience.of(self._policy, batch, advantages, constraints)
+        return {
+            **improve_and_measure(self._rule, self._policy, experience, self._generator),
+            **indexed("cost_gap", constraints.gaps),
+            **indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0)),  # eps of Lemma 1
+            **self._fit_critics(batch, targets),
+        }
+
+    def _estimate(self, rollout: Rollout, costs: Floats, batch: LearningBatch) -> tuple[Floats, Floats]:
+        """Advantages and value targets of the reward and the costs [T, B, k], both [N, C]."""
+        config = self._config
+        signals = np.concatenate([rollout.rewards[..., None], costs], axis=2)
         require_finite("rewards and costs", signals)
         values = batch.per_sample(self._critics.values(batch.rows)).reshape(signals.shape)
         beyond = np.concatenate([rollout.final_observations, rollout.last_observations])
-        beyond_values = self._critics.values(torch.from_numpy(beyond))
+        beyond_values = self._critics.values(torch.as_tensor(beyond))
         num_final = len(rollout.final_observations)
         following = next_values(
             values,
@@ -200,51 +221,101 @@ class ActorCritic:
     def _fit_critics(self, batch: LearningBatch, targets: Floats) -> dict[str, float]:
         """Regress all critics on their targets, [N, C]; they share no parameter, so one loss serves all.
 
-        The mean squared error over samples is that about the mean target of each row, weighted by the
-        row's share of the samples, plus the targets' spread about those means, which no critic can lower.
+        They take ``critic_steps`` steps, or as many as ``critic_passes`` passes over the samples need,
+        whichever is more.
+
+        Returns:
+            The mean squared errors over the last pass, each sample's before the step that it was part of.
         """
-        sums = batch.per_row(targets)
-        shares = batch.row_weights.numpy().astype(np.float64)[:, None]
-        means = to_tensor((sums / shares).T.copy())
-        spread = np.mean(targets**2, axis=0) - np.sum(sums**2 / shares, axis=0)
-        errors = torch.zeros(len(means))
-        for _ in range(self._config.critic_steps):
-            errors = self._critics.differentiate(batch.rows, batch.row_weights, means)
+        config = self._config
+        num_parts = batch.num_parts(config.minibatch_size)
+        steps = max(config.critic_steps, config.critic_passes * num_parts)
+        regression_on = lru_cache(maxsize=1)(lambda part: row_targets(part, targets))
+        losses = []
+        for part in islice(batch.parts(config.minibatch_size, self._generator), steps):
+            means, spread = regression_on(part)
+            losses.append(self._critics.differentiate(part.rows, part.row_weights, means) + spread)
             self._critic_optimiser.step()
-        losses = errors.numpy() + np.maximum(spread, 0.0)
-        require_finite("value losses", losses)
-        return {"value_loss_reward": float(losses[0])} | indexed("value_loss_cost", losses[1:])
+        mean = torch.stack(losses[-num_parts:]).mean(dim=0).numpy(force=True)
+        require_finite("value losses", mean)
+        return {"value_loss_reward": float(mean[0])} | indexed("value_loss_cost", mean[1:])
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32]) -> dict[str, float]:
         """Make the policy more random once; see ``recrl.agents.noise``."""
-        metrics = self._policy.add_noise(noise, observations, self._config.noise_form)
-        require_finite("policy parameters after noise", self._policy.parameters.values.numpy())
+        with self._on_its_device():
+            metrics = self._policy.add_noise(noise, observations, self._config.noise_form)
+        self._policy.publish()
+        require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
-        """Parameters, optimisers and the rule's state."""
+        """Parameters, generator, and the state of every part."""
         return {
             "policy": self._policy.parameters.to_numpy(),
             "critics": self._critics.parameters.to_numpy(),
-            "critic_optimiser": self._critic_optimiser.state_dict(),
-            "rule": self._rule.state_dict(),
+            "generator": self._generator.bit_generator.state,
+            **{name: part.state_dict() for name, part in self._parts.items()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         self._policy.parameters.load(state["policy"])
+        self._policy.publish()
         self._critics.parameters.load(state["critics"])
-        self._critic_optimiser.load_state_dict(state["critic_optimiser"])
-        self._rule.load_state_dict(state["rule"])
+        self._generator.bit_generator.state = state["generator"]
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+
+    def _on_its_device(self) -> AbstractContextManager[Any]:
+        """New tensors are where the parameters are; on a CPU they are anyway, and asking costs time."""
+        device = self._policy.parameters.values.device
+        return nullcontext() if device.type == "cpu" else device
 
 
-def initial_networks(
-    cmdp: CMDPSpec, config: StudentConfig, seed: np.random.SeedSequence
-) -> tuple[StochasticPolicy, Critics]:
-    """A fresh policy and its critics; the same seed gives every student the same policy."""
+def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
+    """What to regress on at each row so that the mean squared error over the samples is minimal.
+
+    The mean squared error over samples is that about the mean target of each row, weighted by the
+    row's share of the samples, plus the targets' spread about those means, which no critic can lower.
+
+    Args:
+        batch: the samples.
+        targets: of all samples of the rollout, [N, C].
+
+    Returns:
+        The mean targets, [C, U], and the spread, [C].
+    """
+    sums = batch.per_row(targets)
+    shares = batch.row_weights.numpy(force=True).astype(np.float64)[:, None]
+    spread = np.mean(batch.own(targets) ** 2, axis=0) - np.sum(sums**2 / shares, axis=0)
+    return to_tensor((sums / shares).T.copy()), to_tensor(np.maximum(spread, 0.0))
+
+
+def fresh_student(
+    cmdp: CMDPSpec,
+    config: StudentConfig,
+    seed: np.random.SeedSequence,
+    make_rule: Callable[[StochasticPolicy], PolicyRule],
+) -> ActorCritic:
+    """A student before its first update; the same seed gives all with the same networks the same policy.
+
+    Args:
+        cmdp: what the task fixes.
+        config: the student's settings.
+        seed: of the initial parameters and of the order of minibatches.
+        make_rule: the student's rule for a policy.
+    """
     generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
     num_observations = observation_size(cmdp.observation_space)
     form = NetworkForm(config.hidden_sizes, INITIALISERS[config.initialisation])
     policy = StochasticPolicy(num_observations, cmdp.action_space, form, config.last_layer_scale, generator)
     critics = Critics(num_observations, cmdp.num_costs, form, generator)
-    return policy, critics
+    order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))
+    return ActorCritic(
+        cmdp,
+        config,
+        policy=policy,
+        critics=critics,
+        rule=make_rule(policy),
+        generator=np.random.default_rng(order),
+    )

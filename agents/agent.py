@@ -34,6 +34,8 @@ class Rollout:
             ``truncated``, float32 [M, n].
         last_observations: what the policy would see next, float32 [B, n]; bootstraps the episodes that
             the end of the rollout cuts.
+        carried_costs: undiscounted costs so far of the episodes that were under way when the rollout began,
+            float64 [B, k].
     """
 
     observations: npt.NDArray[np.float32]
@@ -44,6 +46,7 @@ class Rollout:
     truncated: npt.NDArray[np.bool_]
     final_observations: npt.NDArray[np.float32]
     last_observations: npt.NDArray[np.float32]
+    carried_costs: Floats
 
 
 class Policy(Protocol):

@@ -1,4 +1,4 @@
-"""From a rollout to what learning needs, with repeated observations evaluated once.
+"""From a rollout to what learning needs: repeated observations evaluated once, distinct ones by minibatches.
 
 On a tabular task a rollout of thousands of samples holds a few hundred distinct observations. Networks are
 then evaluated on the distinct *rows*, and everything that is summed over samples is summed by row, or by
@@ -6,13 +6,16 @@ then evaluated on the distinct *rows*, and everything that is summed over sample
 mean over samples of a function of the row is a weighted mean over rows; squared errors about several
 targets of one row are those about the targets' mean plus a constant; and a clipped surrogate, which depends
 on an advantage's sign, is linear in the positive and in the negative advantages of a decision. Where rows do
-not repeat, every sample is its own row and decision, and the same formulas hold.
+not repeat, every sample is its own row and decision, and the same formulas hold; such a batch can be parted
+into minibatches.
 
-Letters: N samples, U distinct rows, D decisions, n observation components, k costs, C = 1 + k signals.
+Letters: N samples of a rollout, U distinct rows, D decisions, n observation components, k costs, C = 1 + k
+signals.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,20 +32,24 @@ WORTHWHILE_SHARE = 0.5
 Indices = npt.NDArray[np.int64]
 
 
-def distinct_rows(observations: npt.NDArray[np.float32]) -> tuple[Indices, Indices] | None:
+def distinct_rows(
+    observations: npt.NDArray[np.float32], most: int | None = None
+) -> tuple[Indices, Indices] | None:
     """Find equal rows, by a 64-bit hash that is then checked against the rows themselves.
 
     Args:
         observations: [N, n].
+        most: distinct rows that are of use, at least 1; any number if None.
 
     Returns:
         The first sample of each distinct row, [U], and the row of each sample, [N]; or None if rows seldom
-        repeat (U > N / 2), or in the improbable case that two different rows have one hash.
+        repeat (U > N / 2), are more than ``most``, or in the improbable case that two different rows have
+        one hash.
     """
     words = np.ascontiguousarray(observations).view(np.uint32).astype(np.uint64)
     factors = np.random.default_rng(0).integers(2**64, size=words.shape[1], dtype=np.uint64)
     first, row = np.unique(words @ factors, return_index=True, return_inverse=True)[1:]
-    if len(first) > WORTHWHILE_SHARE * len(observations):
+    if len(first) > WORTHWHILE_SHARE * len(observations) or len(first) > (most or len(first)):
         return None
     if not np.array_equal(observations[first][row], observations):
         return None
@@ -63,17 +70,20 @@ def by_group(samples: Floats, group: Indices | None, num_groups: int) -> Floats:
         return samples / len(samples)
     if samples.ndim == 1:
         return np.bincount(group, weights=samples, minlength=num_groups) / len(samples)
-    return np.stack([by_group(column, group, num_groups) for column in samples.T], axis=1)
+    sums = np.empty((num_groups, samples.shape[1]))
+    for column in range(samples.shape[1]):
+        sums[:, column] = by_group(samples[:, column], group, num_groups)
+    return sums
 
 
 def to_tensor(values: Floats) -> Tensor:
-    """A float32 tensor of float64 values."""
-    return torch.from_numpy(values.astype(np.float32))
+    """A tensor of float64 values, in the precision and on the device that learning uses."""
+    return torch.as_tensor(values, dtype=torch.get_default_dtype())
 
 
 @dataclass(frozen=True, eq=False)
 class LearningBatch:
-    """The samples of a rollout, with repeated observations and decisions collapsed.
+    """The samples of a rollout, with repeated observations and decisions collapsed; or a minibatch of them.
 
     Attributes:
         rows: distinct observations, float32 [U, n].
@@ -82,6 +92,7 @@ class LearningBatch:
         decision_rows: the row of each decision, int64 [D], or None if decision i is at row i.
         row_of_sample: [N], or None if each sample is its own row.
         decision_of_sample: [N], or None if each sample is its own decision.
+        samples: of a minibatch, the samples of the rollout that it has, [U]; None if it has all.
     """
 
     rows: Tensor
@@ -90,10 +101,16 @@ class LearningBatch:
     decision_rows: Tensor | None
     row_of_sample: Indices | None
     decision_of_sample: Indices | None
+    samples: Indices | None = None
 
     @classmethod
     def gather(
-        cls, observations: npt.NDArray[np.float32], actions: npt.NDArray[Any], *, compact: bool
+        cls,
+        observations: npt.NDArray[np.float32],
+        actions: npt.NDArray[Any],
+        *,
+        compact: bool,
+        most_rows: int | None = None,
     ) -> LearningBatch:
         """Collapse N samples.
 
@@ -101,29 +118,83 @@ class LearningBatch:
             observations: [N, n].
             actions: int64 [N] or float32 [N, m].
             compact: whether to look for repeated rows at all.
+            most_rows: leave the samples as they are if more rows than this are distinct.
         """
-        found = distinct_rows(observations) if compact else None
+        found = distinct_rows(observations, most_rows) if compact else None
         if found is None:
             share = torch.full((len(observations),), 1.0 / len(observations))
-            return cls(torch.from_numpy(observations), share, torch.from_numpy(actions), None, None, None)
+            return cls(torch.as_tensor(observations), share, torch.as_tensor(actions), None, None, None)
         first, row = found
         weights = to_tensor(np.bincount(row) / len(row))
-        rows = torch.from_numpy(observations[first])
+        rows = torch.as_tensor(observations[first])
         if actions.ndim > 1:
-            return cls(rows, weights, torch.from_numpy(actions), torch.from_numpy(row), row, None)
+            return cls(rows, weights, torch.as_tensor(actions), torch.as_tensor(row), row, None)
         num_actions = int(actions.max()) + 1
         pairs, decision = np.unique(row * num_actions + actions, return_inverse=True)
-        taken, at = torch.from_numpy(pairs % num_actions), torch.from_numpy(pairs // num_actions)
+        taken, at = torch.as_tensor(pairs % num_actions), torch.as_tensor(pairs // num_actions)
         return cls(rows, weights, taken, at, row, decision)
+
+    def num_parts(self, size: int | None) -> int:
+        """How many minibatches of about ``size`` rows make a pass over the samples; one if rows repeat."""
+        if size is None or self.row_of_sample is not None:
+            return 1
+        return -(-len(self.rows) // size)
+
+    def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[LearningBatch]:
+        """Minibatches without end: passes over the samples, each in a new random order.
+
+        Args:
+            size: rows of a minibatch, at most; None for all.
+            generator: of the order; not used where the batch is one part, which then is the batch itself.
+        """
+        num_parts = self.num_parts(size)
+        while True:
+            if num_parts == 1:
+                yield self
+                continue
+            for chosen in np.array_split(generator.permutation(len(self.rows)), num_parts):
+                yield self.minibatch(chosen)
+
+    def minibatch(self, samples: Indices) -> LearningBatch:
+        """Some samples, [U], of a batch in which each sample is its own row."""
+        index = torch.as_tensor(samples)
+        return LearningBatch(
+            rows=self.rows.index_select(0, index),
+            row_weights=torch.full((len(samples),), 1.0 / len(samples)),
+            actions=self.actions.index_select(0, index),
+            decision_rows=None,
+            row_of_sample=None,
+            decision_of_sample=None,
+            samples=samples,
+        )
+
+    def thinned(self, most: int | None, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Rows and their weights: the batch's own, or those of ``most`` samples drawn at random.
+
+        Args:
+            most: rows to keep, at most; None for all.
+            generator: of the draw; not used if all rows are kept.
+        """
+        if most is None or len(self.rows) <= most:
+            return self.rows, self.row_weights
+        num_samples = len(self.rows if self.row_of_sample is None else self.row_of_sample)
+        drawn = generator.choice(num_samples, size=most, replace=False)
+        rows = drawn if self.row_of_sample is None else self.row_of_sample[drawn]
+        kept, counts = np.unique(rows, return_counts=True)
+        return self.rows.index_select(0, torch.as_tensor(kept)), to_tensor(counts / most)
 
     def per_row(self, samples: Floats) -> Floats:
         """Sums over the samples of each row, divided by N: [N] or [N, C] -> [U] or [U, C]."""
-        return by_group(samples, self.row_of_sample, len(self.rows))
+        return by_group(self.own(samples), self.row_of_sample, len(self.rows))
 
     def per_decision(self, samples: Floats) -> Tensor:
         """Sums over the samples of each decision, divided by N: [N] or [N, C] -> [D] or [D, C]."""
-        return to_tensor(by_group(samples, self.decision_of_sample, len(self.actions)))
+        return to_tensor(by_group(self.own(samples), self.decision_of_sample, len(self.actions)))
 
     def per_sample(self, values: Floats) -> Floats:
         """Hand each sample its row's values, [U, C] -> [N, C]."""
         return values if self.row_of_sample is None else values[self.row_of_sample]
+
+    def own(self, samples: Floats) -> Floats:
+        """Those of the samples of a rollout, [N] or [N, C], that the batch has."""
+        return samples if self.samples is None else samples[self.samples]

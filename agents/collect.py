@@ -92,6 +92,7 @@ class Collector:
         terminated = np.empty(shape, dtype=np.bool_)
         truncated = np.empty(shape, dtype=np.bool_)
         actions: npt.NDArray[Any] | None = None
+        carried_costs = self._costs.copy()
         final_observations: list[npt.NDArray[np.float32]] = []
         episodes: list[FinishedEpisode] = []
         current = self._observations
@@ -127,6 +128,7 @@ class Collector:
             truncated=truncated,
             final_observations=np.concatenate([observations[0, :0], *final_observations]),
             last_observations=current,
+            carried_costs=carried_costs,
         )
         return rollout, tuple(episodes)
 

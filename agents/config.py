@@ -25,11 +25,13 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "reward_trace_decay": 0.97,
     "cost_trace_decay": 0.97,
     "critic_steps": 80,
+    "minibatch_size": None,
     "value_target": "reward-to-go",
     "noise_form": "match-mixture",
 }
 
 STARTER_AGENTS_ASCENT: Mapping[str, Any] = {"policy_learning_rate": 3e-4, "policy_steps": 80}
+STARTER_AGENTS_TRUST_REGION: Mapping[str, Any] = {"metric_samples": None}
 STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
     "multiplier_rule": "softplus-adam",
     "multiplier_initial": 1.0,
@@ -67,8 +69,26 @@ class StudentConfig(BaseModel):
         default=0.95, description="lambda of the costs' advantages (as the reward's; paper 0.97)."
     )
     critic_learning_rate: Positive = Field(default=1e-3, description="Adam's, for the critics (paper).")
-    critic_steps: Count = Field(
-        default=40, description="Full-batch steps of the critics an update (paper 80)."
+    minibatch_size: Count | None = Field(
+        default=1024,
+        description="Samples of a gradient step where a rollout has more distinct observations than that; "
+        "null for all (ours; paper: all).",
+    )
+    critic_steps: Count = Field(default=40, description="Steps of the critics an update (ours; paper 80).")
+    critic_passes: Count = Field(
+        default=5,
+        description="Passes of the critics over the samples an update, where these are more steps than "
+        "critic_steps (ours).",
+    )
+    constraint: Literal["mean", "cvar"] = Field(
+        default="mean",
+        description="What of an episode's cost is constrained: its mean (paper), or its mean in the worst "
+        "episodes, the conditional value at risk (named by the paper as an extension).",
+    )
+    cvar_level: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
+        default=0.9,
+        description="alpha of the CVaR, which is the mean of the worst share 1 - alpha of the episodes; only "
+        "with the constraint cvar (ours).",
     )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",
@@ -106,7 +126,12 @@ class AscentConfig(StudentConfig):
         description="Adam's, for the policy; the KL keeps it in bounds (ours; paper 3e-4).",
     )
     policy_steps: Count = Field(
-        default=20, description="Full-batch steps of the policy an update, at most (ours; paper 80)."
+        default=20, description="Steps of the policy an update; the KL may stop it before (ours; paper 80)."
+    )
+    policy_passes: Count = Field(
+        default=5,
+        description="Passes of the policy over the samples an update, where these are more steps than "
+        "policy_steps; the KL may stop it before (ours).",
     )
     stop_kl_factor: Positive = Field(
         default=1.2, description="Stop the policy's steps when the KL exceeds this times target_kl (paper)."
@@ -157,10 +182,17 @@ class MultiplierConfig(StudentConfig):
 class TrustRegionConfig(StudentConfig):
     """Settings of students that take one trust-region step an update."""
 
+    paper: ClassVar[Mapping[str, Any]] = {**STARTER_AGENTS_SETTING, **STARTER_AGENTS_TRUST_REGION}
+
     damping: NonNegative = Field(
         default=0.1, description="Multiple of the identity added to the Hessian of the KL (paper)."
     )
     conjugate_gradient_steps: Count = Field(default=10, description="Iterations for each direction (paper).")
+    metric_samples: Count | None = Field(
+        default=2048,
+        description="Samples, drawn at random, on which the Hessian of the KL is evaluated; null for all "
+        "(ours; paper: all).",
+    )
     backtrack_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
         default=0.8, description="Factor on the step from one try of the line search to the next (paper)."
     )
@@ -281,6 +313,7 @@ class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):
 
     paper: ClassVar[Mapping[str, Any]] = {
         **STARTER_AGENTS_SETTING,
+        **STARTER_AGENTS_TRUST_REGION,
         **STARTER_AGENTS_MULTIPLIERS,
         "cost_advantages": "centred",
     }

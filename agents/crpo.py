@@ -11,17 +11,14 @@ costs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
-from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import SMALLEST_STD
-from recrl.agents.batch import LearningBatch
 from recrl.agents.config import CRPOConfig
+from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.trpo import improve_within_trust_region
+from recrl.agents.trpo import step_up
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -43,43 +40,31 @@ def most_violated(gaps: Floats, spreads: Floats, tolerance: float) -> int | None
 
 
 class ConstraintRectifiedPolicyOptimisation:
-    """The rule of ``crpo``; a ``recrl.agents.actor_critic.PolicyRule``. It keeps no state."""
+    """The rule of ``crpo``; a ``recrl.agents.actor_critic.PolicyRule``."""
 
     def __init__(self, config: CRPOConfig) -> None:
         self._config = config
+        self.parts: dict[str, Stateful] = {}
 
     def improve(
-        self,
-        policy: StochasticPolicy,
-        batch: LearningBatch,
-        advantages: Floats,
-        constraints: Constraints,
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one step up the reward or down a violated cost, unless nothing is known of the constraints."""
-        objective = None
-        multipliers = np.full_like(constraints.limits, np.nan)
-        if constraints.known:
-            spreads = np.maximum(advantages.std(axis=0), SMALLEST_STD)
-            standardised = (advantages - advantages.mean(axis=0)) / spreads
-            mended = most_violated(constraints.gaps, spreads[1:], self._config.tolerance)
-            objective = standardised[:, 0] if mended is None else -standardised[:, 1 + mended]
-            multipliers = np.zeros_like(constraints.limits)
-            if mended is not None:
-                multipliers[mended] = np.inf  # as if this constraint were all that counts
-        metrics = improve_within_trust_region(
-            policy, batch, advantages, objective=objective, config=self._config
-        )
+        constraints, advantages = experience.constraints, experience.advantages
+        if not constraints.known:
+            stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
+            return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
+        spreads = np.maximum(advantages.std(axis=0), SMALLEST_STD)
+        standardised = (advantages - advantages.mean(axis=0)) / spreads
+        mended = most_violated(constraints.gaps, spreads[1:], self._config.tolerance)
+        objective = standardised[:, 0] if mended is None else -standardised[:, 1 + mended]
+        multipliers = np.zeros_like(constraints.limits)
+        if mended is not None:
+            multipliers[mended] = np.inf  # as if this constraint were all that counts
+        metrics = step_up(policy, experience, objective, self._config, generator)
         return {**metrics, **indexed("multiplier", multipliers)}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Nothing to load."""
 
 
 def make_crpo(cmdp: CMDPSpec, config: CRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """A fresh CRPO student."""
-    policy, critics = initial_networks(cmdp, config, seed)
-    return ActorCritic(cmdp, config, policy, critics, ConstraintRectifiedPolicyOptimisation(config))
+    return fresh_student(cmdp, config, seed, lambda _: ConstraintRectifiedPolicyOptimisation(config))

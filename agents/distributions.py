@@ -35,8 +35,12 @@ class Categorical:
         """
         num_rows, num_actions = self.log_probs.shape
         if rows is None:
-            rows = torch.arange(num_rows)
+            rows = torch.arange(num_rows, device=actions.device)
         return torch.take(self.log_probs, rows * num_actions + actions)
+
+    def at(self, rows: Tensor) -> Categorical:
+        """The same at some rows only, int64 [V]."""
+        return Categorical(self.log_probs.index_select(0, rows))
 
     def divergence(self, other: Categorical) -> Tensor:
         """KL(self || other) = sum_a p_a (log p_a - log q_a) at each row, [U]."""
@@ -77,6 +81,10 @@ class Gaussian:
         standardised = (actions - mean) * torch.exp(-self.log_std)
         constant = self.log_std.sum() + 0.5 * math.log(2.0 * math.pi) * len(self.log_std)
         return -0.5 * standardised.square().sum(1) - constant
+
+    def at(self, rows: Tensor) -> Gaussian:
+        """The same at some rows only, int64 [V]."""
+        return Gaussian(self.mean.index_select(0, rows), self.log_std)
 
     def divergence(self, other: Gaussian) -> Tensor:
         """KL(self || other) at each row, summed over the action components, [U].

@@ -16,19 +16,18 @@ Letters: N samples, U rows, D decisions, k costs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import penalised_advantages, scaled_advantages
-from recrl.agents.ascent import Objective, ascend
-from recrl.agents.batch import LearningBatch
+from recrl.agents.ascent import Objective, climb
 from recrl.agents.config import FOCOPSConfig
 from recrl.agents.distributions import Distribution
+from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
 from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
@@ -36,17 +35,17 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 
 
 def projection_objective(
-    batch: LearningBatch, old: Distribution, advantages: Floats, *, temperature: float, radius: float
+    experience: Experience, advantages: Floats, *, temperature: float, radius: float
 ) -> Objective:
     """What draws the policy towards pi*: the module's formula.
 
     Args:
-        batch: the collapsed samples.
-        old: pi_old at the batch's rows.
-        advantages: of the Lagrangian, [N].
+        experience: the samples, and pi_old at their rows.
+        advantages: of the Lagrangian, of all samples of the rollout, [N].
         temperature: lam, above 0.
         radius: delta, nats; rows that have moved further pull no more.
     """
+    batch, old = experience.batch, experience.old
     pull = batch.per_decision(advantages / temperature)
 
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
@@ -66,39 +65,27 @@ class FirstOrderConstrainedOptimisation:
         self._config = config
         self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
         self._multipliers = Multipliers(config, num_costs)
+        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser, "multipliers": self._multipliers}
 
     def improve(
-        self,
-        policy: StochasticPolicy,
-        batch: LearningBatch,
-        advantages: Floats,
-        constraints: Constraints,
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
-        multipliers = self._multipliers.answer(constraints)
-        rewards, costs = scaled_advantages(advantages, "reward-scaled")
-        objective = projection_objective(
-            batch,
-            policy.distribution(batch.rows),
-            penalised_advantages(rewards, costs, multipliers),
-            temperature=self._config.temperature,
-            radius=self._config.target_kl,
+        config = self._config
+        multipliers = self._multipliers.answer(experience.constraints)
+        rewards, costs = scaled_advantages(experience.advantages, "reward-scaled")
+        objective = partial(
+            projection_objective,
+            advantages=penalised_advantages(rewards, costs, multipliers),
+            temperature=config.temperature,
+            radius=config.target_kl,
         )
-        metrics = ascend(policy, self._optimiser, batch, advantages, objective=objective, config=self._config)
+        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
         return {**metrics, **indexed("multiplier", multipliers)}
-
-    def state_dict(self) -> dict[str, Any]:
-        """The policy's optimiser, the multipliers, and the limits last seen."""
-        return {"optimiser": self._optimiser.state_dict(), **self._multipliers.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self._optimiser.load_state_dict(state["optimiser"])
-        self._multipliers.load_state_dict(state)
 
 
 def make_focops(cmdp: CMDPSpec, config: FOCOPSConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """A fresh FOCOPS student."""
-    policy, critics = initial_networks(cmdp, config, seed)
-    rule = FirstOrderConstrainedOptimisation(config, policy, cmdp.num_costs)
-    return ActorCritic(cmdp, config, policy, critics, rule)
+    return fresh_student(
+        cmdp, config, seed, lambda policy: FirstOrderConstrainedOptimisation(config, policy, cmdp.num_costs)
+    )

@@ -21,21 +21,19 @@ decisions, k costs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
-from recrl.agents.advantages import reward_spread, scaled_advantages
-from recrl.agents.ascent import ascend, with_prices
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.ascent import Objective, climb, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.config import IPOConfig
-from recrl.agents.cpo import ActiveConstraints
+from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, surrogate
@@ -57,25 +55,27 @@ def slopes(slack: npt.NDArray[np.floating], config: IPOConfig) -> Floats:
 
 
 def barrier_gain(
-    batch: LearningBatch, advantages: Floats, active: ActiveConstraints, config: IPOConfig
+    batch: LearningBatch, rewards: Floats, costs: Floats, violations: Floats, config: IPOConfig
 ) -> Callable[[Tensor], tuple[Tensor, float]]:
     """The module's formula, a function of the ratios, with the sum of the barriers' slopes.
 
+    A minibatch's mean cost advantage is not 0, as that of all samples is; it says nothing about the policy,
+    so surrogates of cost are counted from their value at ratios of 1.
+
     Args:
-        batch: the collapsed samples.
-        advantages: raw, [N, 1 + k].
-        active: the constraints that have a limit.
+        batch: the samples.
+        rewards: centred advantages, [N].
+        costs: centred advantages of the costs that have a limit, [N, j].
+        violations: c, [j].
         config: clip, t and kappa.
     """
-    rewards, costs = scaled_advantages(advantages, "reward-scaled")
     signed = SignedAdvantages.split(batch, rewards)
-    per_decision = batch.per_decision(costs)[:, torch.from_numpy(active.index)]
-    violations = to_tensor(active.violations / reward_spread(advantages))
+    per_decision, offsets = batch.per_decision(costs), to_tensor(violations)
     shape = partial(barrier, sharpness=config.barrier_sharpness, slope=config.barrier_slope)
 
     def gain(ratios: Tensor) -> tuple[Tensor, float]:
-        slack = -(surrogate(ratios, per_decision) + violations)
-        charged = slopes(slack.detach().numpy(), config)
+        slack = -(surrogate(ratios - 1.0, per_decision) + offsets)
+        charged = slopes(slack.detach().numpy(force=True), config)
         return clipped_surrogate(ratios, signed, config.clip) + shape(slack).sum(), float(charged.sum())
 
     return gain
@@ -87,36 +87,26 @@ class InteriorPointPolicyOptimisation:
     def __init__(self, config: IPOConfig, policy: StochasticPolicy) -> None:
         self._config = config
         self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
-        self,
-        policy: StochasticPolicy,
-        batch: LearningBatch,
-        advantages: Floats,
-        constraints: Constraints,
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Climb the surrogate between the barriers, unless nothing is known about the constraints."""
-        config = self._config
-        objective = None
-        multipliers = np.full_like(constraints.limits, np.nan)
-        if constraints.known:
-            active = ActiveConstraints.of(constraints)
-            objective = with_prices(barrier_gain(batch, advantages, active, config))
-            multipliers = np.zeros_like(constraints.limits)
-            multipliers[active.index] = slopes(-active.violations / reward_spread(advantages), config)
-        metrics = ascend(policy, self._optimiser, batch, advantages, objective=objective, config=config)
+        config, constraints = self._config, experience.constraints
+        if not constraints.known:
+            return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
+        rewards, costs, violations = experience.in_reward_spreads()
+
+        def objective(part: Experience) -> Objective:
+            return with_prices(barrier_gain(part.batch, rewards, costs, violations, config))
+
+        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        multipliers = np.zeros_like(constraints.limits)
+        multipliers[ActiveConstraints.of(constraints).index] = slopes(-violations, config)
         return {**metrics, **indexed("multiplier", multipliers)}
-
-    def state_dict(self) -> dict[str, Any]:
-        """The policy's optimiser."""
-        return {"optimiser": self._optimiser.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self._optimiser.load_state_dict(state["optimiser"])
 
 
 def make_ipo(cmdp: CMDPSpec, config: IPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """A fresh IPO student."""
-    policy, critics = initial_networks(cmdp, config, seed)
-    return ActorCritic(cmdp, config, policy, critics, InteriorPointPolicyOptimisation(config, policy))
+    return fresh_student(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))

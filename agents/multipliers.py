@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from recrl.agents.actor_critic import Constraints
 from recrl.agents.config import MultiplierConfig
+from recrl.agents.experience import Constraints
 from recrl.agents.lagrange import (
     STARTS,
     MultiplierState,

@@ -5,7 +5,8 @@ Every network here is a *stack* of C separate networks of one shape, evaluated a
 
 All parameters of a stack are views into one contiguous vector, and so are their gradients. Adam is then a
 handful of operations on two vectors, a trust-region step is ``parameters += step``, and a checkpoint is a
-single array. With networks this small, the number of calls is what an update costs.
+single array. With small networks and few rows the number of calls is what an update costs; with many rows it
+is memory, so rows are evaluated in blocks whose activations stay in the processor's cache.
 
 Letters: C networks, U rows, n inputs, P parameters.
 """
@@ -23,6 +24,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+# Rows evaluated at once.
+BLOCK_ROWS = 512
+
+# (1 - h^2) slope in one sweep over memory, into ``grad_input``; no public function does that.
+tanh_backward = torch.ops.aten.tanh_backward.grad_input
+
 # Initialise one weight matrix [in, out] in place; biases start at 0.
 Initialiser = Callable[[Tensor, torch.Generator], None]
 
@@ -38,6 +45,11 @@ def xavier(weight: Tensor, generator: torch.Generator) -> None:
 
 
 INITIALISERS: dict[str, Initialiser] = {"orthogonal": orthogonal, "xavier": xavier}
+
+
+def blocks(num_rows: int) -> list[slice]:
+    """Consecutive slices of at most ``BLOCK_ROWS`` rows that cover ``num_rows``."""
+    return [slice(start, start + BLOCK_ROWS) for start in range(0, max(num_rows, 1), BLOCK_ROWS)]
 
 
 @dataclass(frozen=True)
@@ -85,7 +97,7 @@ class FlatParameters:
 
     def to_numpy(self) -> npt.NDArray[np.float32]:
         """A copy of all parameters, [P]."""
-        return self.values.numpy().copy()
+        return self.values.numpy(force=True).copy()
 
     def load(self, values: npt.NDArray[np.float32]) -> None:
         """Take over saved parameters, [P].
@@ -98,7 +110,25 @@ class FlatParameters:
                 f"the saved network has {values.size} parameters, this one {self.values.numel()}: "
                 "was it built with other options?"
             )
-        self.values.copy_(torch.from_numpy(np.asarray(values, dtype=np.float32)))
+        self.values.copy_(torch.as_tensor(np.asarray(values, dtype=np.float32)))
+
+
+class Scratch:
+    """Memory that is used again and again.
+
+    Asking the system for some megabytes anew costs as much as a product that fills them.
+    """
+
+    def __init__(self) -> None:
+        self._buffers: dict[int, Tensor] = {}
+
+    def tensor(self, place: int, shape: tuple[int, ...]) -> Tensor:
+        """Uninitialised memory; what was handed out at the same place before is overwritten."""
+        size = math.prod(shape)
+        buffer = self._buffers.get(place)
+        if buffer is None or buffer.numel() < size:
+            buffer = self._buffers[place] = torch.empty(size)
+        return buffer[:size].view(shape)
 
 
 class TanhStack:
@@ -119,6 +149,8 @@ class TanhStack:
         self._slopes = list(
             zip(parameters.gradients[used][0::2], parameters.gradients[used][1::2], strict=True)
         )
+        self._scratch = Scratch()
+        self._slope_scratch = Scratch()
 
     @staticmethod
     def shapes(num_networks: int, sizes: Sequence[int]) -> list[tuple[int, ...]]:
@@ -138,16 +170,31 @@ class TanhStack:
         """Draw all weights; scale the last layer's by ``last_scale``; set the biases to 0."""
         for weight, bias in zip(self.weights, self.biases, strict=True):
             for network in weight:
-                initialiser(network, generator)
+                drawn = torch.empty(network.shape, device="cpu")  # equal weights on every device
+                initialiser(drawn, generator)
+                network.copy_(drawn)
             bias.zero_()
         self.weights[-1].mul_(last_scale)
 
-    def activations(self, rows: Tensor) -> list[Tensor]:
-        """The inputs of every layer, then the outputs, each [C, U, width]; rows are [U, n]."""
+    def outputs(self, rows: Tensor) -> Tensor:
+        """The outputs of every network, [C, U, out], block by block; rows are [U, n]."""
+        outputs = [self.activations(rows[block])[-1] for block in blocks(len(rows))]
+        return outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=1)
+
+    def activations(self, rows: Tensor, scratch: Scratch | None = None) -> list[Tensor]:
+        """The inputs of every layer, then the outputs, each [C, U, width].
+
+        Args:
+            rows: [U, n], one block.
+            scratch: where the activations of hidden layers are kept; if None, in the stack's own, where the
+                next evaluation without one overwrites them.
+        """
+        scratch = scratch or self._scratch
         layers = [rows.expand(len(self.weights[0]), *rows.shape)]
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            layers.append(torch.baddbmm(bias, layers[-1], weight).tanh_())
-        layers.append(torch.baddbmm(self.biases[-1], layers[-1], self.weights[-1]))
+        for layer, (weight, bias) in enumerate(zip(self.weights[:-1], self.biases[:-1], strict=True)):
+            memory = scratch.tensor(layer, (*layers[0].shape[:2], weight.shape[2]))
+            layers.append(torch.bmm(layers[-1], weight, out=memory).add_(bias).tanh_())
+        layers.append(torch.bmm(layers[-1], self.weights[-1]).add_(self.biases[-1]))
         return layers
 
     def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
@@ -164,13 +211,13 @@ class TanhStack:
         """
         moved = torch.baddbmm(change[1], activations[0], change[0])
         for layer in range(1, len(self.weights)):
-            moved.addcmul_(moved * activations[layer], activations[layer], value=-1.0)
+            tanh_backward(moved, activations[layer], grad_input=moved)
             moved = torch.baddbmm(change[2 * layer + 1], moved, self.weights[layer]).baddbmm_(
                 activations[layer], change[2 * layer]
             )
         return moved
 
-    def pull_back(self, activations: Sequence[Tensor], slope: Tensor) -> None:
+    def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
         """The derivative of a loss by the parameters, J^T times that by the outputs, into the gradient block.
 
         dL/dW_l = h_l^T s_l,  dL/db_l = sum over rows of s_l,  s_{l-1} = (1 - h_l^2) (s_l W_l^T).
@@ -178,14 +225,20 @@ class TanhStack:
         Args:
             activations: as ``activations`` gave them at the present parameters.
             slope: dL / d outputs, [C, U, out].
+            add: to what the gradient block holds, as for the second and later blocks of rows; else replace.
         """
         for layer in range(len(self.weights) - 1, -1, -1):
             by_weight, by_bias = self._slopes[layer]
-            torch.bmm(activations[layer].transpose(1, 2), slope, out=by_weight)
-            torch.sum(slope, dim=1, keepdim=True, out=by_bias)
+            if add:
+                by_weight.baddbmm_(activations[layer].transpose(1, 2), slope)
+                by_bias.add_(slope.sum(dim=1, keepdim=True))
+            else:
+                torch.bmm(activations[layer].transpose(1, 2), slope, out=by_weight)
+                torch.sum(slope, dim=1, keepdim=True, out=by_bias)
             if layer > 0:
-                slope = torch.bmm(slope, self.weights[layer].transpose(1, 2))
-                slope.addcmul_(slope * activations[layer], activations[layer], value=-1.0)
+                memory = self._slope_scratch.tensor(layer, tuple(activations[layer].shape))
+                slope = torch.bmm(slope, self.weights[layer].transpose(1, 2), out=memory)
+                tanh_backward(slope, activations[layer], grad_input=slope)
 
 
 class Adam:
@@ -226,15 +279,15 @@ class Adam:
     def state_dict(self) -> dict[str, Any]:
         """Both moments, [P], and the number of steps taken."""
         return {
-            "first_moment": self._first_moment.numpy().copy(),
-            "second_moment": self._second_moment.numpy().copy(),
+            "first_moment": self._first_moment.numpy(force=True).copy(),
+            "second_moment": self._second_moment.numpy(force=True).copy(),
             "steps": self._steps,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
-        self._first_moment.copy_(torch.from_numpy(np.asarray(state["first_moment"], dtype=np.float32)))
-        self._second_moment.copy_(torch.from_numpy(np.asarray(state["second_moment"], dtype=np.float32)))
+        self._first_moment.copy_(torch.as_tensor(np.asarray(state["first_moment"], dtype=np.float32)))
+        self._second_moment.copy_(torch.as_tensor(np.asarray(state["second_moment"], dtype=np.float32)))
         self._steps = int(state["steps"])
 
 
@@ -258,7 +311,7 @@ class Critics:
 
     def values(self, rows: Tensor) -> npt.NDArray[np.float64]:
         """The values of every row, [U, n] -> float64 [U, 1 + k]."""
-        return self._stack.activations(rows)[-1][..., 0].numpy().T.astype(np.float64)
+        return self._stack.outputs(rows)[..., 0].numpy(force=True).T.astype(np.float64)
 
     def differentiate(self, rows: Tensor, row_weights: Tensor, targets: Tensor) -> Tensor:
         """The squared errors of each critic, and their sum's gradient, which the block then holds.
@@ -274,8 +327,11 @@ class Critics:
         Returns:
             L, [1 + k].
         """
-        activations = self._stack.activations(rows)
-        errors = activations[-1][..., 0] - targets
-        weighted = errors * row_weights
-        self._stack.pull_back(activations, (2.0 * weighted)[..., None])
-        return (weighted * errors).sum(dim=1)
+        losses = torch.zeros(len(targets))
+        for block in blocks(len(rows)):
+            activations = self._stack.activations(rows[block])
+            errors = activations[-1][..., 0] - targets[:, block]
+            weighted = errors * row_weights[block]
+            self._stack.pull_back(activations, (2.0 * weighted)[..., None], add=block.start > 0)
+            losses += (weighted * errors).sum(dim=1)
+        return losses

@@ -15,19 +15,17 @@ decisions, k costs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
-from recrl.agents.advantages import reward_spread, scaled_advantages
-from recrl.agents.ascent import ascend, with_prices
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.ascent import Objective, climb, with_prices
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import P3OConfig
-from recrl.agents.cpo import ActiveConstraints
+from recrl.agents.experience import Experience
 from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate
@@ -35,27 +33,35 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 
 
 def penalised_gain(
-    batch: LearningBatch, advantages: Floats, active: ActiveConstraints, *, clip: float, factor: float
+    batch: LearningBatch,
+    rewards: Floats,
+    costs: Floats,
+    violations: Floats,
+    *,
+    clip: float,
+    factor: float,
 ) -> Callable[[Tensor], tuple[Tensor, float]]:
     """The module's formula, a function of the ratios, with the sum of the penalty factors in force.
 
+    A minibatch's mean cost advantage is not 0, as that of all samples is; it says nothing about the policy,
+    so surrogates of cost are counted from their value at ratios of 1.
+
     Args:
-        batch: the collapsed samples.
-        advantages: raw, [N, 1 + k].
-        active: the constraints that have a limit.
+        batch: the samples.
+        rewards: centred advantages, [N].
+        costs: centred advantages of the costs that have a limit, [N, j].
+        violations: c, [j].
         clip: e in (0, 1).
         factor: kappa.
     """
-    rewards, costs = scaled_advantages(advantages, "reward-scaled")
-    violations = (active.violations / reward_spread(advantages)).tolist()
     signed = SignedAdvantages.split(batch, rewards)
     # The pessimistic surrogate of a cost is minus that of its negative.
-    relief = [SignedAdvantages.split(batch, -costs[:, i]) for i in active.index]
+    relief = [SignedAdvantages.split(batch, -column) for column in costs.T]
 
     def gain(ratios: Tensor) -> tuple[Tensor, float]:
         value, price = clipped_surrogate(ratios, signed, clip), 0.0
-        for each, violation in zip(relief, violations, strict=True):
-            excess = violation - clipped_surrogate(ratios, each, clip)
+        for each, violation in zip(relief, violations.tolist(), strict=True):
+            excess = violation - (clipped_surrogate(ratios, each, clip) - each.total)
             value = value - factor * torch.relu(excess)
             price += factor * float(excess.detach() > 0.0)
         return value, price
@@ -69,36 +75,30 @@ class PenalisedProximalPolicyOptimisation:
     def __init__(self, config: P3OConfig, policy: StochasticPolicy) -> None:
         self._config = config
         self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
-        self,
-        policy: StochasticPolicy,
-        batch: LearningBatch,
-        advantages: Floats,
-        constraints: Constraints,
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Climb the penalised surrogate, unless nothing is known about the constraints."""
-        config = self._config
-        objective = None
-        multipliers = np.full_like(constraints.limits, np.nan)
-        if constraints.known:
-            active = ActiveConstraints.of(constraints)
-            gain = penalised_gain(batch, advantages, active, clip=config.clip, factor=config.penalty_factor)
-            objective = with_prices(gain)
-            multipliers = np.where(constraints.gaps > 0.0, config.penalty_factor, 0.0)
-        metrics = ascend(policy, self._optimiser, batch, advantages, objective=objective, config=config)
+        config, constraints = self._config, experience.constraints
+        if not constraints.known:
+            return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
+        rewards, costs, violations = experience.in_reward_spreads()
+
+        def objective(part: Experience) -> Objective:
+            gain = penalised_gain(
+                part.batch, rewards, costs, violations, clip=config.clip, factor=config.penalty_factor
+            )
+            return with_prices(gain)
+
+        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        multipliers = np.where(constraints.gaps > 0.0, config.penalty_factor, 0.0)
         return {**metrics, **indexed("multiplier", multipliers)}
-
-    def state_dict(self) -> dict[str, Any]:
-        """The policy's optimiser."""
-        return {"optimiser": self._optimiser.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self._optimiser.load_state_dict(state["optimiser"])
 
 
 def make_p3o(cmdp: CMDPSpec, config: P3OConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """A fresh P3O student."""
-    policy, critics = initial_networks(cmdp, config, seed)
-    return ActorCritic(cmdp, config, policy, critics, PenalisedProximalPolicyOptimisation(config, policy))
+    return fresh_student(
+        cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy)
+    )

@@ -20,16 +20,12 @@ costs, P parameters.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
-from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
-from recrl.agents.advantages import reward_spread
-from recrl.agents.batch import LearningBatch
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student
 from recrl.agents.config import PCPOConfig
-from recrl.agents.cpo import ActiveConstraints, LocalModel, acceptance, along, linearise
+from recrl.agents.cpo import constrained_step
 from recrl.agents.cpo_dual import (
     FEASIBILITY_TOLERANCE,
     NO_GRADIENT,
@@ -38,8 +34,8 @@ from recrl.agents.cpo_dual import (
     StepCase,
     StepProblem,
 )
+from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.trust_region import backtrack
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -98,61 +94,19 @@ def projected_step(problem: StepProblem) -> DualSolution:
 
 
 class ProjectionBasedConstrainedPolicyOptimisation:
-    """The rule of ``pcpo``; a ``recrl.agents.actor_critic.PolicyRule``. It keeps no state."""
+    """The rule of ``pcpo``; a ``recrl.agents.actor_critic.PolicyRule``."""
 
     def __init__(self, config: PCPOConfig) -> None:
         self._config = config
+        self.parts: dict[str, Stateful] = {}
 
     def improve(
-        self,
-        policy: StochasticPolicy,
-        batch: LearningBatch,
-        advantages: Floats,
-        constraints: Constraints,
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one projected step, unless nothing is known about the constraints."""
-        config = self._config
-        centred = advantages - advantages.mean(axis=0)
-        std = reward_spread(centred)
-        centred[:, 0] /= std  # changes no step, only the unit of the multipliers
-        model = LocalModel(policy, batch, centred)
-        multipliers = np.full_like(constraints.limits, np.nan)
-        shortened, norm = None, 0.0
-        if constraints.known:
-            active = ActiveConstraints.of(constraints)
-            problem, solved = linearise(model, active, config)
-            solution = projected_step(problem)
-            step = along(solution, solved)
-            shortened = backtrack(
-                policy.parameters,
-                step,
-                acceptance(model, active, solution, config.target_kl),
-                ratio=config.backtrack_ratio,
-                tries=config.backtrack_tries,
-            )
-            norm = 0.0 if shortened is None else config.backtrack_ratio**shortened * float(step.norm())
-            multipliers = np.zeros_like(constraints.limits)
-            multipliers[active.index] = solution.multipliers
-        gains, _ = model.measure()
-        return {
-            "policy_steps": float(shortened is not None),
-            "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
-            "step_norm": norm,
-            "surrogate_reward": float(gains[0]) * std,
-            **indexed("surrogate_cost", gains[1:]),
-            **indexed("multiplier", multipliers),
-        }
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Nothing to load."""
+        return constrained_step(policy, experience, projected_step, self._config, generator)
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """A fresh PCPO student."""
-    policy, critics = initial_networks(cmdp, config, seed)
-    rule = ProjectionBasedConstrainedPolicyOptimisation(config)
-    return ActorCritic(cmdp, config, policy, critics, rule)
+    return fresh_student(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))

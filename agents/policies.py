@@ -1,15 +1,14 @@
 """Stochastic policies: a tanh network with a categorical or a diagonal Gaussian head.
 
-Acting is plain NumPy on the parameters' own memory: at 16 observations, PyTorch's overhead would cost more
-than the arithmetic. Learning is PyTorch. The probabilities that learning compares with are computed by
-PyTorch too, at the start of an update, so that the ratio of an unchanged policy is exactly 1.
+Acting is plain NumPy, on a CPU on the parameters' own memory: at 16 observations, PyTorch's overhead would
+cost more than the arithmetic. Learning is PyTorch. The probabilities that learning compares with are computed
+by PyTorch too, at the start of an update, so that the ratio of an unchanged policy is exactly 1.
 
 Letters: U rows, B observations, n observation components, A actions, m action components, P parameters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +20,7 @@ from gymnasium.spaces import Box, Discrete
 from torch import Tensor
 
 from recrl.agents.distributions import Categorical, Distribution, Gaussian
-from recrl.agents.networks import FlatParameters, NetworkForm, TanhStack
+from recrl.agents.networks import FlatParameters, NetworkForm, Scratch, TanhStack, blocks
 from recrl.agents.noise import matching_log_std, matching_scale, off_greedy_mass
 from recrl.agents.spaces import action_size
 from recrl.environments.cmdp import Floats
@@ -66,12 +65,21 @@ class StochasticPolicy:
         self.parameters = FlatParameters(shapes)
         self.stack = TanhStack(self.parameters, len(sizes) - 1)
         self.stack.initialise(form.initialiser, last_scale, generator)
-        self._weights = [weight.numpy()[0] for weight in self.stack.weights]
-        self._biases = [bias.numpy()[0] for bias in self.stack.biases]
         if isinstance(action_space, Box):
             self.log_std.fill_(INITIAL_LOG_STD)
             half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
             self._half_ranges = np.where(np.isfinite(half), half, 1.0)
+        self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
+        acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
+        layers = slice(0, 2 * len(self.stack.weights))
+        self._weights = [weight[0] for weight in acting[layers][0::2]]
+        self._biases = [bias[0] for bias in acting[layers][1::2]]
+        self._acting_log_std = acting[-1]
+        self._scratch: list[Scratch] = []
+
+    def publish(self) -> None:
+        """Let acting know of changed parameters; on a CPU it always does."""
+        self._acting.copy_(self.parameters.values)
 
     @property
     def log_std(self) -> Tensor:
@@ -94,7 +102,7 @@ class StochasticPolicy:
         """Draw actions for B observations [B, n]: int64 [B] by inversion, or float32 [B, m]."""
         outputs = self.outputs(observations)
         if not self._is_categorical:
-            spread = np.exp(self.log_std.numpy())
+            spread = np.exp(self._acting_log_std)
             outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
             return outputs
         cumulative = np.exp(outputs - outputs.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
@@ -123,22 +131,27 @@ class StochasticPolicy:
 
     def distribution(self, rows: Tensor) -> Distribution:
         """The action distributions at U rows, [U, n]; not differentiable, see ``evaluate``."""
-        return self._head(self.stack.activations(rows)[-1][0], self.parameters.tensors)
+        return self.head(self.stack.outputs(rows)[0], self.log_std.clone())  # the policy will move
 
     def evaluate(self, rows: Tensor) -> PolicyEvaluation:
         """The action distributions at U rows, [U, n], of which a loss can be differentiated."""
-        activations = self.stack.activations(rows)
-        outputs = activations[-1][0].requires_grad_()
+        pieces = blocks(len(rows))
+        self._scratch += [Scratch() for _ in pieces[len(self._scratch) :]]
+        activations = [
+            self.stack.activations(rows[block], scratch)
+            for block, scratch in zip(pieces, self._scratch, strict=False)
+        ]
+        outputs = torch.cat([layers[-1][0] for layers in activations]).requires_grad_()
         leaves = [outputs]
         if not self._is_categorical:
             leaves.append(self.log_std.clone().requires_grad_())
-        return PolicyEvaluation(self, activations, leaves, self._head(outputs, leaves))
+        return PolicyEvaluation(self, activations, leaves, self.head(outputs, leaves[-1]))
 
-    def _head(self, outputs: Tensor, tensors: Sequence[Tensor]) -> Distribution:
-        """The distributions that outputs, [U, A] or [U, m], stand for; a log_std is the last tensor."""
+    def head(self, outputs: Tensor, log_std: Tensor) -> Distribution:
+        """The distributions that outputs, [U, A] or [U, m], stand for; only a Gaussian has a log_std."""
         if self._is_categorical:
             return Categorical(torch.log_softmax(outputs, dim=1))
-        return Gaussian(outputs, tensors[-1])
+        return Gaussian(outputs, log_std)
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
         """Make the policy more random, once; ``recrl.agents.noise`` says how.
@@ -169,12 +182,12 @@ class StochasticPolicy:
         }
 
     def _widen(self, noise: float, form: str) -> dict[str, float]:
-        before = self.log_std.numpy().astype(np.float64)
+        before = self._acting_log_std.astype(np.float64)
         if form == "temperature":
             after = before - np.log(max(1.0 - noise, SMALLEST_TEMPERING))
         else:
             after = matching_log_std(before, self._half_ranges, noise)
-        self.log_std.copy_(torch.from_numpy(after))
+        self.log_std.copy_(torch.as_tensor(after))
         mean_before, mean_after = float(np.exp(before).mean()), float(np.exp(after).mean())
         return {
             "noise_scale": mean_after / mean_before,
@@ -185,27 +198,28 @@ class StochasticPolicy:
 
 @dataclass(frozen=True, eq=False)
 class PolicyEvaluation:
-    """A policy evaluated at some rows; valid until its parameters change.
+    """A policy evaluated at some rows; valid until its parameters change or it is evaluated again.
 
     The part between the network's outputs and a loss is differentiated automatically, so that a student may
     write any loss of the distribution; the network itself is ``TanhStack``'s to differentiate.
 
     Attributes:
         policy: what was evaluated.
-        activations: of its network.
+        activations: of its network, block by block of the rows.
         leaves: the outputs, and a Gaussian's log_std: what losses are differentiated by.
         distribution: at the rows; a differentiable function of the leaves.
     """
 
     policy: StochasticPolicy
-    activations: list[Tensor]
+    activations: list[list[Tensor]]
     leaves: list[Tensor]
     distribution: Distribution
 
     def gradient(self, loss: Tensor, *, retain_graph: bool = False) -> Tensor:
         """The gradient of a scalar loss by all parameters, [P]: the policy's gradient block."""
         slopes = torch.autograd.grad(loss, self.leaves, retain_graph=retain_graph)
-        self.policy.stack.pull_back(self.activations, slopes[0][None])
+        for block, activations in zip(blocks(len(slopes[0])), self.activations, strict=True):
+            self.policy.stack.pull_back(activations, slopes[0][None, block], add=block.start > 0)
         if len(slopes) > 1:
             self.policy.parameters.gradients[-1].copy_(slopes[1])
         return self.policy.parameters.gradient
@@ -228,17 +242,20 @@ class FisherMetric:
 
     def __init__(self, policy: StochasticPolicy, rows: Tensor, row_weights: Tensor, damping: float) -> None:
         self._policy = policy
-        self._row_weights = row_weights[:, None]
         self._damping = damping
-        self._activations = policy.stack.activations(rows)
-        self._distribution = policy.distribution(rows)
+        self._blocks: list[tuple[list[Tensor], Distribution, Tensor]] = []
+        for block in blocks(len(rows)):
+            activations = policy.stack.activations(rows[block], Scratch())
+            distribution = policy.head(activations[-1][0], policy.log_std)
+            self._blocks.append((activations, distribution, row_weights[block, None]))
 
     def __call__(self, vector: Tensor) -> Tensor:
         """H times a vector of parameter changes, [P] -> [P]; overwrites the policy's gradient block."""
         stack, parameters = self._policy.stack, self._policy.parameters
         change = parameters.pieces(vector)
-        moved = stack.output_change(self._activations, change)[0]
-        stack.pull_back(self._activations, (self._row_weights * self._distribution.fisher(moved))[None])
+        for number, (activations, distribution, weights) in enumerate(self._blocks):
+            moved = stack.output_change(activations, change)[0]
+            stack.pull_back(activations, (weights * distribution.fisher(moved))[None], add=number > 0)
         if len(change) > 2 * len(stack.weights):
             parameters.gradients[-1].copy_(2.0 * change[-1])  # the Fisher metric of log_std is 2
         return parameters.gradient + self._damping * vector

@@ -1,8 +1,7 @@
 """PPO on the Lagrangian (Ray et al. 2019, section 5).
 
-Multipliers first answer the gaps; then the policy climbs the penalised surrogate in at most ``policy_steps``
-full-batch steps, and stops when it has moved too far. If no episode finished, nothing is known about the
-constraints: the multipliers stay.
+Multipliers first answer the gaps; then the policy climbs the penalised surrogate until its steps are done or
+it has moved too far. If no episode finished, nothing is known about the constraints: the multipliers stay.
 
 The objective is (L_r - sum_i p_i L_i) / (1 + sum_i p_i), p the multipliers. ``separate`` clips the reward's
 surrogate only (the paper's students); ``combined`` clips the surrogate of the penalised advantage
@@ -13,22 +12,52 @@ Letters: N samples, D decisions, k costs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Constraints, indexed, initial_networks
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import penalised_advantages, scaled_advantages
-from recrl.agents.ascent import ascend, with_entropy
+from recrl.agents.ascent import Objective, climb, with_entropy
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import PPOLagConfig
+from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
 from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
+
+
+def combined_gain(
+    batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
+) -> Callable[[Tensor], Tensor]:
+    """The clipped surrogate of the penalised advantages, as a function of the ratios, [D].
+
+    Args:
+        batch: the samples.
+        rewards: standardised advantages, [N].
+        costs: centred advantages, [N, k].
+        multipliers: p, [k].
+        clip: e in (0, 1).
+    """
+    penalised = SignedAdvantages.split(batch, penalised_advantages(rewards, costs, multipliers))
+    return lambda ratios: clipped_surrogate(ratios, penalised, clip)
+
+
+def separate_gain(
+    batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
+) -> Callable[[Tensor], Tensor]:
+    """The reward's clipped surrogate minus the multiplied costs' surrogates; see ``combined_gain``."""
+    weight = 1.0 / (1.0 + float(multipliers.sum()))
+    signed = SignedAdvantages.split(batch, weight * rewards)
+    penalty = batch.per_decision(weight * (costs @ multipliers))
+    return lambda ratios: clipped_surrogate(ratios, signed, clip) - surrogate(ratios, penalty)
+
+
+# By the name that the option ``penalty`` has.
+GAINS = {"combined": combined_gain, "separate": separate_gain}
 
 
 class PPOLagrangian:
@@ -38,46 +67,24 @@ class PPOLagrangian:
         self._config = config
         self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
         self._multipliers = Multipliers(config, num_costs)
+        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser, "multipliers": self._multipliers}
 
     def improve(
-        self,
-        policy: StochasticPolicy,
-        batch: LearningBatch,
-        advantages: Floats,
-        constraints: Constraints,
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
-        multipliers = self._multipliers.answer(constraints)
-        gain = self._objective(batch, advantages, multipliers)
-        objective = with_entropy(gain, batch, self._config.entropy_bonus)
-        metrics = ascend(policy, self._optimiser, batch, advantages, objective=objective, config=self._config)
-        return {**metrics, **indexed("multiplier", multipliers)}
-
-    def _objective(
-        self, batch: LearningBatch, advantages: Floats, multipliers: Floats
-    ) -> Callable[[Tensor], Tensor]:
-        """What the policy climbs, as a function of the decisions' probability ratios, [D]."""
         config = self._config
-        rewards, costs = scaled_advantages(advantages, config.cost_advantages)
-        if config.penalty == "combined":
-            penalised = SignedAdvantages.split(batch, penalised_advantages(rewards, costs, multipliers))
-            return lambda ratios: clipped_surrogate(ratios, penalised, config.clip)
-        weight = 1.0 / (1.0 + float(multipliers.sum()))
-        signed = SignedAdvantages.split(batch, weight * rewards)
-        penalty = batch.per_decision(weight * (costs @ multipliers))
-        return lambda ratios: clipped_surrogate(ratios, signed, config.clip) - surrogate(ratios, penalty)
+        multipliers = self._multipliers.answer(experience.constraints)
+        rewards, costs = scaled_advantages(experience.advantages, config.cost_advantages)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The policy's optimiser, the multipliers, and the limits last seen."""
-        return {"optimiser": self._optimiser.state_dict(), **self._multipliers.state_dict()}
+        def objective(part: Experience) -> Objective:
+            gain = GAINS[config.penalty](part.batch, rewards, costs, multipliers, config.clip)
+            return with_entropy(gain, part.batch, config.entropy_bonus)
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self._optimiser.load_state_dict(state["optimiser"])
-        self._multipliers.load_state_dict(state)
+        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        return {**metrics, **indexed("multiplier", multipliers)}
 
 
 def make_ppo_lag(cmdp: CMDPSpec, config: PPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """A fresh PPO-Lagrangian student."""
-    policy, critics = initial_networks(cmdp, config, seed)
-    return ActorCritic(cmdp, config, policy, critics, PPOLagrangian(config, policy, cmdp.num_costs))
+    return fresh_student(cmdp, config, seed, lambda policy: PPOLagrangian(config, policy, cmdp.num_costs))

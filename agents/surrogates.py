@@ -49,6 +49,11 @@ class SignedAdvantages:
             batch.per_decision(np.maximum(advantages, 0.0)), batch.per_decision(np.minimum(advantages, 0.0))
         )
 
+    @property
+    def total(self) -> Tensor:
+        """The surrogate at ratios of 1, clipped or not: the mean advantage, a scalar."""
+        return self.positive.sum() + self.negative.sum()
+
 
 def clipped_surrogate(ratios: Tensor, advantages: SignedAdvantages, clip: float) -> Tensor:
     """PPO's pessimistic surrogate (Schulman et al. 2017, equation 7), a scalar.

@@ -1,16 +1,19 @@
 """What every student promises, whatever its algorithm (``recrl.agents.agent.Agent``)."""
 
+import gc
 import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from recrl.agents.agent import Agent, Rollout
 from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
+from recrl.agents.config import AscentConfig
 from recrl.agents.errors import DivergedError
-from recrl.agents.registry import AGENTS, make_agent
+from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.environments.cmdp import Floats
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.checkpoint import decode, encode
@@ -191,3 +194,76 @@ def test_evaluating_repeated_observations_once_changes_only_the_speed(agent: str
         found, expected = compact.update(), plain.update()
         for key, value in expected.items():
             assert found[key] == pytest.approx(value, rel=2e-3, abs=2e-4, nan_ok=True), key
+
+
+MINIBATCHES = {"compaction": False, "minibatch_size": 16, "critic_passes": 2}
+
+
+@every_agent
+@pytest.mark.parametrize("task", ["two-state-2", "continuous-bandit"])
+def test_a_student_of_minibatches_resumes_bit_for_bit(agent: str, task: str) -> None:
+    has_metric = "metric_samples" in agent_config(agent, {}).model_dump()
+    options = MINIBATCHES | ({"metric_samples": 20} if has_metric else {})
+    lessons = Lessons(agent, task, options)
+    for _ in range(2):
+        lessons.update()
+    resumed = Lessons(agent, task, options)
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    for _ in range(2):
+        rollout, episodes = lessons.collect()
+        costs = episode_costs(episodes, lessons.num_costs)
+        expected = lessons.agent.update(rollout, costs, lessons.limits())
+        assert repr(resumed.agent.update(rollout, costs, lessons.limits())) == repr(expected)
+        if isinstance(agent_config(agent, options), AscentConfig):
+            assert expected["policy_steps"] >= 1.0
+    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
+
+
+@every_agent
+def test_a_bound_on_the_worst_episodes_returns_the_same_metrics_and_resumes(agent: str) -> None:
+    options = {"constraint": "cvar", "cvar_level": 0.5}
+    lessons, resumed = (Lessons(agent, "two-state-2", options) for _ in range(2))
+    assert set(lessons.update()) == set(Lessons(agent, "two-state-2").update())
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    rollout, _ = lessons.collect()
+    none_finished = np.empty((0, 2))
+    expected = lessons.agent.update(rollout, none_finished, lessons.limits())
+    assert repr(resumed.agent.update(rollout, none_finished, lessons.limits())) == repr(expected)
+
+
+def held_bytes() -> int:
+    """What all live tensors take."""
+    gc.collect()
+    return sum(thing.nbytes for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor))
+
+
+@pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
+@pytest.mark.parametrize("options", [{}, MINIBATCHES])
+def test_memory_is_flat_in_the_length_of_a_run(agent: str, options: dict[str, Any]) -> None:
+    lessons = Lessons(agent, "continuous-bandit", options)
+    lessons.update()
+    saved, held = len(encode(lessons.agent.state_dict())), held_bytes()
+    for _ in range(3):
+        lessons.update()
+    assert held_bytes() == held
+    assert len(encode(lessons.agent.state_dict())) == pytest.approx(saved, abs=200)  # digits of numbers
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@every_agent
+@every_task
+def test_a_student_on_a_gpu_learns_what_one_on_a_cpu_learns(agent: str, task: str) -> None:
+    on_cpu = Lessons(agent, task)
+    with torch.device("cuda"):
+        on_gpu = Lessons(agent, task)
+    np.testing.assert_array_equal(on_gpu.agent.state_dict()["policy"], on_cpu.agent.state_dict()["policy"])
+    rollout, episodes = on_cpu.collect()
+    costs = episode_costs(episodes, on_cpu.num_costs)
+    found, expected = (each.agent.update(rollout, costs, each.limits()) for each in (on_gpu, on_cpu))
+    for key, value in expected.items():
+        assert found[key] == pytest.approx(value, rel=0.02, abs=1e-3, nan_ok=True), key
+    on_cpu.agent.load_state_dict(on_gpu.agent.state_dict())
+    observations = rollout.observations[0]
+    np.testing.assert_array_equal(
+        on_gpu.agent.act_greedily(observations), on_cpu.agent.act_greedily(observations)
+    )

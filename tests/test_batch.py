@@ -63,3 +63,65 @@ def test_the_clipped_surrogate_is_pessimistic_by_hand() -> None:
     assert clipped_surrogate(torch.tensor([1.5, 0.5]), signed, 0.2).item() == pytest.approx(1.2 - 0.8)
     # what makes things worse counts in full
     assert clipped_surrogate(torch.tensor([0.5, 1.5]), signed, 0.2).item() == pytest.approx(0.5 - 1.5)
+
+
+def distinct_batch(num_samples: int = 10) -> LearningBatch:
+    """Each sample its own row: the number of the sample."""
+    observations = np.arange(num_samples, dtype=np.float32)[:, None]
+    return LearningBatch.gather(observations, np.arange(num_samples), compact=True)
+
+
+def test_a_pass_has_every_sample_once_in_a_new_order() -> None:
+    generator = np.random.default_rng(0)
+    batch = distinct_batch()
+    assert batch.num_parts(4) == 3
+    passes = []
+    parts = batch.parts(4, generator)
+    for _ in range(2):
+        found = [next(parts) for _ in range(3)]
+        assert [len(part.rows) for part in found] == [4, 3, 3]
+        passes.append([row for part in found for row in part.rows[:, 0].tolist()])
+        assert sorted(passes[-1]) == list(range(10))
+    assert passes[0] != passes[1]
+
+
+def test_a_minibatch_picks_its_own_of_the_samples_values() -> None:
+    part = distinct_batch().minibatch(np.array([7, 2]))
+    values = 10.0 * np.arange(10.0)
+    assert part.rows.tolist() == [[7.0], [2.0]]
+    assert part.actions.tolist() == [7, 2]
+    assert part.per_row(values).tolist() == part.per_decision(values).tolist() == [35.0, 10.0]
+    assert float(part.row_weights.sum()) == 1.0
+
+
+@pytest.mark.parametrize("size", [None, 10, 100])
+def test_a_batch_no_larger_than_a_minibatch_is_not_parted(size: int | None) -> None:
+    batch, generator = distinct_batch(), np.random.default_rng(0)
+    before = generator.bit_generator.state
+    assert next(batch.parts(size, generator)) is batch
+    assert generator.bit_generator.state == before
+
+
+def test_repeated_rows_are_not_parted() -> None:
+    batch = LearningBatch.gather(ROWS[STATES], ACTIONS, compact=True)
+    assert next(batch.parts(1, np.random.default_rng(0))) is batch
+
+
+def test_more_distinct_rows_than_asked_for_leave_the_samples_alone() -> None:
+    batch = LearningBatch.gather(ROWS[STATES], ACTIONS, compact=True, most_rows=2)
+    assert len(batch.rows) == 10
+    assert len(LearningBatch.gather(ROWS[STATES], ACTIONS, compact=True, most_rows=3).rows) == 3
+
+
+def test_thinning_keeps_the_samples_shares() -> None:
+    generator = np.random.default_rng(0)
+    rows, weights = distinct_batch(100).thinned(20, generator)
+    assert len(set(rows[:, 0].tolist())) == 20
+    assert weights.tolist() == pytest.approx([0.05] * 20)
+    repeated = LearningBatch.gather(
+        np.repeat(np.eye(30, dtype=np.float32), 4, 0), np.zeros(120, np.int64), compact=True
+    )
+    rows, weights = repeated.thinned(20, generator)
+    assert len(rows) <= 20
+    assert float(weights.sum()) == pytest.approx(1.0)
+    assert repeated.thinned(30, generator)[0] is repeated.rows

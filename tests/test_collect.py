@@ -138,3 +138,11 @@ def test_a_space_that_no_student_handles_is_refused() -> None:
 
 def test_discrete_actions_are_shifted_to_the_first() -> None:
     assert environment_actions(Discrete(2, start=5), np.array([0, 1])).tolist() == [5, 6]
+
+
+def test_a_rollout_says_what_its_first_episodes_have_cost_before() -> None:
+    """Always hasty: no cost in the camp, 1 a step in the mine, a time-out after 4 steps."""
+    collector = collector_of("two-state", num_envs=2, num_steps=3)
+    policy, generator = Constantly(1), np.random.default_rng(0)
+    carried = [collector.collect(policy, generator)[0].carried_costs.tolist() for _ in range(3)]
+    assert carried == [[[0.0], [0.0]], [[2.0], [2.0]], [[1.0], [1.0]]]

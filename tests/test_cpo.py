@@ -7,11 +7,12 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.actor_critic import Constraints
+from recrl.agents.actor_critic import improve_and_measure
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import CPOConfig
-from recrl.agents.cpo import ActiveConstraints, ConstrainedPolicyOptimisation
+from recrl.agents.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.cpo_dual import StepCase
+from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
@@ -44,7 +45,8 @@ def improve(
         np.array(limits or [10.0, 10.0]), np.array(gaps), math.nan if math.isnan(gaps[0]) else LENGTH
     )
     rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
-    metrics = rule.improve(policy, batch, advantages, constraints)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
     old = StochasticPolicy(3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0))
     moved = old.distribution(batch.rows).divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]
     metrics["kl"] = float(torch.dot(batch.row_weights, moved))

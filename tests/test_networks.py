@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from recrl.agents import networks
 from recrl.agents.networks import (
     INITIALISERS,
     Adam,
@@ -137,3 +138,23 @@ def test_parameters_of_another_network_are_refused() -> None:
     message = "the saved network has 3 parameters, this one 54: was it built with other options\\?"
     with pytest.raises(ValueError, match=message):
         parameters.load(np.zeros(3, dtype=np.float32))
+
+
+@pytest.mark.usefixtures("double_precision")
+def test_many_rows_in_blocks_are_all_rows_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    critics = Critics(3, 1, NetworkForm((5, 4), xavier), torch.Generator().manual_seed(0))
+    rows, targets = random_rows(23), torch.randn(2, 23, generator=torch.Generator().manual_seed(1))
+    weights = torch.full((23,), 1.0 / 23.0)
+    found = []
+    for size in (23, 5):
+        monkeypatch.setattr(networks, "BLOCK_ROWS", size)
+        losses = critics.differentiate(rows, weights, targets)
+        values = torch.from_numpy(critics.values(rows))
+        found.append(torch.cat([losses, critics.parameters.gradient.clone(), values.ravel()]))
+    torch.testing.assert_close(found[0], found[1])
+
+
+def test_blocks_cover_all_rows() -> None:
+    rows = list(range(1300))
+    assert [row for block in networks.blocks(1300) for row in rows[block]] == rows
+    assert len(networks.blocks(0)) == 1

@@ -9,11 +9,12 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 from scipy.optimize import nnls
 
-from recrl.agents.actor_critic import Constraints, PolicyRule
+from recrl.agents.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.cpo_dual import StepCase, StepProblem
 from recrl.agents.crpo import ConstraintRectifiedPolicyOptimisation, most_violated
+from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step, projection_weights
 from recrl.agents.policies import StochasticPolicy
@@ -127,7 +128,8 @@ def improved(
     before, old = policy.parameters.to_numpy(), policy.distribution(batch.rows)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), length)
-    metrics = rule_of(name, 2).improve(policy, batch, advantages, constraints)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    metrics = improve_and_measure(rule_of(name, 2), policy, experience, np.random.default_rng(0))
     moved = old.divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]
     metrics["kl"] = float(torch.dot(batch.row_weights, moved))
     return metrics, (policy.parameters.to_numpy() - before).astype(np.float64)

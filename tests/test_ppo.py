@@ -7,13 +7,14 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.actor_critic import Constraints, PolicyRule
+from recrl.agents.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.advantages import penalised_advantages
-from recrl.agents.ascent import climb, with_entropy, with_prices
+from recrl.agents.ascent import Objective, climb, with_entropy, with_prices
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.distributions import Categorical
+from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import Adam, NetworkForm, orthogonal
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.ppo import ProximalPolicyOptimisation
@@ -52,7 +53,8 @@ def improved(
     policy, batch, advantages = sampled(space)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), length)
-    metrics = rule_of(name, policy).improve(policy, batch, advantages, constraints)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    metrics = improve_and_measure(rule_of(name, policy), policy, experience, np.random.default_rng(0))
     return metrics, policy.parameters.to_numpy().astype(np.float64)
 
 
@@ -82,34 +84,51 @@ def test_where_no_action_is_better_trpo_stays() -> None:
     policy, batch, advantages = sampled(SPACES[0])
     before = policy.parameters.to_numpy()
     constraints = Constraints(np.array([1.0]), np.array([0.0]), 10.0)
-    metrics = rule_of("trpo", policy).improve(policy, batch, np.zeros((400, 2)), constraints)
+    experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints)
+    metrics = improve_and_measure(rule_of("trpo", policy), policy, experience, np.random.default_rng(0))
     np.testing.assert_array_equal(policy.parameters.to_numpy(), before)
     assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
     assert advantages.shape == (400, 3)
 
 
-def climbed(steps: int, largest_kl: float) -> tuple[int, bool]:
-    """The steps taken up an advantage, and whether the policy is another."""
-    policy, batch, advantages = sampled(SPACES[0])
+UNKNOWN = Constraints(np.array([1.0, 1.0]), np.array([math.nan, math.nan]), math.nan)
+
+
+def climbed(**options: object) -> tuple[float, bool, set[int]]:
+    """The steps taken up an advantage, whether the policy is another, and the samples a step uses."""
+    policy, batch, advantages = sampled(SPACES[1])
     before = policy.parameters.to_numpy()
-    weights = batch.per_decision(advantages[:, 0])
-    taken = climb(
+    sizes = set()
+
+    def objective(part: Experience) -> Objective:
+        weights = part.batch.per_decision(advantages[:, 0])
+        sizes.add(len(part.batch.rows))
+        return lambda _, ratios: ratios @ weights
+
+    metrics = climb(
         policy,
         Adam(policy.parameters, 0.01),
-        batch,
-        lambda _, ratios: ratios @ weights,
-        steps=steps,
-        largest_kl=largest_kl,
+        Experience.of(policy, batch, advantages, UNKNOWN),
+        objective,
+        config=PPOConfig.model_validate(options),
+        generator=np.random.default_rng(0),
     )
-    return taken, bool(np.any(policy.parameters.to_numpy() != before))
+    return metrics["policy_steps"], bool(np.any(policy.parameters.to_numpy() != before)), sizes
 
 
 def test_the_ascent_takes_its_steps_and_stops_when_it_has_gone_too_far() -> None:
-    assert climbed(0, 1.0) == (0, False)
-    assert climbed(3, math.inf) == (3, True)
-    taken, moved = climbed(100, 1e-4)
+    assert climbed(policy_steps=3, policy_passes=1, target_kl=1e9) == (3.0, True, {400})
+    taken, moved, _ = climbed(policy_steps=100, target_kl=1e-4)
     assert moved
-    assert 1 <= taken < 20
+    assert 1.0 <= taken < 20.0
+
+
+def test_with_minibatches_the_steps_are_those_of_the_passes_if_they_are_more() -> None:
+    few = {"minibatch_size": 100, "target_kl": 1e9, "policy_passes": 3}
+    assert climbed(policy_steps=2, **few) == (12.0, True, {100})
+    assert climbed(policy_steps=20, **few) == (20.0, True, {100})
+    taken, _, _ = climbed(policy_steps=2, minibatch_size=100, target_kl=1e-4)
+    assert taken < 8.0
 
 
 def test_an_entropy_bonus_adds_the_mean_entropy_in_nats() -> None:

@@ -1,0 +1,159 @@
+"""What of an episode's cost is constrained: its mean, or its mean in the worst episodes (CVaR).
+
+The conditional value at risk at level alpha of an episode's cost C is the mean of its worst share 1 - alpha,
+
+    CVaR(C) = min over nu of  nu + E[max(C - nu, 0)] / (1 - alpha)        (Rockafellar and Uryasev 2000),
+
+and the value at risk, the alpha-quantile of C, is a nu that attains it. alpha = 0 is the mean. Since nu
+minimises, a small change of the policy changes the CVaR as if nu were fixed (Tamar et al. 2015; Chow et al.
+2017): by E[max(C - nu, 0)] / (1 - alpha) alone. That is the mean over episodes of the *tail costs*
+
+    c'_t = (max(S_{t+1} - nu, 0) - max(S_t - nu, 0)) / (1 - alpha),  S_t the episode's cost before step t,
+
+which sum to max(C - nu, 0) / (1 - alpha) over an episode: only cost beyond the quantile counts. So a student
+of mean costs that is given c'_t for the costs, and nu + the mean of their sums for the mean episode cost,
+keeps the CVaR within the limit, whatever its algorithm.
+
+Where all episodes are about equally bad, no episode has cost beyond its quantile: the CVaR is flat there, and
+a student that violates its limit d could not leave (Greenberg et al. 2022). But the CVaR is at most d if and
+only if nu + E[max(C - nu, 0)] / (1 - alpha) is, for some nu <= d. Hence nu is the value at risk or d,
+whichever is less; where the limit is kept, that is the value at risk.
+
+Left out: Chow et al. let policy and critics see S_t. Here both see the task's observations alone; the policy
+is the best of those, and the critics are baselines that know the average S_t. What a step does to later tail
+costs is therefore seen by the trace, not by the bootstrap: with ``cvar``, a ``cost_trace_decay`` near 1 is
+right. And only a share 1 - alpha of the episodes of an update counts: it needs many.
+
+Letters: T steps, B environments, k costs, E finished episodes, alpha the level, nu the value at risk.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.agents.agent import Rollout
+from recrl.environments.cmdp import Floats
+
+
+def value_at_risk(costs: Floats, level: float) -> Floats:
+    """nu, the smallest of E costs that at least a share alpha of them does not exceed, [E, k] -> [k].
+
+    >>> value_at_risk(np.array([[4.0], [1.0], [3.0], [2.0]]), 0.75)
+    array([3.])
+    """
+    # Without the tolerance a level that is a count over E, 0.9 of 10, may round up to the next count.
+    rank = max(math.ceil(level * len(costs) - 1e-9), 1)
+    quantile: Floats = np.sort(costs, axis=0)[rank - 1]
+    return quantile
+
+
+def conditional_value_at_risk(costs: Floats, level: float) -> Floats:
+    """The mean of the worst share 1 - alpha of E costs, [E, k] -> [k].
+
+    >>> conditional_value_at_risk(np.array([[4.0], [1.0], [3.0], [2.0]]), 0.5)
+    array([3.5])
+    """
+    return tail_bound(costs, value_at_risk(costs, level), level)
+
+
+def tail_bound(costs: Floats, threshold: Floats, level: float) -> Floats:
+    """At least the CVaR of E costs, for any nu: nu + mean(max(C - nu, 0)) / (1 - alpha), [E, k] -> [k].
+
+    >>> tail_bound(np.array([[4.0], [1.0], [3.0], [2.0]]), np.array([2.5]), 0.5)
+    array([3.5])
+    """
+    bound: Floats = threshold + np.maximum(costs - threshold, 0.0).mean(axis=0) / (1.0 - level)
+    return bound
+
+
+def tail_costs(
+    costs: Floats, *, carried: Floats, ended: npt.NDArray[np.bool_], threshold: Floats, level: float
+) -> Floats:
+    """The module's c'_t.
+
+    Args:
+        costs: of each step, at least 0, [T, B, k].
+        carried: S of the episodes under way before the first step, [B, k].
+        ended: the step ended an episode, [T, B].
+        threshold: nu, [k].
+        level: alpha in [0, 1).
+
+    Returns:
+        [T, B, k].
+    """
+    beyond = np.empty_like(costs)
+    so_far = carried
+    for step in range(len(costs)):
+        after = so_far + costs[step]
+        beyond[step] = np.maximum(after - threshold, 0.0) - np.maximum(so_far - threshold, 0.0)
+        so_far = np.where(ended[step][:, None], 0.0, after)
+    return beyond / (1.0 - level)
+
+
+class MeanCost:
+    """The mean episode cost is constrained; nothing is kept."""
+
+    def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
+        """See ``TailCost.judge``."""
+        values = episode_costs.mean(axis=0) if len(episode_costs) else np.full(rollout.costs.shape[2], np.nan)
+        return rollout.costs, values
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Nothing to load."""
+
+
+class TailCost:
+    """The CVaR of the episode cost is constrained.
+
+    Args:
+        level: alpha in [0, 1).
+        num_costs: k.
+    """
+
+    def __init__(self, level: float, num_costs: int) -> None:
+        self._level = level
+        self._value_at_risk = np.zeros(num_costs)
+
+    def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
+        """The costs to learn from, and what the limits are compared with.
+
+        Args:
+            rollout: the steps.
+            episode_costs: of the episodes that finished in it, [E, k]; with E = 0 the value at risk stays.
+            limits: d, [k], possibly infinite.
+
+        Returns:
+            Costs a step whose sums are to be lowered, [T, B, k]; and what is to be within the limits, [k]:
+            the CVaR where that is, else a bound on it; NaN if no episode finished.
+        """
+        values = np.full_like(limits, np.nan)
+        if len(episode_costs):
+            self._value_at_risk = value_at_risk(episode_costs, self._level)
+        threshold = np.minimum(self._value_at_risk, limits)
+        if len(episode_costs):
+            values = tail_bound(episode_costs, threshold, self._level)
+        costs = tail_costs(
+            rollout.costs,
+            carried=rollout.carried_costs,
+            ended=rollout.terminated | rollout.truncated,
+            threshold=threshold,
+            level=self._level,
+        )
+        return costs, values
+
+    def state_dict(self) -> dict[str, Any]:
+        """The value at risk, [k]."""
+        return {"value_at_risk": self._value_at_risk.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._value_at_risk = np.array(state["value_at_risk"], np.float64)

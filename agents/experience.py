@@ -1,0 +1,126 @@
+"""What a student knows after a rollout: its samples, what they were worth, and how the constraints stand.
+
+Letters: N samples, k costs, D decisions, E finished episodes, j of the k limits are finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from recrl.agents.advantages import reward_spread, scaled_advantages
+from recrl.agents.agent import Rollout
+from recrl.agents.batch import LearningBatch
+from recrl.agents.distributions import Distribution
+from recrl.agents.policies import StochasticPolicy
+from recrl.environments.cmdp import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Constraints:
+    """What is known about the constraints after a rollout.
+
+    Attributes:
+        limits: d, [k], possibly infinite.
+        gaps: constrained value of the finished episodes (their mean undiscounted cost, or its CVaR) minus
+            limit, [k]; -inf where the limit is infinite, NaN where no episode finished.
+        episode_length: mean steps of an episode, above 0: environment steps over finished episodes; NaN if
+            none finished.
+    """
+
+    limits: Floats
+    gaps: Floats
+    episode_length: float
+
+    @classmethod
+    def measure(
+        cls, rollout: Rollout, num_episodes: int, values: Floats, limits: Floats, horizon: int | None
+    ) -> Constraints:
+        """Compare the constrained values of E finished episodes, [k], with the limits, [k]."""
+        if num_episodes == 0:
+            return cls(limits, np.full_like(limits, np.nan), float("nan"))
+        length = rollout.rewards.size / num_episodes
+        # A rollout that ends few of the episodes it carries on would make them look longer than they can be.
+        return cls(limits, values - limits, min(length, horizon or length))
+
+    @property
+    def known(self) -> bool:
+        """Whether any episode finished."""
+        return not bool(np.isnan(self.episode_length))
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveConstraints:
+    """The constraints whose limits are finite, j of k.
+
+    Attributes:
+        index: which they are, [j].
+        violations: c, (constrained value - limit) / mean episode length, [j].
+    """
+
+    index: npt.NDArray[np.int64]
+    violations: Floats
+
+    @classmethod
+    def of(cls, constraints: Constraints) -> ActiveConstraints:
+        """Those of ``constraints``, in the unit of the surrogates: cost per step."""
+        index = np.flatnonzero(np.isfinite(constraints.limits))
+        return cls(index, constraints.gaps[index] / constraints.episode_length)
+
+
+@dataclass(frozen=True, eq=False)
+class Experience:
+    """What a policy is improved by.
+
+    Attributes:
+        batch: the samples, or a minibatch of them.
+        old: pi_old(. | s), of the policy that collected them, at the batch's rows.
+        old_log_probs: log pi_old(a | s) of the batch's decisions, [D].
+        advantages: raw estimates for the reward, then each cost, of all samples of the rollout, [N, 1 + k].
+        constraints: limits and gaps.
+    """
+
+    batch: LearningBatch
+    old: Distribution
+    old_log_probs: Tensor
+    advantages: Floats
+    constraints: Constraints
+
+    @classmethod
+    def of(
+        cls, policy: StochasticPolicy, batch: LearningBatch, advantages: Floats, constraints: Constraints
+    ) -> Experience:
+        """The experience of a policy that has not moved since it collected the samples."""
+        old = policy.distribution(batch.rows)
+        log_probs = old.log_prob(batch.actions, batch.decision_rows)
+        return cls(batch, old, log_probs, advantages, constraints)
+
+    def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
+        """Minibatches without end, as ``LearningBatch.parts`` makes them; itself where there is one part."""
+        for part in self.batch.parts(size, generator):
+            if part.samples is None:
+                yield self
+                continue
+            index = torch.as_tensor(part.samples)
+            log_probs = self.old_log_probs.index_select(0, index)
+            yield replace(self, batch=part, old=self.old.at(index), old_log_probs=log_probs)
+
+    def ratios(self, now: Distribution) -> Tensor:
+        """The probability ratios pi(a | s) / pi_old(a | s) of the decisions, [D]; exactly 1 for pi_old."""
+        log_probs = now.log_prob(self.batch.actions, self.batch.decision_rows)
+        return torch.exp(log_probs - self.old_log_probs)
+
+    def in_reward_spreads(self) -> tuple[Floats, Floats, Floats]:
+        """Centred advantages and violations, in standard deviations of the reward's advantages.
+
+        Returns:
+            Of the reward, [N]; of the costs that have a limit, [N, j]; and their violations c, [j].
+        """
+        active = ActiveConstraints.of(self.constraints)
+        rewards, costs = scaled_advantages(self.advantages, "reward-scaled")
+        return rewards, costs[:, active.index], active.violations / reward_spread(self.advantages)

@@ -1,0 +1,58 @@
+"""How the two presets differ: every option of every student whose value in ``paper`` is not ours.
+
+python -m recrl.agents.presets     prints the table of the README
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from recrl.agents.registry import AGENTS, agent_config
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """One option that the presets set differently.
+
+    Attributes:
+        option: the field that switches it.
+        recommended: its value there, as JSON.
+        paper: likewise.
+        students: who have it with these values.
+    """
+
+    option: str
+    recommended: str
+    paper: str
+    students: tuple[str, ...]
+
+
+def deviations() -> tuple[Deviation, ...]:
+    """All of them, in the order of the options."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+    for student in AGENTS:
+        ours, theirs = (options_of(student, preset) for preset in ("recommended", "paper"))
+        for option, value in ours.items():
+            if value != theirs[option]:
+                found.setdefault((option, json.dumps(value), json.dumps(theirs[option])), []).append(student)
+    return tuple(Deviation(*values, tuple(students)) for values, students in found.items())
+
+
+def options_of(student: str, preset: str) -> dict[str, Any]:
+    """Every option of a student under a preset but the preset itself, as JSON values."""
+    return agent_config(student, {"preset": preset}).model_dump(mode="json", exclude={"preset"})
+
+
+def table() -> str:
+    """The deviations as a Markdown table."""
+    rows = ["| field | `recommended` | `paper` | students |", "|---|---|---|---|"]
+    for each in deviations():
+        students = "all" if set(each.students) == set(AGENTS) else ", ".join(each.students)
+        rows.append(f"| `{each.option}` | {each.recommended} | {each.paper} | {students} |")
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    print(table())
