@@ -2,9 +2,9 @@
 
 Each gremlin is welded, softly, to a point that runs around a circle of radius 0.35 m, once in 2 pi seconds,
 all in phase. Undisturbed, all of them move alike: f(t) from the middle of the circle. The circles keep
-apart, so that the robot meets one gremlin at a time. The gremlin nearest the robot is a body; the others
-follow f(t). The body becomes another gremlin when that one is nearer, once nothing touches it and it is
-back on its course.
+apart, so that the robot meets one gremlin at a time. The gremlin that the robot may meet next is a body; the
+others follow f(t). The body becomes another gremlin when that one is nearer, or none when none is near, once
+nothing touches it and it is back on its course. While it is none it hovers, untied, where nothing is.
 
 This halves the cost of a step, and robots cannot tell: over encounters of 120 steps the robot ends within
 1e-15 m of where it ends among six bodies.
@@ -29,6 +29,12 @@ from recrl.environments.scene import gremlin_xml
 
 ON_COURSE = 0.005
 """How near f(t) the body must be, metres, before it may become another gremlin."""
+ALERT = 0.1
+"""A gremlin becomes a body when it is less than this, metres, from where the robot could touch it: in one
+environment step the two come nearer by two thirds of this at most."""
+NO_GREMLIN = -1
+IDLE_PLACE = (0.0, 0.0, 20.0)
+"""Where the body hovers while it is no gremlin, metres."""
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,10 @@ _CENTRES = ((np.arange(LIDAR_BINS) + 0.5 + _HALF) % LIDAR_BINS - _HALF).astype(n
 _SECTORS_PER_RADIAN = np.float32(LIDAR_BINS / (2.0 * np.pi))
 _NEARNESS = np.float32(-1.0 / LIDAR_RANGE)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_HALF_TURN, _FADE = np.float32(_HALF), np.float32(_HALF - 1.5)
 
 
-def egocentric(points: Floats, rotation: Floats, place: Floats) -> Reading:
+def egocentric(points: Floats, rotation: Floats, position: Floats) -> Reading:
     """Where objects on the floor lie in the robot's frame, as seen from above.
 
     ego = ((x, y, 0) - robot position) R = (x, y, 0) R - (robot position) R, of which the first two numbers.
@@ -38,14 +39,15 @@ def egocentric(points: Floats, rotation: Floats, place: Floats) -> Reading:
     Args:
         points: (x, y) of the objects, metres, [B, P, 2].
         rotation: R, from the robot's frame to the world's, [B, 3, 3].
-        place: (robot position) R, metres, [B, 3].
+        position: (robot position) R, metres, [B, 3].
 
     Returns:
         metres, [P, B, 2].
     """
-    ego = np.empty((points.shape[1], points.shape[0], 2), np.float32)
     turned = points @ rotation[:, :2, :2]
-    np.subtract(turned.transpose(1, 0, 2), place[:, :2], out=ego, casting="same_kind")
+    turned -= position[:, None, :2]
+    ego = np.empty((points.shape[1], points.shape[0], 2), np.float32)
+    ego[...] = turned.transpose(1, 0, 2)
     return ego
 
 
@@ -59,7 +61,7 @@ def lidar(ego: Reading, kinds: Sequence[slice], out: Reading) -> None:
     Args:
         ego: objects in the robot's frame, those of a kind together, [P, B, 2].
         kinds: where in P each kind is, G of them.
-        out: for the readings, in [0, 1], [B, G, 16].
+        out: for the readings, in [0, 1], [G, B, 16].
     """
     x, y = ego[..., 0], ego[..., 1]
     reach = np.hypot(x, y)
@@ -70,10 +72,10 @@ def lidar(ego: Reading, kinds: Sequence[slice], out: Reading) -> None:
     sector *= _SECTORS_PER_RADIAN
     weight = sector[..., None] - _CENTRES
     np.abs(weight, out=weight)
-    weight -= np.float32(_HALF)
+    weight -= _HALF_TURN
     np.abs(weight, out=weight)
-    weight -= np.float32(_HALF - 1.5)
+    weight -= _FADE
     np.minimum(weight, _ONE, out=weight)
     weight *= reach[..., None]
-    for index, kind in enumerate(kinds):
-        np.maximum.reduce(weight[kind], axis=0, initial=_ZERO, out=out[:, index])
+    for kind, shown in zip(kinds, out, strict=True):
+        np.maximum.reduce(weight[kind], axis=0, initial=_ZERO, out=shown)

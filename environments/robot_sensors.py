@@ -4,25 +4,28 @@ All follow from the robot's coordinates: with R the rotation from the robot's fr
 accelerometer reads R^T (a + (0, 0, 9.81)), the velocimeter R^T v, the magnetometer R^T (0, -0.5, 0) and the
 gyro the angular velocity, which MuJoCo keeps in the robot's frame.
 
+At the sizes of these arrays what costs time is the number of NumPy's calls. So the sensors of a robot are an
+object that looks, once, where its numbers lie, and then writes them in a few calls.
+
 Letters: B environments.
 """
 
 from __future__ import annotations
 
+import math
+from typing import Protocol
+
 import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_tasks import ROBOT_HEIGHT, SafetyTask
+from recrl.environments.safety_tasks import ROBOT_HEIGHT, Robot
 
-Readings = npt.NDArray[np.float32]
+Places = npt.NDArray[np.intp]
 
 GRAVITY = 9.81
 MAGNETIC_FIELD = (0.0, -0.5, 0.0)
 _UP = np.array((0.0, 0.0, GRAVITY))
-_QUATERNIONS = np.array(((3, 4, 5, 6), (9, 10, 11, 12)))
-"""Of the Car's body and of its rear ball, in its coordinates."""
-_BALL_AND_ROBOT_SPINS = np.array((8, 9, 10, 3, 4, 5))
 
 
 def _rotation_form() -> Floats:
@@ -57,77 +60,132 @@ def rotation_matrices(quaternions: Floats) -> Floats:
     return matrices
 
 
-class RobotSensors:
+class RobotSensors(Protocol):
     """The sensors of B robots of one kind.
 
-    Args:
-        task: gives the robot.
-        number: B.
-
     Attributes:
-        order: the sensors and their sizes, in the order in which ``read`` returns them.
+        readings: everything that ``read`` finds, flat.
+        places: for each sensor, by name, where in ``readings`` its numbers are, [B, size].
+        rotation: R, from the robots' frames to the world's, [B, 3, 3].
+        position: (the robots' positions) R, metres, [B, 3].
     """
 
-    def __init__(self, task: SafetyTask, number: int) -> None:
-        self._car = task.robot == "Car"
-        ball = (("ballquat_rear", 9), ("ballangvel_rear", 3)) if self._car else ()
-        self.order = (("accelerometer", 3), ("velocimeter", 3), ("magnetometer", 3), *ball, ("gyro", 3))
-        # In the world's frame: acceleration, velocity, magnetic field, position.
-        self._world = np.zeros((number, 4, 3))
+    readings: Floats
+    places: dict[str, Places]
+    rotation: Floats
+    position: Floats
+
+    def read(self) -> None:
+        """Compute the readings from the state as it is now."""
+
+
+class CarSensors:
+    """The sensors of B Cars; see ``RobotSensors``.
+
+    Args:
+        qpos, qvel, qacc: live views of coordinates, velocities and accelerations, those of the robot first:
+            [B, 13 or more], [B, 11 or more], [B, 11 or more].
+    """
+
+    def __init__(self, qpos: Floats, qvel: Floats, qacc: Floats) -> None:
+        number = len(qpos)
+        self.readings, (local, rotations, spins), places = _parts(number, (4, 3), (2, 9), (2, 3))
+        self.places = {
+            "accelerometer": places[0][:, 0],
+            "velocimeter": places[0][:, 1],
+            "magnetometer": places[0][:, 2],
+            "ballquat_rear": places[1][:, 1],
+            "gyro": places[2][:, 0],
+            "ballangvel_rear": places[2][:, 1],
+        }
+        # In the world's frame and in the robot's: acceleration, velocity, magnetic field, position.
+        self._world, self._local = np.zeros((number, 4, 3)), local
+        self._world[:, 2] = MAGNETIC_FIELD
+        self._rows = [self._world[:, row] for row in range(4)]
+        self._acceleration, self._velocity, self._position = qacc[:, :3], qvel[:, :3], qpos[:, :3]
+        # Of the Car's body and of its rear ball: quaternions (from 3 and from 9), q q^T, rotations, and spins
+        # (from 3 and from 8).
+        quaternions = qpos[:, 1:13].reshape(number, 2, 6)[..., 2:]
+        self._factors = quaternions[..., None], quaternions[..., None, :]
+        self._products = np.zeros((number, 2, 4, 4))
+        self._flat_products = self._products.reshape(number, 2, 16)
+        self._rotations = rotations
+        self._spins, self._felt_spins = qvel[:, 1:11].reshape(number, 2, 5)[..., 2:], spins
+        self.rotation = rotations.reshape(number, 2, 3, 3)[:, 0]
+        self.position = local[:, 3]
+
+    def read(self) -> None:
+        """Compute the readings from the state as it is now."""
+        acceleration, velocity, _, position = self._rows
+        np.add(self._acceleration, _UP, out=acceleration)
+        velocity[...] = self._velocity
+        position[...] = self._position
+        np.multiply(*self._factors, out=self._products)
+        np.matmul(self._flat_products, _ROTATION_FORM, out=self._rotations)
+        np.matmul(self._world, self.rotation, out=self._local)
+        self._felt_spins[...] = self._spins
+
+
+class PointSensors:
+    """The sensors of B Points; see ``RobotSensors``.
+
+    Args:
+        qpos, qvel, qacc: live views of coordinates, velocities and accelerations, (x, y, yaw) of the robot
+            first: [B, 3 or more] each.
+    """
+
+    def __init__(self, qpos: Floats, qvel: Floats, qacc: Floats) -> None:
+        number = len(qpos)
+        self.readings, (local, spins), places = _parts(number, (4, 3), (3,))
+        self.places = {
+            "accelerometer": places[0][:, 0],
+            "velocimeter": places[0][:, 1],
+            "magnetometer": places[0][:, 2],
+            "gyro": places[1],
+        }
+        self._world, self._local = np.zeros((number, 4, 3)), local
         self._world[:, 0, 2] = GRAVITY
         self._world[:, 2] = MAGNETIC_FIELD
         self._world[:, 3, 2] = ROBOT_HEIGHT
-        self._local = np.zeros((number, 4, 3))
-        self._flat_local = self._local.reshape(number, 12)
-        # Of the Car's body and rear ball: q q^T, and the rotations that follow from it.
-        self._products = np.zeros((number, 2, 4, 4))
-        self._flat_products = self._products.reshape(number, 2, 16)
-        self._rotations = np.zeros((number, 2, 9))
-        self._rotation = self._rotations.reshape(number, 2, 3, 3)[:, 0]
+        self._rows = [self._world[:, row, :2] for row in range(4)]
+        self._acceleration, self._velocity, self._position = qacc[:, :2], qvel[:, :2], qpos[:, :2]
+        self._yaw, self._spin, self._felt_spin = qpos[:, 2], qvel[:, 2], spins[:, 2]
+        self.rotation = np.zeros((number, 3, 3))
+        self.rotation[:, 2, 2] = 1.0
+        self._cosines = self.rotation[:, 0, 0], self.rotation[:, 1, 1]
+        self._sines = self.rotation[:, 1, 0], self.rotation[:, 0, 1]
+        self.position = local[:, 3]
 
-    def read(self, qpos: Floats, qvel: Floats, qacc: Floats, out: Readings) -> tuple[Floats, Floats]:
-        """Write what the robots feel, and find where they are.
+    def read(self) -> None:
+        """Compute the readings from the state as it is now."""
+        acceleration, velocity, _, position = self._rows
+        acceleration[...] = self._acceleration
+        velocity[...] = self._velocity
+        position[...] = self._position
+        self._cosines[1][...] = np.cos(self._yaw, out=self._cosines[0])
+        np.negative(np.sin(self._yaw, out=self._sines[0]), out=self._sines[1])
+        np.matmul(self._world, self.rotation, out=self._local)
+        self._felt_spin[...] = self._spin
 
-        Args:
-            qpos: the robots' coordinates, [B, 13] or [B, 3].
-            qvel: their velocities, [B, 11] or [B, 3].
-            qacc: their accelerations, [B, ...].
-            out: for the readings, [B, size].
 
-        Of the first three, numbers after the robots' own are ignored.
+def make_sensors(robot: Robot, qpos: Floats, qvel: Floats, qacc: Floats) -> RobotSensors:
+    """The sensors of B robots of one kind, whose numbers come first in these live views."""
+    return _SENSORS[robot](qpos, qvel, qacc)
 
-        Returns:
-            rotations R from the robots' frames to the world's, [B, 3, 3], and (position) R, metres, [B, 3];
-            both are overwritten by the next call.
-        """
-        if self._car:
-            return self._read_car(qpos, qvel, qacc, out)
-        world = self._world
-        world[:, 0, :2] = qacc[:, :2]
-        world[:, 1, :2] = qvel[:, :2]
-        world[:, 3, :2] = qpos[:, :2]
-        cosine, sine = np.cos(qpos[:, 2]), np.sin(qpos[:, 2])
-        rotation = np.zeros((len(qpos), 3, 3))
-        rotation[:, 0, 0] = rotation[:, 1, 1] = cosine
-        rotation[:, 1, 0] = sine
-        np.negative(sine, out=rotation[:, 0, 1])
-        rotation[:, 2, 2] = 1.0
-        np.matmul(world, rotation, out=self._local)
-        out[:, :9] = self._flat_local[:, :9]
-        out[:, 9:11] = 0.0
-        out[:, 11] = qvel[:, 2]
-        return rotation, self._local[:, 3]
 
-    def _read_car(self, qpos: Floats, qvel: Floats, qacc: Floats, out: Readings) -> tuple[Floats, Floats]:
-        world = self._world
-        np.add(qacc[:, :3], _UP, out=world[:, 0])
-        world[:, 1] = qvel[:, :3]
-        world[:, 3] = qpos[:, :3]
-        quaternions = qpos[:, _QUATERNIONS]
-        np.multiply(quaternions[..., None], quaternions[..., None, :], out=self._products)
-        np.matmul(self._flat_products, _ROTATION_FORM, out=self._rotations)
-        np.matmul(world, self._rotation, out=self._local)
-        out[:, :9] = self._flat_local[:, :9]
-        out[:, 9:18] = self._rotations[:, 1]
-        out[:, 18:] = qvel[:, _BALL_AND_ROBOT_SPINS]
-        return self._rotation, self._local[:, 3]
+_SENSORS: dict[str, type[CarSensors] | type[PointSensors]] = {"Car": CarSensors, "Point": PointSensors}
+
+
+def _parts(number: int, *shapes: tuple[int, ...]) -> tuple[Floats, list[Floats], list[Places]]:
+    """A flat array, views [B, *shape] of its parts, and where in it their numbers are."""
+    ends = np.cumsum([number * math.prod(shape) for shape in shapes]).tolist()
+    flat, places = np.zeros(ends[-1]), np.arange(ends[-1])
+    starts = [0, *ends[:-1]]
+    pieces = [
+        (slice(start, end), (number, *shape)) for start, end, shape in zip(starts, ends, shapes, strict=True)
+    ]
+    return (
+        flat,
+        [flat[piece].reshape(shape) for piece, shape in pieces],
+        [places[piece].reshape(shape) for piece, shape in pieces],
+    )

@@ -90,7 +90,7 @@ def _checked(
             f"{task.name}: actions must be numbers of shape {shape}, "
             f"got {actions.dtype} of shape {actions.shape}"
         )
-    if np.abs(actions).max() <= 1.0:
+    if np.maximum.reduce(np.abs(actions), axis=None) <= 1.0:
         return actions
     if not np.isfinite(actions).all():
         raise ValueError(f"{task.name}: actions must be finite, got {actions.tolist()}")

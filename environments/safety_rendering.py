@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.gremlins import gremlin_course
 from recrl.environments.robot_sensors import rotation_matrices
 from recrl.environments.safety_tasks import LIDAR_BINS
 from recrl.environments.safety_worlds import GOAL_HEIGHT, SafetyWorlds
@@ -139,7 +140,7 @@ class SafetyRenderer:
         worlds, task = self._worlds, self._worlds.task
         if not task.gremlins.number:
             return
-        height = float(self._data.body("gremlin").xpos[2])
+        height = float(gremlin_course(task).positions[worlds.steps[index], 2])
         for gremlin, place in enumerate(worlds.points[index, worlds.group["gremlins"]]):
             if gremlin != worlds.embodied[index]:
                 turn = rotation_matrices(upright(worlds.gremlin_yaws[index, gremlin]))

@@ -19,6 +19,8 @@ Letters: B worlds, P objects that the lidar sees, k costs.
 from __future__ import annotations
 
 import copy
+import functools
+import math
 from typing import Any, NamedTuple
 
 import mujoco
@@ -26,14 +28,13 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.gremlins import ON_COURSE, gremlin_course, leads
+from recrl.environments.gremlins import ALERT, IDLE_PLACE, NO_GREMLIN, ON_COURSE, gremlin_course, leads
 from recrl.environments.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.lidar import egocentric, lidar
-from recrl.environments.robot_sensors import RobotSensors
+from recrl.environments.robot_sensors import RobotSensors, make_sensors
 from recrl.environments.safety_tasks import (
     BUTTON_DELAY,
     EXCEPTION_REWARD,
-    GREMLIN_HEIGHT,
     HORIZON,
     LIDAR_BINS,
     REWARD_BOUND,
@@ -42,14 +43,17 @@ from recrl.environments.safety_tasks import (
     VASE_SPEED,
     SafetyTask,
 )
-from recrl.environments.scene import make_scene, upright
-from recrl.environments.simulations import Simulations
+from recrl.environments.scene import Scene, make_scene, upright
+from recrl.environments.simulations import Simulations, anything
 
 Booleans = npt.NDArray[np.bool_]
 Observations = npt.NDArray[np.float32]
 
 GOAL_HEIGHT = 0.16
 """Height of the goal area's middle, metres: in Push, distances to it are three-dimensional."""
+_LEAST, _MOST = np.array(-REWARD_BOUND), np.array(REWARD_BOUND)
+_NOBODY = np.zeros(0, np.intp)
+_NONE = slice(0, 0)
 
 
 class Outcome(NamedTuple):
@@ -90,7 +94,7 @@ class SafetyWorlds:
         scene: the physics' model.
         simulations: the physics.
         generators: one generator for each world.
-        qpos, qvel: coordinates and velocities, live views, [B, ...].
+        qpos, qvel, qacc: coordinates, velocities and accelerations, live views, [B, ...].
         points: (x, y) of everything that the lidar sees, metres, [B, P, 2]; ``group`` tells which is which.
         ranges: distances from the robot to all of them, seen from above, metres, [B, P].
         group: for each kind, its slice of P.
@@ -100,7 +104,7 @@ class SafetyWorlds:
         button_timer: steps until buttons are seen and felt again, [B].
         circles: middles of the gremlins' circles, metres, [B, gremlins, 2].
         gremlin_yaws: radians, [B, gremlins].
-        embodied: the gremlin that is a body, [B].
+        embodied: the gremlin that is a body, or NO_GREMLIN, [B].
         touching: bodies of the model that the robot touches, of those that matter, [B, bodies].
     """
 
@@ -125,43 +129,17 @@ class SafetyWorlds:
         self.mocap_pos = self.simulations.state(state.mjSTATE_MOCAP_POS, (model.nmocap, 3))
         self.mocap_quat = self.simulations.state(state.mjSTATE_MOCAP_QUAT, (model.nmocap, 4))
         self._control = self.simulations.state(state.mjSTATE_CTRL, (model.nu,))
-        self._qacc = self.simulations.output("qacc", (model.nv,))
-        self._awake = self.simulations.output("tree_awake", (model.ntree,), np.int32)
+        self.qacc = self.simulations.output("qacc", (model.nv,))
+        self._object_awake = self.simulations.output("tree_awake", (model.ntree,), np.int32)[:, 1:]
         self.touching = np.zeros((number, model.nbody), np.bool_)
-        self._root = np.asarray(model.body_rootid)
+        self._anything_touched = False
+        self._root = model.body_rootid[model.geom_bodyid].tolist()
 
-        counts = {"goal": 1} | {
-            kind: number for kind, (number, _) in keepouts(task).items() if kind != "goal"
-        }
-        self.group: dict[str, slice] = {}
-        end = 0
-        for kind in task.lidars:
-            self.group[kind] = slice(end, end + counts[kind])
-            end += counts[kind]
-        self.points = np.zeros((number, end, 2))
-        self.ranges = np.zeros((number, end))
-        # (x, y) as x + iy: one operation instead of five for a distance.
-        self._plane = self.points.view(np.complex128)[..., 0]
-        self._offsets = np.zeros_like(self._plane)
-        self._robot_plane = self.qpos[:, :2].view(np.complex128)
-        self._sensors = RobotSensors(task, number)
-        self._kinds = list(self.group.values())
-        self._order = _sorted_order(task, self._sensors)
-        self._perceived = np.zeros((number, task.observation_size), np.float32)
-        felt = task.observation_size - LIDAR_BINS * len(task.lidars)
-        self._felt = self._perceived[:, :felt]
-        self._seen = self._perceived[:, felt:].reshape(number, len(task.lidars), LIDAR_BINS)
-        vases = task.vases.number
-        self._vases = self.qpos[:, self.scene.robot_qpos :][:, : 7 * vases].reshape(number, vases, 7)[..., :2]
-        self._vase_velocities = self.qvel[:, self.scene.robot_qvel :][:, : 6 * vases].reshape(
-            number, vases, 6
-        )[..., :3]
-        self._box = self.qpos[:, self.scene.box_qpos :][:, :3]
-        self._is_button = task.goal == "Button"
-
+        self._lay_out_objects()
+        self._lay_out_observations()
         self._indicators = [_INDICATORS[term] for term in task.cost_terms]
         self._everyone = np.arange(number)
-        self._nobody = np.zeros(0, np.intp)
+        self._kinds = list(self.group.values())
         self._begin()
         self.refresh()
 
@@ -198,13 +176,15 @@ class SafetyWorlds:
         distances = self.measure()
         progress = self.distances - distances
         rewards = progress[:, 0] + progress[:, 1] if self.task.goal == "Push" else progress[:, 0]
-        rewards.clip(-REWARD_BOUND, REWARD_BOUND, out=rewards)
+        np.minimum(rewards, _MOST, out=rewards)
+        np.maximum(rewards, _LEAST, out=rewards)
         self.distances = distances
         terms = self.cost_terms()
-        if self._is_button:
+        if self._is_button and anything(self.button_timer):
             np.maximum(self.button_timer - 1, 0, out=self.button_timer)
         goal_met = self.goal_met()
         terminated = np.zeros(self.number, np.bool_)
+        truncated = self.steps >= self.horizon
         broken = None
         if not self.simulations.intact() and (failed := self.simulations.broken()).any():
             broken = failed
@@ -212,46 +192,41 @@ class SafetyWorlds:
             terms[broken] = 0.0
             goal_met &= ~broken
             terminated |= broken
-        truncated = self.steps >= self.horizon
         eventful = broken is not None
-        if np.logical_or.reduce(goal_met):
+        if anything(goal_met):
             eventful = True
             rewards[goal_met] += 1.0
             met = np.flatnonzero(goal_met)
             self.button_timer[met] = BUTTON_DELAY
             terminated[met] = ~self._renew_goals(met)
-        finished = self._nobody
-        if eventful or np.logical_or.reduce(truncated):
+        finished = _NOBODY
+        if eventful or anything(truncated):
             truncated &= ~terminated
             finished = np.flatnonzero(terminated | truncated)
         return Outcome(rewards, terms, goal_met, terminated, truncated, broken, finished)
 
-    def observations(self, qacc: Floats | None = None) -> Observations:
-        """What the robots perceive now, [B, size].
-
-        Args:
-            qacc: the robots' accelerations, if not those of the simulations, [B, ...].
-        """
-        acceleration = self._qacc if qacc is None else qacc
-        rotation, place = self._sensors.read(self.qpos, self.qvel, acceleration, self._felt)
-        lidar(egocentric(self.points, rotation, place), self._kinds, self._seen)
-        if self._is_button and self.button_timer.any():
-            self._seen[self.button_timer > 0, list(self.group).index("buttons")] = 0.0
-        observations: Observations = self._perceived.take(self._order, axis=1)
+    def observations(self) -> Observations:
+        """What the robots perceive now, [B, size]."""
+        self._sensors.read()
+        self._felt[...] = self._sensors.readings
+        lidar(
+            egocentric(self.points, self._sensors.rotation, self._sensors.position),
+            self._kinds,
+            self._seen,
+        )
+        if self._is_button and anything(self.button_timer):
+            self._seen[list(self.group).index("buttons"), self.button_timer > 0] = 0.0
+        observations: Observations = self._readings.take(self._order)
         return observations
 
     def refresh(self) -> None:
         """Find everything where the simulations have it now."""
-        if "vases" in self.group:
-            self.points[:, self.group["vases"]] = self._vases
-        elif "box" in self.group:
-            self.points[:, self.group["box"].start] = self._box[:, :2]
-        elif self._has_gremlins:
-            places = self.circles + self._course.positions[self.steps, None, :2]
-            places[self._everyone, self.embodied] = self._gremlin[:, :2]
-            self.points[:, self.group["gremlins"]] = places
+        self._place_movers()
         np.subtract(self._plane, self._robot_plane, out=self._offsets)
         np.abs(self._offsets, out=self.ranges)
+        np.less(self.ranges, self._reaches, out=self._near)
+        self._anything_near = anything(self._near)
+        self._anything_stirs = anything(self._object_awake)
         self._feel()
 
     def measure(self) -> Floats:
@@ -274,7 +249,7 @@ class SafetyWorlds:
 
     def goal_met(self) -> Booleans:
         """Whether the goal is reached, [B]; ``distances`` must be of now."""
-        if self.task.goal == "Button":
+        if self._is_button:
             pressed: Booleans = self.pressed()[self._everyone, self.goal_button]
             return pressed
         met: Booleans = self.distances[:, -1] <= self.task.target.size
@@ -288,7 +263,9 @@ class SafetyWorlds:
         """The indicator of each cost term, [B, terms]."""
         terms = np.zeros((self.number, len(self.task.cost_terms)))
         for column, indicator in enumerate(self._indicators):
-            terms[:, column] = indicator(self)
+            costly = indicator(self)
+            if costly is not None:
+                terms[:, column] = costly
         return terms
 
     def state_dict(self) -> dict[str, Any]:
@@ -303,7 +280,7 @@ class SafetyWorlds:
             "circles": self.circles.copy(),
             "gremlin_yaws": self.gremlin_yaws.copy(),
             "embodied": self.embodied.copy(),
-            "qacc": self._qacc.copy(),
+            "qacc": self.qacc.copy(),
             "touching": self.touching.copy(),
             "generators": [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators],
         }
@@ -317,7 +294,7 @@ class SafetyWorlds:
             )
         self.simulations.load(state["physics"])
         # Loading computes nothing: what the last step computed is put back as well.
-        self._qacc[...] = state["qacc"]
+        self.qacc[...] = state["qacc"]
         for name in (
             "points",
             "steps",
@@ -336,6 +313,51 @@ class SafetyWorlds:
             generator.bit_generator.state = saved
         self.refresh()
         self.touching[...] = state["touching"]
+        self._anything_touched = bool(self.touching.any())
+
+    def _lay_out_objects(self) -> None:
+        """Give everything that the lidar sees its place in ``points``."""
+        task, number = self.task, self.number
+        counts = {"goal": 1} | {
+            kind: number for kind, (number, _) in keepouts(task).items() if kind != "goal"
+        }
+        self.group: dict[str, slice] = {}
+        end = 0
+        for kind in task.lidars:
+            self.group[kind] = slice(end, end + counts[kind])
+            end += counts[kind]
+        self.points = np.zeros((number, end, 2))
+        self.ranges = np.zeros((number, end))
+        # (x, y) as x + iy: one operation instead of five for a distance.
+        self._plane = self.points.view(np.complex128)[..., 0]
+        self._offsets = np.zeros_like(self._plane)
+        self._robot_plane = self.qpos[:, :2].view(np.complex128)
+        # Which objects are so near that it may matter.
+        self._near = np.zeros((number, end), np.bool_)
+        self._reaches = np.concatenate(
+            [np.full(counts[kind], _reach(task, self.scene, kind)) for kind in task.lidars]
+        )
+        self._near_touchable = [self._near[:, self.group[kind]] for kind in self.scene.touchable]
+
+        vases, box = task.vases.number, task.box.number
+        self._has_vases, self._has_box, self._is_button = vases > 0, box > 0, task.goal == "Button"
+        self._vases = self.qpos[:, self.scene.robot_qpos :][:, : 7 * vases].reshape(number, vases, 7)[..., :2]
+        self._vase_velocities = self.qvel[:, self.scene.robot_qvel :][:, : 6 * vases].reshape(
+            number, vases, 6
+        )[..., :3]
+        self._box = self.qpos[:, self.scene.box_qpos :][:, :3]
+        self._vase_points = self.points[:, self.group.get("vases", _NONE)]
+        self._box_points = self.points[:, self.group.get("box", _NONE)]
+
+    def _lay_out_observations(self) -> None:
+        """Decide where the parts of an observation are computed, and from where they are taken."""
+        task, number = self.task, self.number
+        self._sensors = make_sensors(task.robot, self.qpos, self.qvel, self.qacc)
+        seen = (len(task.lidars), number, LIDAR_BINS)
+        self._readings = np.zeros(len(self._sensors.readings) + math.prod(seen), np.float32)
+        self._felt, self._seen = np.split(self._readings, [len(self._sensors.readings)])
+        self._seen = self._seen.reshape(seen)
+        self._order = _sorted_order(task, self._sensors, seen)
 
     def _begin(self) -> None:
         """Make room for what changes within an episode, and for what leads the gremlins."""
@@ -346,19 +368,37 @@ class SafetyWorlds:
         self.button_timer = np.zeros(number, np.int64)
         self.circles = np.zeros((number, task.gremlins.number, 2))
         self.gremlin_yaws = np.zeros((number, task.gremlins.number))
-        self.embodied = np.zeros(number, np.int64)
+        self.embodied = np.full(number, NO_GREMLIN)
         self._has_gremlins = task.gremlins.number > 0
         if self._has_gremlins:
-            gremlin = self.scene.gremlin_qpos
+            gremlin, velocity = self.scene.gremlin_qpos, self.scene.gremlin_qvel
             self._gremlin = self.qpos[:, gremlin : gremlin + 7]
-            velocity = self.scene.gremlin_qvel
             self._gremlin_velocity = self.qvel[:, velocity : velocity + 6]
+            state = mujoco.mjtState
+            self._tied = self.simulations.state(state.mjSTATE_EQ_ACTIVE, (model.neq,))[:, 0]
+            self._lift = self.simulations.state(state.mjSTATE_QFRC_APPLIED, (model.nv,))[:, velocity + 2]
+            self._gremlin_weight = -float(model.body("gremlin").mass[0] * model.opt.gravity[2])
+            self._gremlin_ranges = self.ranges[:, self.group["gremlins"]]
+            self._alert = self.scene.touchable["gremlins"][1] + ALERT
+            self._gremlin_points = self.points[:, self.group["gremlins"]]
             self._course = gremlin_course(task)
-            self._leads = leads(task.timestep, np.arange(HORIZON + 1.0) * SUBSTEPS)
+            self._course_points = np.ascontiguousarray(self._course.positions[:, None, :2])
+            self._leads = leads(task.timestep, np.arange(HORIZON + 1.0) * SUBSTEPS)[..., :2].copy()
             self._controls = np.zeros((number, SUBSTEPS, model.nu + 3 * model.nmocap))
-            self._lead = slice(
-                model.nu + 3 * self.scene.gremlin_mocap, model.nu + 3 * self.scene.gremlin_mocap + 3
-            )
+            lead = model.nu + 3 * self.scene.gremlin_mocap
+            self._lead = slice(lead, lead + 2)
+
+    def _place_movers(self) -> None:
+        """Find the objects that move."""
+        if self._has_vases:
+            self._vase_points[...] = self._vases
+        elif self._has_box:
+            self._box_points[...] = self._box[:, None, :2]
+        elif self._has_gremlins:
+            np.add(self.circles, self._course_points.take(self.steps, axis=0), out=self._gremlin_points)
+            met = (self.embodied != NO_GREMLIN).nonzero()[0]
+            if len(met):
+                self._gremlin_points[met, self.embodied[met]] = self._gremlin[met, :2]
 
     def _feel(self) -> None:
         """Find what the robots touch.
@@ -366,44 +406,71 @@ class SafetyWorlds:
         Contacts are looked up only where something can be touched: it is near, and, if it is a vase, awake.
         A sensor for them would cost time in every physics step.
         """
-        self.touching[...] = False
-        for kind, (_, reach) in self.scene.touchable.items():
-            near = np.minimum.reduce(self.ranges[:, self.group[kind]], axis=1) < reach
-            if kind == "vases":
-                near &= np.add.reduce(self._awake, axis=1) > 1
-            for index in near.nonzero()[0]:
-                roots = self._root[self.simulations.contacts(index)]
-                others = roots[(roots == self.scene.robot_body)[:, ::-1]]
-                self.touching[index, others] = True
+        if self._anything_touched:
+            self.touching[...] = False
+            self._anything_touched = False
+        if not (self._anything_near and self._near_touchable):
+            return
+        robot, roots = self.scene.robot_body, self._root
+        near_kinds = [np.logical_or.reduce(kind, axis=1) for kind in self._near_touchable]
+        near = functools.reduce(np.logical_or, near_kinds)
+        for index in near.nonzero()[0].tolist():
+            if self._has_vases and not anything(self._object_awake[index]):
+                continue
+            for one, other in self.simulations.contacts(index).tolist():
+                pair = roots[one], roots[other]
+                if robot in pair:
+                    self.touching[index, pair] = True
+                    self._anything_touched = True
 
     def _simulate(self, actions: npt.NDArray[Any]) -> None:
+        self._control[...] = actions
         if not self._has_gremlins:
-            self._control[...] = actions
             self.simulations.step(SUBSTEPS)
             return
-        self._embody_nearest()
-        self._controls[:, :, : self._control.shape[1]] = actions[:, None]
-        lead = self._leads[self.steps]
-        lead[..., :2] += self.circles[self._everyone, self.embodied][:, None]
-        self._controls[:, :, self._lead] = lead
-        state = mujoco.mjtState
-        self.simulations.step_under(self._controls, state.mjSTATE_CTRL.value | state.mjSTATE_MOCAP_POS.value)
+        self._embody_near()
+        bodies = self.embodied != NO_GREMLIN
+        met = bodies.nonzero()[0]
+        if len(met) < self.number:
+            self.simulations.step(SUBSTEPS, (~bodies).nonzero()[0])
+        if len(met):
+            controls = self._controls[met]
+            controls[:, :, : self._control.shape[1]] = actions[met, None]
+            own_circles = self.circles[met, self.embodied[met]]
+            controls[:, :, self._lead] = self._leads[self.steps[met]] + own_circles[:, None]
+            state = mujoco.mjtState
+            components = state.mjSTATE_CTRL.value | state.mjSTATE_MOCAP_POS.value
+            self.simulations.step_under(controls, components, met)
 
-    def _embody_nearest(self) -> None:
-        """Make the gremlin nearest the robot the one that is a body, where that changes nothing."""
-        nearest = self.ranges[:, self.group["gremlins"]].argmin(axis=1)
-        for index in np.flatnonzero(nearest != self.embodied):
-            course = self._course.positions[self.steps[index]]
-            astray = self._gremlin[index, :3] - course
-            astray[:2] -= self.circles[index, self.embodied[index]]
-            touched = self.touching[index, self.scene.touchable["gremlins"][0]][0]
-            if not touched and np.square(astray).sum() < ON_COURSE**2:
-                self._embody(int(index), int(nearest[index]))
+    def _embody_near(self) -> None:
+        """Make the gremlin that the robot may meet next a body, or none, where that changes nothing."""
+        wanted = self._gremlin_ranges.argmin(axis=1)
+        wanted[np.minimum.reduce(self._gremlin_ranges, axis=1) > self._alert] = NO_GREMLIN
+        for index in (wanted != self.embodied).nonzero()[0].tolist():
+            if self._on_course(index):
+                self._embody(index, wanted[index])
+
+    def _on_course(self, index: int) -> bool:
+        """Whether the gremlin that is a body, if one is, could as well be none."""
+        if self.embodied[index] == NO_GREMLIN:
+            return True
+        astray = self._gremlin[index, :3] - self._course.positions[self.steps[index]]
+        astray[:2] -= self.circles[index, self.embodied[index]]
+        touched = self.touching[index, self.scene.touchable["gremlins"][0]][0]
+        return not touched and bool(np.square(astray).sum() < ON_COURSE**2)
 
     def _embody(self, index: int, gremlin: int) -> None:
+        """Make this gremlin the body, or none: the body then hovers, untied, where nothing is."""
+        self.embodied[index] = gremlin
+        self._tied[index] = gremlin != NO_GREMLIN
+        self._lift[index] = 0.0
+        if gremlin == NO_GREMLIN:
+            self._gremlin[index, :3] = IDLE_PLACE
+            self._gremlin_velocity[index] = 0.0
+            self._lift[index] = self._gremlin_weight
+            return
         step = self.steps[index]
         orientation = upright(self.gremlin_yaws[index, gremlin])
-        self.embodied[index] = gremlin
         self._gremlin[index, :3] = self._course.positions[step]
         self._gremlin[index, :2] += self.circles[index, gremlin]
         self._gremlin[index, 3:] = orientation
@@ -434,10 +501,8 @@ class SafetyWorlds:
             self.circles[index] = layout["gremlins"]
             self.gremlin_yaws[index] = generator.uniform(0.0, 2.0 * np.pi, task.gremlins.number)
             self.steps[index] = 0
-            apart = np.square(layout["gremlins"] - layout["robot"]).sum(axis=1)
-            self._embody(index, int(apart.argmin()))
-            lead = self.mocap_pos[index, scene.gremlin_mocap]
-            lead[:2], lead[2] = self._gremlin[index, :2], GREMLIN_HEIGHT
+            apart = np.hypot(*(layout["gremlins"] - layout["robot"]).T)
+            self._embody(index, int(apart.argmin()) if apart.min() <= self._alert else NO_GREMLIN)
             self._controls[index, :, self._control.shape[1] :] = self.mocap_pos[index].reshape(-1)
 
     def _renew_goals(self, ids: npt.NDArray[np.intp]) -> Booleans:
@@ -469,33 +534,39 @@ class SafetyWorlds:
         goal[:] = found
         return True
 
-    def _cost_of_hazards(self) -> Booleans:
-        over: Booleans = (
-            np.minimum.reduce(self.ranges[:, self.group["hazards"]], axis=1) < self.task.hazards.size
-        )
+    def _cost_of_hazards(self) -> Booleans | None:
+        if not self._anything_near:
+            return None
+        over: Booleans = np.logical_or.reduce(self._near[:, self.group["hazards"]], axis=1)
         return over
 
-    def _cost_of_vases_contact(self) -> Booleans:
+    def _cost_of_vases_contact(self) -> Booleans | None:
         return self._touches("vases")
 
-    def _cost_of_vases_velocity(self) -> Booleans:
-        squares = np.add.reduce(np.square(self._vase_velocities), axis=2)
+    def _cost_of_vases_velocity(self) -> Booleans | None:
+        if not self._anything_stirs:  # what sleeps has no velocity
+            return None
+        squares = np.add.reduce(self._vase_velocities * self._vase_velocities, axis=2)
         moving: Booleans = np.maximum.reduce(squares, axis=1) >= VASE_SPEED**2
         return moving
 
-    def _cost_of_pillars(self) -> Booleans:
+    def _cost_of_pillars(self) -> Booleans | None:
         return self._touches("pillars")
 
-    def _cost_of_buttons(self) -> Booleans:
+    def _cost_of_buttons(self) -> Booleans | None:
+        if not self._anything_touched:
+            return None
         pressed = self.pressed()
         pressed[self._everyone, self.goal_button] = False
         wrong: Booleans = pressed.any(axis=1) & (self.button_timer == 0)
         return wrong
 
-    def _cost_of_gremlins(self) -> Booleans:
+    def _cost_of_gremlins(self) -> Booleans | None:
         return self._touches("gremlins")
 
-    def _touches(self, kind: str) -> Booleans:
+    def _touches(self, kind: str) -> Booleans | None:
+        if not self._anything_touched:
+            return None
         touched: Booleans = np.logical_or.reduce(self.touching[:, self.scene.touchable[kind][0]], axis=1)
         return touched
 
@@ -508,15 +579,29 @@ _INDICATORS = {
     "buttons": SafetyWorlds._cost_of_buttons,
     "gremlins": SafetyWorlds._cost_of_gremlins,
 }
+"""For each cost term, in which worlds it costs, [B], or None for in none."""
 
 
-def _sorted_order(task: SafetyTask, sensors: RobotSensors) -> npt.NDArray[np.intp]:
-    """Where each number of an observation is found among the readings as they are computed."""
-    computed = [*sensors.order, *((f"{kind}_lidar", LIDAR_BINS) for kind in task.lidars)]
-    starts = dict(
-        zip([name for name, _ in computed], np.cumsum([0, *(n for _, n in computed)]), strict=False)
-    )
-    return np.concatenate([starts[name] + np.arange(size) for name, size in task.components])
+def _reach(task: SafetyTask, scene: Scene, kind: str) -> float:
+    """The distance within which it matters, metres, that an object of this kind is near."""
+    if kind == "hazards":
+        return task.hazards.size
+    return scene.touchable[kind][1] if kind in scene.touchable else 0.0
+
+
+def _sorted_order(
+    task: SafetyTask, sensors: RobotSensors, seen: tuple[int, int, int]
+) -> npt.NDArray[np.intp]:
+    """Where each number of the observations is found among the readings as they are computed, [B, size].
+
+    Args:
+        task: gives the parts of an observation.
+        sensors: their readings come first.
+        seen: the shape of the lidar's readings, (kinds, B, bins), which follow.
+    """
+    places = len(sensors.readings) + np.arange(math.prod(seen)).reshape(seen)
+    computed = sensors.places | {f"{kind}_lidar": places[row] for row, kind in enumerate(task.lidars)}
+    return np.concatenate([computed[name] for name, _ in task.components], axis=1)
 
 
 def _rebuilt(

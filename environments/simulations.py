@@ -21,8 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.mujoco_layout import structure
 
 Integers = npt.NDArray[np.int32]
+Ids = Sequence[int] | npt.NDArray[np.intp] | None
 
 _BatchFunction = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 _NUM_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
@@ -33,6 +35,7 @@ _BAD_STATES = [
 ]
 _EVERYTHING, _NOTHING = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_NONE)
 _ROW = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_CONTACT_SIZE, _CONTACT_GEOM = ctypes.sizeof(structure("mjContact")), structure("mjContact").geom.offset
 
 
 class _Config(ctypes.Structure):
@@ -84,6 +87,15 @@ def _library() -> Any:
     return library
 
 
+def anything(array: npt.NDArray[Any]) -> bool:
+    """Whether any of some flags or whole numbers is not 0.
+
+    As ``array.any()``, with less code: this is asked right after the physics, when all code is new to the
+    processor's caches, and NumPy's reductions are much of it.
+    """
+    return array.tobytes() != bytes(array.nbytes)
+
+
 class PhysicsError(RuntimeError):
     """MuJoCo refused to go on."""
 
@@ -116,7 +128,9 @@ class Simulations:
             raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
         self._delete = weakref.finalize(self, self._library.mjb_deleteBatch, self._batch)
         self._data = mujoco.MjData(model)
-        self._bodies = np.asarray(model.geom_bodyid)
+        self._fields = self._locate()
+        self._no_contacts: Integers = np.zeros((0, 2), np.int32)
+        self._everyone: Integers = np.arange(number, dtype=np.int32)
         self.rows: Floats = self._view(
             self._library.mjb_state(self._batch),
             np.float64,
@@ -144,44 +158,57 @@ class Simulations:
         return self._view(address, dtype, (self.number, *shape))
 
     def contacts(self, index: int) -> Integers:
-        """The two bodies of each contact in one simulation, [contacts, 2]."""
-        self._library.mjb_getData(self._batch, int(index), self._data._address)
-        bodies: Integers = self._bodies[self._data.contact.geom]
-        return bodies
+        """The two geoms of each contact in one simulation, [contacts, 2].
 
-    def step(self, substeps: int) -> None:
-        """Advance all simulations, then compute everything, accelerations included, at the new state."""
-        self._note(self._library.mjb_step(self._batch, None, 0, substeps, _EVERYTHING))
+        A view of MuJoCo's own memory: look before the next call.
+        """
+        data = self._fields[index]
+        if not data.ncon:
+            return self._no_contacts
+        memory = (ctypes.c_char * (data.ncon * _CONTACT_SIZE)).from_address(data.contact)
+        return np.ndarray((data.ncon, 2), np.int32, memory, _CONTACT_GEOM, (_CONTACT_SIZE, 4))
 
-    def step_under(self, controls: Floats, components: int) -> None:
+    def step(self, substeps: int, ids: Ids = None) -> None:
+        """Advance simulations, then compute everything, accelerations included, at the new state.
+
+        Args:
+            substeps: physics steps.
+            ids: which simulations; None for all.
+        """
+        chosen = self._chosen(ids)
+        self._note(
+            self._library.mjb_step(self._batch, chosen.ctypes.data, len(chosen), substeps, _EVERYTHING)
+        )
+
+    def step_under(self, controls: Floats, components: int, ids: Ids = None) -> None:
         """As ``step``, with controls of their own for every substep.
 
         Args:
-            controls: [B, substeps, m].
+            controls: contiguous, [B or as many as ids, substeps, m].
             components: bits of ``mjtState`` whose m numbers are given, in MuJoCo's order.
+            ids: which simulations; None for all.
         """
-        self._note(
-            self._library.mjb_rollout(
-                self._batch, None, 0, controls.shape[1], controls.ctypes.data, components, None, 0
-            )
-        )
-        self._note(self._library.mjb_forward(self._batch, None, 0, _EVERYTHING))
+        chosen = self._chosen(ids)
+        substeps, numbers = controls.shape[1], controls.ctypes.data
+        library, batch, address, count = self._library, self._batch, chosen.ctypes.data, len(chosen)
+        self._note(library.mjb_rollout(batch, address, count, substeps, numbers, components, None, 0))
+        self._note(library.mjb_forward(batch, address, count, _EVERYTHING))
 
-    def reset(self, ids: Sequence[int] | npt.NDArray[np.intp]) -> None:
+    def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
-        chosen = np.ascontiguousarray(ids, np.int32)
+        chosen = self._chosen(ids)
         self._stopped[chosen] = False
         self._any_stopped = bool(self._stopped.any())
         self._check(self._library.mjb_reset(self._batch, chosen.ctypes.data, len(chosen), None, _NOTHING))
 
-    def forward(self, ids: Sequence[int] | npt.NDArray[np.intp]) -> None:
+    def forward(self, ids: Ids) -> None:
         """Compute everything that follows from the rows of some simulations."""
-        chosen = np.ascontiguousarray(ids, np.int32)
+        chosen = self._chosen(ids)
         self._check(self._library.mjb_forward(self._batch, chosen.ctypes.data, len(chosen), _EVERYTHING))
 
     def intact(self) -> bool:
         """Whether nothing was noted since the last resets: a quick look before ``broken``."""
-        return not (self._any_stopped or np.bitwise_or.reduce(self._counters))
+        return not (self._any_stopped or anything(self._counters))
 
     def broken(self) -> npt.NDArray[np.bool_]:
         """Whether a simulation has diverged since its last reset, [B].
@@ -230,6 +257,16 @@ class Simulations:
         self._warnings[...], self._stopped[...] = state["warnings"], state["stopped"]
         self._any_stopped = bool(self._stopped.any())
 
+    def _locate(self) -> list[Any]:
+        """The ``mjData`` of each simulation, in MuJoCo's own memory, where it stays."""
+        addresses = [0] * self.number
+
+        def note(_model: int, data: int, index: int, _: Any) -> None:
+            addresses[index] = data
+
+        self._check(self._library.mjb_apply(self._batch, None, 0, _BatchFunction(note), None, 0))
+        return [structure("mjData").from_address(address) for address in addresses]
+
     def _restored(self, row: Floats, asleep: Integers) -> mujoco.MjData:
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(self.model, data, row, _ROW)
@@ -256,10 +293,14 @@ class Simulations:
         status: Integers = self._view(self._library.mjb_status(self._batch), np.int32, (self.number,))
         return status
 
+    def _chosen(self, ids: Ids) -> Integers:
+        return self._everyone if ids is None else np.ascontiguousarray(ids, np.int32)
+
     def _note(self, failed: int) -> None:
         if failed:
             self._stopped |= self._status() != 0
             self._any_stopped = True
+            self._fields = self._locate()  # MuJoCo may have begun anew elsewhere
 
     def _check(self, failed: int) -> None:
         if not failed:

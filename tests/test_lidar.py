@@ -19,7 +19,7 @@ def reading(x: float, y: float) -> Reading:
 
 
 def readings(ego: Reading, kinds: list[slice]) -> Reading:
-    out = np.full((ego.shape[1], len(kinds), 16), np.nan, np.float32)
+    out = np.full((len(kinds), ego.shape[1], 16), np.nan, np.float32)
     lidar(ego, kinds, out)
     return out
 

@@ -283,3 +283,23 @@ def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -
                 assert worlds.touching[index, bodies].tolist() == expected
                 felt += sum(expected)
     assert felt > 0 or name == "CarPush2" or name.startswith("Point")
+
+
+def test_robots_cannot_tell_that_gremlins_far_away_are_no_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
+    some = SafetyGymVectorEnv("CarButton2", 4)
+    monkeypatch.setattr("recrl.environments.safety_worlds.ALERT", 100.0)  # the nearest is always a body
+    always = SafetyGymVectorEnv("CarButton2", 4)
+    some.reset(seed=8)
+    always.reset(seed=8)
+    untouched, bodies = np.ones(4, np.bool_), 0
+    for action in held_actions(250, 4, seed=3):
+        seen, expected = some.step(action)[0], always.step(action)[0]
+        assert (always.worlds.embodied >= 0).all()
+        bodies += int((some.worlds.embodied >= 0).sum())
+        # Off their course, or where touching makes chaos of the smallest difference, they may differ.
+        untouched &= ~(some.worlds.touching | always.worlds.touching).any(axis=1)
+        np.testing.assert_allclose(seen[untouched], expected[untouched], atol=2e-3)
+        robots = some.worlds.qpos[untouched, :13], always.worlds.qpos[untouched, :13]
+        np.testing.assert_allclose(*robots, rtol=0.0, atol=1e-9)
+    assert 0 < bodies < 1000
+    assert untouched.any()

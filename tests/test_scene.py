@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recrl.environments.gremlins import gremlin_course
-from recrl.environments.robot_sensors import RobotSensors, rotation_matrices
+from recrl.environments.robot_sensors import make_sensors, rotation_matrices
 from recrl.environments.safety_tasks import SAFETY_TASKS
 from recrl.environments.scene import make_scene, scene_xml, upright
 
@@ -66,24 +66,22 @@ def test_computed_sensors_are_those_of_mujoco(robot: str) -> None:
     xml = scene_xml(task).replace("</mujoco>", f"<sensor>{SENSORS}</sensor></mujoco>")
     xml = xml.replace("<joint name=", '<site name="robot_middle"/><joint name=', 1)
     model = mujoco.MjModel.from_xml_string(xml)
-    data, sensors = mujoco.MjData(model), RobotSensors(task, 1)
+    data = mujoco.MjData(model)
+    sensors = make_sensors(task.robot, data.qpos[None], data.qvel[None], data.qacc[None])
     generator = np.random.default_rng(0)
     for _ in range(100):
         data.ctrl[:] = generator.uniform(-1.0, 1.0, 2)
         mujoco.mj_step(model, data, 10)
         mujoco.mj_forward(model, data)
-        readings = np.zeros((1, sum(size for _, size in sensors.order)), np.float32)
-        rotation, place = sensors.read(data.qpos[None], data.qvel[None], data.qacc[None], readings)
+        sensors.read()
+        rotation, position = sensors.rotation[0], sensors.position[0]
         body = data.body("robot")
-        np.testing.assert_allclose(rotation[0].reshape(-1), body.xmat, atol=1e-12)
-        np.testing.assert_allclose(rotation[0] @ place[0], body.xpos, atol=1e-12)
-        start = 0
-        for name, size in sensors.order:
+        np.testing.assert_allclose(rotation.reshape(-1), body.xmat, atol=1e-12)
+        np.testing.assert_allclose(rotation @ position, body.xpos, atol=1e-12)
+        for name, places in sensors.places.items():
             if "ball" not in name:
                 expected = data.sensor(name).data
-                seen = readings[0, start : start + size]
-                np.testing.assert_allclose(seen, expected, rtol=1e-5, atol=1e-5)
-            start += size
+                np.testing.assert_allclose(sensors.readings[places[0]], expected, rtol=1e-5, atol=1e-5)
 
 
 def test_rotation_matrices_are_those_of_mujoco() -> None:

@@ -11,7 +11,7 @@ import pytest
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_tasks import SAFETY_TASKS
 from recrl.environments.scene import make_scene
-from recrl.environments.simulations import PhysicsError, Simulations
+from recrl.environments.simulations import PhysicsError, Simulations, anything
 
 SCENE = make_scene(SAFETY_TASKS["CarGoal2"])
 NUMBER = 2
@@ -99,6 +99,34 @@ def test_saving_changes_nothing() -> None:
     restored = Simulations(SCENE.model, NUMBER)
     restored.load(snapshot)
     assert first + run(restored, chosen[200:]) == run(crowd(), chosen)
+
+
+def test_contacts_are_those_of_a_copy_of_the_simulation() -> None:
+    simulations, seen = crowd(), set()
+    for step in range(20):
+        run(simulations, controls(400)[20 * step : 20 * step + 20])
+        for index in range(NUMBER):
+            geoms = simulations.data(index).contact.geom
+            assert simulations.contacts(index).tolist() == geoms.tolist()
+            seen.add(len(geoms))
+    assert len(seen) > 1
+
+
+def test_simulations_stepped_in_parts_move_as_those_stepped_together() -> None:
+    together, apart = crowd(), crowd()
+    for chosen in controls(50):
+        for simulations in (together, apart):
+            simulations.state(CONTROL, (2,))[...] = chosen
+        together.step(10)
+        apart.step(10, [1])
+        apart.step(10, [0])
+    assert together.rows.tobytes() == apart.rows.tobytes()
+
+
+def test_anything_is_any() -> None:
+    assert not anything(np.zeros((3, 2), np.int32)[:, 1:])
+    assert anything(np.array([False, True]))
+    assert not anything(np.zeros(0, np.bool_))
 
 
 def test_a_state_of_another_batch_is_refused() -> None:
