@@ -56,39 +56,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"recrl {importlib.metadata.version('recrl')}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
-    launch = _command(
-        commands, "launch", "run what is not complete, draw the figures, say where everything is"
-    )
-    _add_grid(launch)
-    _add_selection(launch)
-    _add_tracking(launch)
-    launch.add_argument(
-        "--executor",
-        choices=("ray", "inline"),
-        default="ray",
-        help="ray: side by side on all cores or a cluster (default); inline: one after the other in this "
-        "process, for debuggers",
-    )
-    launch.add_argument(
-        "--address",
-        metavar="HOST:PORT",
-        help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
-        "is started here",
-    )
-    launch.add_argument(
-        "--ship-package",
-        action="store_true",
-        help="with --address: send recrl itself, without its dependencies, to the cluster's nodes",
-    )
-    launch.add_argument(
-        "--no-mlflow",
-        dest="mlflow",
-        action="store_false",
-        help="send nothing to MLflow; 'sync' can do it later",
-    )
-    launch.add_argument(
-        "--no-figures", dest="figures", action="store_false", help="draw no figures at the end"
-    )
+    _add_launch(commands)
 
     plan = _command(commands, "plan", "say what a launch would do, and about how long it takes")
     _add_grid(plan)
@@ -187,22 +155,7 @@ def parser() -> argparse.ArgumentParser:
         "--cost", type=_at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
     )
 
-    replay = _command(
-        commands, "replay", "what limits another teacher would have set on the recorded episodes"
-    )
-    _add_sweep(replay)
-    replay.add_argument(
-        "--teacher", required=True, metavar="NAME", help="a method of the sweep, or any teacher by its name"
-    )
-    replay.add_argument(
-        "--option",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KEY=VALUE",
-        help="options of the teacher other than the sweep's, window=8",
-    )
-    _add_only(replay)
+    _add_replay(commands)
 
     user_interface = _command(commands, "ui", "open MLflow's pages about a sweep, on this machine only")
     _add_sweep(user_interface)
@@ -287,6 +240,61 @@ def _command(
             "--root", type=_folder, default=Path("runs"), help="the folder of all sweeps (default: runs)"
         )
     return command
+
+
+def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    launch = _command(
+        commands, "launch", "run what is not complete, draw the figures, say where everything is"
+    )
+    _add_grid(launch)
+    _add_selection(launch)
+    _add_tracking(launch)
+    launch.add_argument(
+        "--executor",
+        choices=("ray", "inline"),
+        default="ray",
+        help="ray: side by side on all cores or a cluster (default); inline: one after the other in this "
+        "process, for debuggers",
+    )
+    launch.add_argument(
+        "--address",
+        metavar="HOST:PORT",
+        help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
+        "is started here",
+    )
+    launch.add_argument(
+        "--ship-package",
+        action="store_true",
+        help="with --address: send recrl itself, without its dependencies, to the cluster's nodes",
+    )
+    launch.add_argument(
+        "--no-mlflow",
+        dest="mlflow",
+        action="store_false",
+        help="send nothing to MLflow; 'sync' can do it later",
+    )
+    launch.add_argument(
+        "--no-figures", dest="figures", action="store_false", help="draw no figures at the end"
+    )
+
+
+def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    replay = _command(
+        commands, "replay", "what limits another teacher would have set on the recorded episodes"
+    )
+    _add_sweep(replay)
+    replay.add_argument(
+        "--teacher", required=True, metavar="NAME", help="a method of the sweep, or any teacher by its name"
+    )
+    replay.add_argument(
+        "--option",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="options of the teacher other than the sweep's, window=8",
+    )
+    _add_only(replay)
 
 
 def _add_grid(command: argparse.ArgumentParser) -> None:

@@ -434,6 +434,7 @@ def _executor(grid: GridSpec, arguments: argparse.Namespace) -> Executor:
         gpus_per_trial=grid.resources.gpus_per_trial,
         custom_per_trial=grid.resources.custom_per_trial,
         max_concurrent=arguments.max_concurrent or grid.resources.max_concurrent,
+        teacher=grid.resources.teacher,
         silence_seconds=grid.resources.silence_seconds,
     )
 

@@ -180,6 +180,11 @@ class Resources(_Written):
     max_concurrent: Whole | None = Field(
         default=None, ge=1, le=10_000, description="Trials at once, at most; by default as many as fit."
     )
+    teacher: Literal["service", "inline"] = Field(
+        default="service",
+        description="Where teachers think: in one service for the sweep, or in each trial's own process "
+        "(for hundreds of trials at once whose updates take less than a second).",
+    )
     silence_seconds: Number = Field(
         default=300.0,
         ge=5.0,

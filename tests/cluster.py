@@ -33,6 +33,7 @@ import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -50,6 +51,14 @@ agents: [ppo-lag, cpo]
 methods: [linear, {{name: dynamic, options: {{window: 5}}}}]
 seeds: 3
 run: {{total_steps: {steps}, evaluation_episodes: 10}}
+"""
+SMALL_GRID = """\
+name: shipped
+tasks: [{name: rivergrid-1a, deploy_limits: 5}]
+agents: [ppo-lag]
+methods: [none, linear]
+seeds: 2
+run: {total_steps: 40_000, evaluation_episodes: 2}
 """
 COPIES = 3  # finished sweeps that are sent to MLflow while the sweep runs, each by a process of its own
 READY_SECONDS = 300.0
@@ -95,6 +104,9 @@ class Container:
         addresses: by network.
         folder: holds what is made for it.
         names: who has which address, as it sees it.
+        compose: the whole file.
+        environment: what the image sets.
+        bare: whether it is an image that lacks recrl, though not what recrl needs.
     """
 
     name: str
@@ -104,6 +116,7 @@ class Container:
     names: Mapping[str, str]
     compose: Mapping[str, Any]
     environment: Mapping[str, str]
+    bare: bool = False
     process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -136,7 +149,7 @@ class Container:
 
     def _mounts(self) -> Iterator[str]:
         """Build a root of its own: the system read-only, and what the compose file mounts."""
-        root = self.root
+        root, venv = self.root, ROOT / ".venv"
         yield "mount --make-rprivate /"
         yield f"hostname {self.name}"
         yield "ip link set lo up"
@@ -153,11 +166,16 @@ class Container:
         yield f"mount -t tmpfs -o mode=1777,size={size} tmpfs {root}/dev/shm"
         for target in sorted(self._tmpfs()):
             yield f"mkdir -p {root}{target} && mount -t tmpfs -o mode=1777 tmpfs {root}{target}"
-        seen = {"/usr": Path("/usr"), "/etc": Path("/etc"), str(ROOT): ROOT, "/opt/recrl": ROOT / ".venv"}
+        seen = {"/usr": Path("/usr"), "/etc": Path("/etc"), str(ROOT): ROOT, "/opt/recrl": venv}
         seen[sys.base_prefix] = Path(sys.base_prefix)
         for target, source in seen.items():
             if target == "/usr" or not target.startswith("/usr/"):
                 yield f"mkdir -p {root}{target} && mount -o rbind,ro {source} {root}{target}"
+        if self.bare:
+            installed = [path.relative_to(venv) for path in venv.glob("lib/python*/site-packages/*recrl*")]
+            for seen_as, path in product((venv, "/opt/recrl"), installed):
+                empty = "-t tmpfs tmpfs" if (venv / path).is_dir() else "-o bind,ro /dev/null"
+                yield f"mount {empty} {root}{seen_as}/{path}"
         yield f"mount -t tmpfs -o mode=755 tmpfs {root}/usr/local/bin"
         yield f"install -m 755 {ROOT}/docker/recrl-node {root}/usr/local/bin/"
         for name, text in (("hosts", self._hosts()), ("passwd", "recrl:x:10001:10001::/tmp:/bin/sh\n")):
@@ -463,9 +481,35 @@ class Trouble:
 
     def restart_mlflow(self) -> None:
         self.cluster.containers["mlflow"].kill()
-        self.cluster.say("MLflow's server is killed")
+        self.cluster.say(f"MLflow's server is killed while {1 + COPIES} processes write to it")
         time.sleep(5.0)
         self.cluster.wait_until_healthy("mlflow")
+
+    def without_recrl(self, name: str) -> Iterator[str]:
+        """What goes otherwise than it should when a node's image lacks recrl."""
+        container, launch = self.cluster.containers[name], self.cluster.containers["second"]
+        container.bare = True
+        container.kill()
+        self.cluster.say(f"{name} is killed, and comes back with an image that lacks recrl")
+        time.sleep(30.0)  # until nobody believes in the old one any more
+        self.cluster.wait_until_healthy(name)
+        command = ["recrl-node", "run", "recrl-sweep", "launch", "/grids/shipped.yaml", "--root=/runs"]
+        command += ["--address=auto", "--no-mlflow", "--no-figures"]
+        for shipped, expected in (([], 4), (["--ship-package"], 0)):
+            launch.kill()
+            launch.output.unlink(missing_ok=True)
+            launch.start([*command, *shipped])
+            assert launch.process is not None
+            code = launch.process.wait()
+            last = launch.output.read_text().splitlines()[-1]
+            self.cluster.say(f"a launch {' '.join(shipped)} ends with {code}: {last}".replace("  ", " "))
+            if code != expected:
+                yield f"a launch with {shipped} ended with {code}"
+        small = SweepStore(self.store.folder.parent, "shipped")
+        hosts = sorted({trial.record().host for trial in small.trials()})
+        self.cluster.say(f"the trials of the shipped recrl ran on {', '.join(hosts)}")
+        if name not in hosts:
+            yield f"{name} ran no trial of the shipped recrl"
 
     def strangers(self, port: int) -> Iterator[str]:
         """Who is let in though they should not be."""
@@ -561,11 +605,11 @@ def check(
 
 
 def disturbed(cluster: Cluster, port: int, uri: str) -> int:
-    """The whole story; how many things went wrong."""
+    """The whole story; returns how many things went wrong."""
     expected = single_machine(cluster)
     root = cluster.folder / "runs"
     others = copies(expected, root)
-    names = ["sweep", *(store.name for store in others)]
+    names = ["sweep", "second", *(store.name for store in others)]
     cluster.connect(names)
     cluster.publish()
     cluster.up()
@@ -578,7 +622,8 @@ def disturbed(cluster: Cluster, port: int, uri: str) -> int:
     for other in others:
         tracking = ["--root", "/runs", "--tracking-uri", "http://mlflow:5000"]
         cluster.containers[other.name].start(["recrl-sweep", "sync", other.name, *tracking])
-    time.sleep(10.0)
+    told = [other.mirror_folder for other in others]
+    assert wait_for(lambda: all(any(folder.glob("*/trial-*.json")) for folder in told), READY_SECONDS)
     trouble.restart_mlflow()
     trouble.cut_off("ray-worker-2")
     refused = list(trouble.strangers(port))
@@ -593,7 +638,11 @@ def disturbed(cluster: Cluster, port: int, uri: str) -> int:
             cluster.say(f"{other.name}: {cluster.containers[other.name].output.read_text().splitlines()[-1]}")
             time.sleep(2.0)
             cluster.containers[other.name].start(["recrl-sweep", "sync", other.name, *tracking])
-    return (code != 0) + len(refused) + check(cluster, store, expected, others, uri)
+    wrong = (code != 0) + len(refused) + check(cluster, store, expected, others, uri)
+    for problem in trouble.without_recrl("ray-worker-2"):
+        cluster.say(f"WRONG {problem}")
+        wrong += 1
+    return wrong
 
 
 def main() -> int:
@@ -623,6 +672,7 @@ def main() -> int:
         folder.chmod(0o755)
         (folder / "grids").mkdir()
         (folder / "grids/cluster.yaml").write_text(GRID.format(steps=given.steps))
+        (folder / "grids/shipped.yaml").write_text(SMALL_GRID)
         print(f"python -m tests.cluster {' '.join(sys.argv[1:])}", file=log, flush=True)
         cluster = Cluster(folder, log, variables)
         cluster.environment["PATH"] += f":{postgres_programs()}"

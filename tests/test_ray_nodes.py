@@ -99,6 +99,12 @@ def test_nothing_is_shipped_nowhere(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == "recrl-sweep: --ship-package: needs an --address to ship to\n"
 
 
+def test_teachers_think_where_the_grid_says() -> None:
+    assert parse_grid(GRID.encode(), source="grid.yaml").resources.teacher == "service"
+    grid = parse_grid((GRID + "resources: {teacher: inline}\n").encode(), source="grid.yaml")
+    assert grid.resources.teacher == "inline"
+
+
 def test_custom_resources_come_from_the_grid() -> None:
     grid = parse_grid(
         (GRID + "resources: {custom_per_trial: {big_memory: 1}}\n").encode(), source="grid.yaml"
