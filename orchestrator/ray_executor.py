@@ -211,13 +211,14 @@ class TuneTrial(tune.Trainable):
         from recrl.orchestrator.trial import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
         if not self._stop_file.is_set():
-            run_recorded(
-                self._spec,
-                self._store.trial(self._spec),
-                should_stop=self._stop_file.is_set,
-                teacher=self._teacher,
-                commit_seconds=self._commit_seconds,
-            )
+            with _given_gpu():
+                run_recorded(
+                    self._spec,
+                    self._store.trial(self._spec),
+                    should_stop=self._stop_file.is_set,
+                    teacher=self._teacher,
+                    commit_seconds=self._commit_seconds,
+                )
         return {"done": True}
 
     def _take(self, config: Mapping[str, Any]) -> None:
@@ -228,6 +229,15 @@ class TuneTrial(tune.Trainable):
         self._commit_seconds: float = config["commit_seconds"]
         name = config["teacher_service"]
         self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
+
+
+def _given_gpu() -> AbstractContextManager[Any]:
+    """Students made meanwhile live on the GPU that Ray gave this worker, if it gave one that can be used."""
+    if not ray.get_gpu_ids():
+        return nullcontext()
+    import torch  # noqa: PLC0415  (the driver does without)
+
+    return torch.device("cuda") if torch.cuda.is_available() else nullcontext()
 
 
 class StopFile:
