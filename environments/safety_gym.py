@@ -113,10 +113,10 @@ def _costs(outcome: Outcome, options: SafetyGymOptions) -> Floats:
     return costs
 
 
-def _info(task: SafetyTask, outcome: Outcome, options: SafetyGymOptions) -> dict[str, Any]:
+def _info(terms: tuple[str, ...], outcome: Outcome, options: SafetyGymOptions) -> dict[str, Any]:
     info: dict[str, Any] = {"cost": _costs(outcome, options), "goal_met": outcome.goal_met}
-    for column, term in enumerate(task.cost_terms):
-        info[f"cost_{term}"] = outcome.terms[:, column]
+    for key, indicator in zip(terms, outcome.terms.T, strict=True):
+        info[key] = indicator
     if outcome.broken is not None:
         info["cost_exception"] = outcome.broken.astype(np.float64)
     return info
@@ -173,6 +173,7 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
         if num_envs < 1:
             raise ValueError(f"{task}: num_envs must be at least 1, got {num_envs}")
         self.options = SafetyGymOptions(**options)
+        self._terms = tuple(f"cost_{term}" for term in found.cost_terms)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._camera = _Camera(render_mode)
@@ -217,7 +218,7 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
         checked = _checked(worlds.task, actions, (self.num_envs, 2), self.options)
         outcome = worlds.advance(checked)
         observations = worlds.observations()
-        info = _info(worlds.task, outcome, self.options)
+        info = _info(self._terms, outcome, self.options)
         if len(outcome.finished):
             info["final_obs"] = observations
             worlds.restart(outcome.finished)
@@ -261,6 +262,7 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
     def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
         found = _find(task)
         self.options = SafetyGymOptions(**options)
+        self._terms = tuple(f"cost_{term}" for term in found.cost_terms)
         self.render_mode = render_mode
         self._camera = _Camera(render_mode)
         self.metadata = {**self.metadata, "render_fps": frames_per_second(found)}
@@ -288,7 +290,7 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
             raise ValueError(f"{worlds.task.name}: call reset before the first step")
         checked = _checked(worlds.task, action, (2,), self.options)
         outcome = worlds.advance(checked[None])
-        info = {name: values[0] for name, values in _info(worlds.task, outcome, self.options).items()}
+        info = {name: values[0] for name, values in _info(self._terms, outcome, self.options).items()}
         return (
             worlds.observations()[0],
             float(outcome.rewards[0]),

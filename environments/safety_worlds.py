@@ -19,7 +19,6 @@ Letters: B worlds, P objects that the lidar sees, k costs.
 from __future__ import annotations
 
 import copy
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -132,7 +131,7 @@ class SafetyWorlds:
         self.qacc = self.simulations.output("qacc", (model.nv,))
         self._object_awake = self.simulations.output("tree_awake", (model.ntree,), np.int32)[:, 1:]
         self.touching = np.zeros((number, model.nbody), np.bool_)
-        self._anything_touched = False
+        self._touched: list[tuple[int, int]] = []
         self._root = model.body_rootid[model.geom_bodyid].tolist()
 
         self._lay_out_objects()
@@ -161,6 +160,7 @@ class SafetyWorlds:
         self.simulations.forward(ids)
         self.steps[ids] = 0
         self.button_timer[ids] = 0
+        self._rest = self.horizon - int(self.steps.max())
         self.refresh()
         self._renew_goals(ids)
 
@@ -172,6 +172,7 @@ class SafetyWorlds:
         """
         self._simulate(actions)
         self.steps += 1
+        self._rest -= 1
         self.refresh()
         distances = self.measure()
         progress = self.distances - distances
@@ -184,7 +185,9 @@ class SafetyWorlds:
             np.maximum(self.button_timer - 1, 0, out=self.button_timer)
         goal_met = self.goal_met()
         terminated = np.zeros(self.number, np.bool_)
-        truncated = self.steps >= self.horizon
+        truncated = np.zeros(self.number, np.bool_)
+        if self._rest <= 0:
+            np.greater_equal(self.steps, self.horizon, out=truncated)
         broken = None
         if not self.simulations.intact() and (failed := self.simulations.broken()).any():
             broken = failed
@@ -200,7 +203,7 @@ class SafetyWorlds:
             self.button_timer[met] = BUTTON_DELAY
             terminated[met] = ~self._renew_goals(met)
         finished = _NOBODY
-        if eventful or anything(truncated):
+        if eventful or self._rest <= 0:
             truncated &= ~terminated
             finished = np.flatnonzero(terminated | truncated)
         return Outcome(rewards, terms, goal_met, terminated, truncated, broken, finished)
@@ -249,10 +252,12 @@ class SafetyWorlds:
 
     def goal_met(self) -> Booleans:
         """Whether the goal is reached, [B]; ``distances`` must be of now."""
-        if self._is_button:
-            pressed: Booleans = self.pressed()[self._everyone, self.goal_button]
-            return pressed
-        met: Booleans = self.distances[:, -1] <= self.task.target.size
+        if not self._is_button:
+            reached: Booleans = self.distances[:, -1] <= self.task.target.size
+            return reached
+        met = np.zeros(self.number, np.bool_)
+        for index, button in self._pressed():
+            met[index] |= button == self.goal_button[index]
         return met
 
     def pressed(self) -> Booleans:
@@ -263,9 +268,7 @@ class SafetyWorlds:
         """The indicator of each cost term, [B, terms]."""
         terms = np.zeros((self.number, len(self.task.cost_terms)))
         for column, indicator in enumerate(self._indicators):
-            costly = indicator(self)
-            if costly is not None:
-                terms[:, column] = costly
+            indicator(self, terms[:, column])
         return terms
 
     def state_dict(self) -> dict[str, Any]:
@@ -313,7 +316,8 @@ class SafetyWorlds:
             generator.bit_generator.state = saved
         self.refresh()
         self.touching[...] = state["touching"]
-        self._anything_touched = bool(self.touching.any())
+        self._touched = [(int(index), int(body)) for index, body in np.argwhere(self.touching)]
+        self._rest = self.horizon - int(self.steps.max())
 
     def _lay_out_objects(self) -> None:
         """Give everything that the lidar sees its place in ``points``."""
@@ -337,7 +341,13 @@ class SafetyWorlds:
         self._reaches = np.concatenate(
             [np.full(counts[kind], _reach(task, self.scene, kind)) for kind in task.lidars]
         )
-        self._near_touchable = [self._near[:, self.group[kind]] for kind in self.scene.touchable]
+        self._near_hazards = self._near[:, self.group.get("hazards", _NONE)]
+        # What can be touched follows on one another, but for a goal, which is not felt.
+        touchable = [self.group[kind] for kind in self.scene.touchable] or [_NONE]
+        self._near_touchable = self._near[:, touchable[0].start : touchable[-1].stop]
+        self._touchable = {
+            body for bodies, _ in self.scene.touchable.values() for body in range(bodies.start, bodies.stop)
+        }
 
         vases, box = task.vases.number, task.box.number
         self._has_vases, self._has_box, self._is_button = vases > 0, box > 0, task.goal == "Button"
@@ -396,9 +406,9 @@ class SafetyWorlds:
             self._box_points[...] = self._box[:, None, :2]
         elif self._has_gremlins:
             np.add(self.circles, self._course_points.take(self.steps, axis=0), out=self._gremlin_points)
-            met = (self.embodied != NO_GREMLIN).nonzero()[0]
-            if len(met):
-                self._gremlin_points[met, self.embodied[met]] = self._gremlin[met, :2]
+            for index, gremlin in enumerate(self.embodied.tolist()):
+                if gremlin != NO_GREMLIN:
+                    self._gremlin_points[index, gremlin] = self._gremlin[index, :2]
 
     def _feel(self) -> None:
         """Find what the robots touch.
@@ -406,22 +416,21 @@ class SafetyWorlds:
         Contacts are looked up only where something can be touched: it is near, and, if it is a vase, awake.
         A sensor for them would cost time in every physics step.
         """
-        if self._anything_touched:
+        if self._touched:
             self.touching[...] = False
-            self._anything_touched = False
-        if not (self._anything_near and self._near_touchable):
+            self._touched = []
+        if not (self._anything_near and self.scene.touchable):
             return
         robot, roots = self.scene.robot_body, self._root
-        near_kinds = [np.logical_or.reduce(kind, axis=1) for kind in self._near_touchable]
-        near = functools.reduce(np.logical_or, near_kinds)
-        for index in near.nonzero()[0].tolist():
+        for index in np.logical_or.reduce(self._near_touchable, axis=1).nonzero()[0].tolist():
             if self._has_vases and not anything(self._object_awake[index]):
                 continue
             for one, other in self.simulations.contacts(index).tolist():
                 pair = roots[one], roots[other]
-                if robot in pair:
-                    self.touching[index, pair] = True
-                    self._anything_touched = True
+                body = pair[pair[0] == robot]
+                if robot in pair and body in self._touchable:
+                    self.touching[index, body] = True
+                    self._touched.append((index, body))
 
     def _simulate(self, actions: npt.NDArray[Any]) -> None:
         self._control[...] = actions
@@ -534,41 +543,43 @@ class SafetyWorlds:
         goal[:] = found
         return True
 
-    def _cost_of_hazards(self) -> Booleans | None:
-        if not self._anything_near:
-            return None
-        over: Booleans = np.logical_or.reduce(self._near[:, self.group["hazards"]], axis=1)
-        return over
+    def _cost_of_hazards(self, costly: Floats) -> None:
+        if self._anything_near:
+            costly[...] = np.logical_or.reduce(self._near_hazards, axis=1)
 
-    def _cost_of_vases_contact(self) -> Booleans | None:
-        return self._touches("vases")
+    def _cost_of_vases_contact(self, costly: Floats) -> None:
+        self._cost_of_touching("vases", costly)
 
-    def _cost_of_vases_velocity(self) -> Booleans | None:
-        if not self._anything_stirs:  # what sleeps has no velocity
-            return None
-        squares = np.add.reduce(self._vase_velocities * self._vase_velocities, axis=2)
-        moving: Booleans = np.maximum.reduce(squares, axis=1) >= VASE_SPEED**2
-        return moving
+    def _cost_of_vases_velocity(self, costly: Floats) -> None:
+        if self._anything_stirs:  # what sleeps has no velocity
+            squares = np.add.reduce(self._vase_velocities * self._vase_velocities, axis=2)
+            costly[...] = np.maximum.reduce(squares, axis=1) >= VASE_SPEED**2
 
-    def _cost_of_pillars(self) -> Booleans | None:
-        return self._touches("pillars")
+    def _cost_of_pillars(self, costly: Floats) -> None:
+        self._cost_of_touching("pillars", costly)
 
-    def _cost_of_buttons(self) -> Booleans | None:
-        if not self._anything_touched:
-            return None
-        pressed = self.pressed()
-        pressed[self._everyone, self.goal_button] = False
-        wrong: Booleans = pressed.any(axis=1) & (self.button_timer == 0)
-        return wrong
+    def _cost_of_buttons(self, costly: Floats) -> None:
+        for index, button in self._pressed():
+            if button != self.goal_button[index] and not self.button_timer[index]:
+                costly[index] = 1.0
 
-    def _cost_of_gremlins(self) -> Booleans | None:
-        return self._touches("gremlins")
+    def _cost_of_gremlins(self, costly: Floats) -> None:
+        self._cost_of_touching("gremlins", costly)
 
-    def _touches(self, kind: str) -> Booleans | None:
-        if not self._anything_touched:
-            return None
-        touched: Booleans = np.logical_or.reduce(self.touching[:, self.scene.touchable[kind][0]], axis=1)
-        return touched
+    def _cost_of_touching(self, kind: str, costly: Floats) -> None:
+        bodies = self.scene.touchable[kind][0]
+        for index, body in self._touched:
+            if bodies.start <= body < bodies.stop:
+                costly[index] = 1.0
+
+    def _pressed(self) -> list[tuple[int, int]]:
+        """Worlds and the buttons that are pressed in them."""
+        buttons = self.scene.touchable["buttons"][0]
+        return [
+            (index, body - buttons.start)
+            for index, body in self._touched
+            if buttons.start <= body < buttons.stop
+        ]
 
 
 _INDICATORS = {
@@ -579,7 +590,7 @@ _INDICATORS = {
     "buttons": SafetyWorlds._cost_of_buttons,
     "gremlins": SafetyWorlds._cost_of_gremlins,
 }
-"""For each cost term, in which worlds it costs, [B], or None for in none."""
+"""For each cost term, what writes 1 where it costs into zeros, [B]."""
 
 
 def _reach(task: SafetyTask, scene: Scene, kind: str) -> float:
