@@ -25,10 +25,13 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from recrl.analysis import figures, metrics, page, styles, tables
 from recrl.analysis.bound_figure import cumulative_bounds
@@ -82,25 +85,10 @@ def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Pat
             f"committed a policy update"
         )
     drawn = []
-    for agent in sweep.updates["agent"].cat.categories:
-        if (sweep.updates["agent"] == agent).any():
-            stem = f"learning-curves_{_safe(agent)}"
-            drawn += styles.save(figures.learning_curves(sweep, agent, averaging=averaging), folder, stem)
-    drawn += styles.save(figures.curricula(sweep), folder, "curricula")
-    for task, agent in sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist():
-        stem = f"diagnostics_{_safe(task)}_{_safe(agent)}"
-        drawn += styles.save(curriculum_diagnostics(sweep, task, agent), folder, stem)
-    for agent in ordered(list(sweep.policies["agent"]), list(sweep.trials["agent"].cat.categories)):
-        if (maps := policy_maps(sweep, agent)) is not None:
-            drawn += styles.save(maps, folder, f"policies_{_safe(agent)}")
-    for agent in ordered(list(sweep.trials["agent"]), list(sweep.trials["agent"].cat.categories)):
-        if (bounds := cumulative_bounds(sweep, agent)) is not None:
-            drawn += styles.save(bounds, folder, f"bounds_{_safe(agent)}")
-    if (against := return_against_cost(sweep)) is not None:
-        drawn += styles.save(against, folder, "return-against-cost")
-    if (profiles := performance_profiles(sweep, Measure.STOCHASTIC)) is not None:
-        drawn += styles.save(profiles, folder, "performance-profiles")
-    written, shown = _tables(sweep, folder)
+    for stem, make in drawings(sweep, averaging=averaging).items():
+        if (figure := make()) is not None:
+            drawn += styles.save(figure, folder, stem)
+    written, shown = write_tables(sweep, folder)
     pictures = [path for path in drawn if path.suffix == ".png"]
     text = [f"![{path.stem}]({path.name})" for path in pictures]
     for heading, table in shown:
@@ -113,6 +101,36 @@ def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Pat
         tables.write_text("\n".join([f"# {sweep.name}", "", *state, "", *text]), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
+
+
+def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable[[], Figure | None]]:
+    """The figures of a sweep by the stems of their files, made when called; None where there is nothing.
+
+    Args:
+        sweep: with at least one update.
+        averaging: of the learning curves.
+    """
+    agents = ordered(list(sweep.updates["agent"]), list(sweep.trials["agent"].cat.categories))
+    cells = sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist()
+    made: dict[str, Callable[[], Figure | None]] = {}
+    for agent in agents:
+        made[f"learning-curves_{_safe(agent)}"] = partial(
+            figures.learning_curves, sweep, agent, averaging=averaging
+        )
+    made["curricula"] = partial(figures.curricula, sweep)
+    for task, agent in cells:
+        made[f"diagnostics_{_safe(task)}_{_safe(agent)}"] = partial(
+            curriculum_diagnostics, sweep, task, agent
+        )
+    for agent in agents:
+        made[f"policies_{_safe(agent)}"] = partial(policy_maps, sweep, agent)
+    for agent in agents:
+        for i in range(sweep.num_costs):
+            which = f"_cost-{i + 1}" if i else ""
+            made[f"bounds_{_safe(agent)}{which}"] = partial(cumulative_bounds, sweep, agent, cost=i)
+    made["return-against-cost"] = partial(return_against_cost, sweep)
+    made["performance-profiles"] = partial(performance_profiles, sweep, Measure.STOCHASTIC)
+    return made
 
 
 def averagings() -> dict[str, Averaging]:
@@ -159,8 +177,16 @@ def _count(sweep: Sweep) -> str:
     return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
-def _tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str, pd.DataFrame]]]:
-    """Write the tables; returns the files, and those for people under their headings."""
+def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str, pd.DataFrame]]]:
+    """Write the tables of a sweep, as far as it has come.
+
+    Args:
+        sweep: its frames.
+        folder: where the files go.
+
+    Returns:
+        The files, and the tables for people, as text, with their headings.
+    """
     rows = metrics.outcomes(sweep)
     bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
     written = [

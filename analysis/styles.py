@@ -118,11 +118,22 @@ def save(figure: Figure, folder: Path, stem: str) -> list[Path]:
         folder: made if it is not there.
         stem: of the two file names.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    pdf, png = folder / f"{stem}.pdf", folder / f"{stem}.png"
+    pdf, png = folder / f"{stem}.pdf", save_png(figure, folder / f"{stem}.png")
     blank = {"Creator": "recrl", "Producer": None, "CreationDate": None}
     with context():  # ticks are only made now
-        figure.savefig(png, dpi=PNG_DPI, metadata={"Software": None})
         figure.set_layout_engine("none")  # keep the places just found: finding them takes a second
         figure.savefig(pdf, metadata=blank)
     return [pdf, png]
+
+
+def save_png(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG; equal figures give equal bytes.
+
+    Args:
+        figure: made within ``context``.
+        path: of the file; its folder is made if it is not there.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with context():
+        figure.savefig(path, dpi=PNG_DPI, metadata={"Software": None})
+    return path

@@ -25,11 +25,11 @@ import numpy.typing as npt
 import pandas as pd
 
 from recrl.analysis.frames import DRAWN_METRICS, EVENT_COLUMNS, TRIAL, Sweep, TrialFacts, assemble, joined
-from recrl.environments.cmdp import Phase
+from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.tracking_reader import History, TrackedSweep, TrackedTrial, find_sweep
 
 SHOWN_WITH_EVERY_UPDATE = "curriculum/noise"
-SECTIONS = {Phase.TRAINING: "train", Phase.DEPLOYMENT: "deploy"}
+SECTIONS = ("train", "deploy")
 
 
 def load(uri: str, name: str | None = None) -> Sweep:
@@ -85,24 +85,31 @@ def _facts(trial: TrackedTrial, provenance: bytes | None) -> TrialFacts:
 
 def _updates(tracked: TrackedSweep) -> pd.DataFrame:
     """The shown updates of all trials at once: a row for every point that each update has."""
-    shown = tracked.history(SHOWN_WITH_EVERY_UPDATE, with_time=True)
-    assert shown.milliseconds is not None
     specs = [trial.spec for trial in tracked.trials]
-    sizes = np.array([spec.steps_per_update for spec in specs], dtype=np.int64)
-    budgets = np.array([spec.train_steps for spec in specs], dtype=np.int64)
-    trained = shown.steps - sizes[shown.trials] < budgets[shown.trials]
-    cells = _Cells(shown)
     names = set().union(*(trial.metrics for trial in tracked.trials))
+    num_costs = max((len(spec.deploy_limits) for spec in specs), default=0)
+    own = sorted(
+        name
+        for section, _, name in (metric.partition("/") for metric in names)
+        if section == "student" and DRAWN_METRICS.fullmatch(name)
+    )
+    means = ["episodes", "return", *(f"cost_{i}" for i in range(num_costs))]
+    wanted = {SHOWN_WITH_EVERY_UPDATE, *(f"curriculum/limit_{i}" for i in range(num_costs))}
+    wanted |= {f"{section}/{name}" for section in SECTIONS for name in means} & names
+    histories = tracked.histories(sorted(wanted | {f"student/{name}" for name in own}))
+    shown = histories[SHOWN_WITH_EVERY_UPDATE]
+    sizes = np.array([spec.steps_per_update for spec in specs], dtype=np.int64)[shown.trials]
+    budgets = np.array([spec.train_steps for spec in specs], dtype=np.int64)[shown.trials]
+    counts = np.array([len(spec.deploy_limits) for spec in specs], dtype=np.int64)[shown.trials]
+    cells = _Cells(shown)
 
-    def of_phases(name: str) -> npt.NDArray[np.float64]:
-        return cells.fill(
-            [tracked.history(f"{it}/{name}") for it in SECTIONS.values() if f"{it}/{name}" in names]
-        )
+    def of_phases(name: str) -> Floats:
+        return cells.fill([histories[key] for it in SECTIONS if (key := f"{it}/{name}") in histories])
 
     columns: dict[str, Any] = {
         TRIAL: shown.trials,
-        "update": shown.steps // sizes[shown.trials],
-        "phase": np.where(trained, Phase.TRAINING.value, Phase.DEPLOYMENT.value),
+        "update": shown.steps // sizes,
+        "phase": np.where(shown.steps - sizes < budgets, Phase.TRAINING.value, Phase.DEPLOYMENT.value),
         "end_step": shown.steps,
         "episodes": of_phases("episodes"),
         "episode_return": of_phases("return"),
@@ -111,17 +118,13 @@ def _updates(tracked: TrackedSweep) -> pd.DataFrame:
         "collect_seconds": math.nan,
         "update_seconds": math.nan,
     }
-    num_costs = max((len(spec.deploy_limits) for spec in specs), default=0)
-    numbers = np.array([len(spec.deploy_limits) for spec in specs], dtype=np.int64)[shown.trials]
     for i in range(num_costs):
         columns[f"cost_{i}"] = of_phases(f"cost_{i}")
     for i in range(num_costs):
-        limits = cells.fill([tracked.history(f"curriculum/limit_{i}")])
-        columns[f"limit_{i}"] = np.where(np.isnan(limits) & (numbers > i), math.inf, limits)
-    for metric in sorted(names):
-        section, _, name = metric.partition("/")
-        if section == "student" and DRAWN_METRICS.fullmatch(name):
-            columns[name] = cells.fill([tracked.history(metric)])
+        limits = cells.fill([histories[f"curriculum/limit_{i}"]])
+        columns[f"limit_{i}"] = np.where(np.isnan(limits) & (counts > i), math.inf, limits)
+    for name in own:
+        columns[name] = cells.fill([histories[f"student/{name}"]])
     return pd.DataFrame(columns)
 
 
@@ -132,7 +135,7 @@ class _Cells:
         self._scale = int(shown.steps.max(initial=0)) + 1
         self._known = self._numbered(shown)  # ascending, as a history is in order
 
-    def fill(self, histories: list[History]) -> npt.NDArray[np.float64]:
+    def fill(self, histories: list[History]) -> Floats:
         """The points' values, one for every shown update, NaN where there is none."""
         values = np.full(len(self._known), math.nan)
         for history in histories:

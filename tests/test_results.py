@@ -1,0 +1,75 @@
+"""What is committed under results/rivergrid can be drawn again from its compact file, pixel by pixel."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from PIL import Image
+
+from recrl.analysis import compact, report, styles
+from recrl.analysis.cumulative import cumulative_costs
+from recrl.analysis.frames import KEY, Sweep
+
+RESULTS = Path(__file__).parent.parent / "results" / "rivergrid"
+PINNED = "matplotlib==" + mpl.__version__
+pytestmark = pytest.mark.skipif(
+    PINNED not in (RESULTS.parent.parent / "constraints.txt").read_text().split(),
+    reason="another matplotlib than the pinned one draws other pixels",
+)
+
+
+@pytest.fixture(scope="module")
+def rivergrid() -> Sweep:
+    return compact.load(RESULTS / "rivergrid.zip")
+
+
+@pytest.mark.parametrize(
+    "stem",
+    [
+        "learning-curves_cpo",
+        "curricula",
+        "diagnostics_rivergrid-1b_ppo-lag",
+        "policies_ppo-lag",
+        "bounds_cpo",
+        "return-against-cost",
+        "performance-profiles",
+    ],
+)
+def test_a_figure_of_each_kind_is_redrawn_pixel_by_pixel(rivergrid: Sweep, tmp_path: Path, stem: str) -> None:
+    figure = report.drawings(rivergrid)[stem]()
+    assert figure is not None
+    redrawn = styles.save_png(figure, tmp_path / "figure.png")
+    with Image.open(redrawn) as one, Image.open(RESULTS / "figures" / f"{stem}.png") as other:
+        assert np.array_equal(np.asarray(one), np.asarray(other))
+
+
+def test_every_committed_figure_has_its_drawing(rivergrid: Sweep) -> None:
+    committed = {path.stem for path in (RESULTS / "figures").glob("*.png")}
+    assert committed == set(report.drawings(rivergrid))
+
+
+def test_tables_are_rewritten_byte_by_byte(rivergrid: Sweep, tmp_path: Path) -> None:
+    written, _ = report.write_tables(rivergrid, tmp_path)
+    names = {path.name for path in written if path.suffix != ".parquet"}
+    assert names == {path.name for path in (RESULTS / "figures").iterdir() if path.suffix in (".csv", ".tex")}
+    for name in names:
+        assert (tmp_path / name).read_bytes() == (RESULTS / "figures" / name).read_bytes(), name
+
+
+def test_measured_cost_lies_under_the_bounds_on_river_grid(rivergrid: Sweep) -> None:
+    rows = cumulative_costs(rivergrid)
+    assert len(rows) == 100
+    assert (rows["cost_sum"] < rows["ceiling_sum"]).all()
+    cpo = rows[rows["agent"] == "cpo"]
+    assert (cpo["cost_sum"] < cpo["bound"]).all()
+
+
+def test_measured_cost_lies_under_proposition_1_with_the_runs_own_advantages(rivergrid: Sweep) -> None:
+    crude = cumulative_costs(rivergrid).set_index(list(KEY))
+    own = cumulative_costs(compact.load(RESULTS / "advantages.zip")).set_index(list(KEY))
+    assert len(own) == 10
+    for key, row in own.iterrows():
+        # the discounted cost, which the bound is on, is at most the measured one
+        assert row["cost_sum"] < row["discounted_bound"] < crude.loc[key, "discounted_bound"]
+        assert row["cost_sum"] == pytest.approx(crude.loc[key, "cost_sum"])
