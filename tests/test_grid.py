@@ -324,11 +324,20 @@ def test_too_many_trials_are_refused() -> None:
     assert _problems(text) == ["grid.yaml:1: a grid must have at most 100000 trials, got 110000"]
 
 
-@pytest.mark.parametrize("name", ["demo", "rivergrid"])
-def test_the_grids_we_ship_are_right(name: str) -> None:
-    grid = read_grid(Path(__file__).parent.parent / "grids" / f"{name}.yaml")
-    assert grid.name == name
-    assert len(grid.trials()) == {"demo": 20, "rivergrid": 100}[name]
+ROOT = Path(__file__).parent.parent
+SHIPPED = {"demo": 20, "rivergrid": 100, "safety-gym": 150, "safety-gym-small": 36}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "grids").glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_grids_we_ship_are_right(path: Path) -> None:
+    grid = read_grid(path)
+    assert grid.name == path.stem
+    assert len(grid.trials()) == SHIPPED[path.stem]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "results").glob("*/*.yaml")), ids=lambda path: path.stem)
+def test_the_grids_of_our_results_still_are_right(path: Path) -> None:
+    assert read_grid(path).trials()
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
