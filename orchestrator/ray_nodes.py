@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import ray
-from ray.exceptions import RayError
+from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from recrl.orchestrator.errors import ClusterError
@@ -63,7 +63,8 @@ def check_nodes(probe: Path) -> None:
             there = ray.get(answer)
             problems += differences(address, here, there, probe.parent)
         except RayError as error:
-            problems.append(f"{address} cannot run anything: {next(iter(str(error).splitlines()), '')}")
+            cause = error.cause if isinstance(error, RayTaskError) else error
+            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {_first_line(cause)}")
     if problems:
         raise ClusterError(
             f"not every node of the cluster can run these trials: {'; '.join(sorted(problems))}; "
@@ -97,6 +98,10 @@ def _nodes() -> list[dict[str, Any]]:
     return [node for node in described if node["Alive"]]
 
 
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).splitlines()), "")
+
+
 def _look() -> Callable[[tuple[str, ...], str], dict[str, str]]:
     """What is run on the nodes. A closure is sent by value: they may have another recrl, or none."""
 
@@ -108,7 +113,7 @@ def _look() -> Callable[[tuple[str, ...], str], dict[str, str]]:
         found = {"Python": platform.python_version()}
         for name in distributions:
             try:  # torch's CPU and CUDA builds of one version differ behind the plus
-                found[name] = importlib.metadata.version(name).partition("+")[0]
+                found[name] = (importlib.metadata.version(name) or "").partition("+")[0]
             except importlib.metadata.PackageNotFoundError:
                 found[name] = ""
         try:

@@ -39,6 +39,7 @@ from typing import Any, TextIO
 
 import yaml
 
+from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore, TrialRecord
 from tests.chaos import differences, mirrored
@@ -472,9 +473,7 @@ class Trouble:
         taken = wait_for(taken_over, READY_SECONDS)
         seconds = time.monotonic() - began
         assert taken, f"nobody took over what {name} ran"
-        self.cluster.say(
-            f"after {seconds:.0f} seconds another node has taken over what {name} ran, or it was done"
-        )
+        self.cluster.say(f"after {seconds:.0f} seconds another node has taken over what {name} ran")
         self.cluster.set_link(container, "up")
         self.cluster.say(f"{name} is connected again")
         self.cluster.wait_until_healthy(name)
@@ -495,7 +494,7 @@ class Trouble:
         self.cluster.wait_until_healthy(name)
         command = ["recrl-node", "run", "recrl-sweep", "launch", "/grids/shipped.yaml", "--root=/runs"]
         command += ["--address=auto", "--no-mlflow", "--no-figures"]
-        for shipped, expected in (([], 4), (["--ship-package"], 0)):
+        for shipped, expected in (([], ExitCode.CANNOT_RUN), (["--ship-package"], ExitCode.OK)):
             launch.kill()
             launch.output.unlink(missing_ok=True)
             launch.start([*command, *shipped])
