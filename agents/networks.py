@@ -121,14 +121,18 @@ class Scratch:
 
     def __init__(self) -> None:
         self._buffers: dict[int, Tensor] = {}
+        self._views: dict[int, Tensor] = {}
 
     def tensor(self, place: int, shape: tuple[int, ...]) -> Tensor:
         """Uninitialised memory; what was handed out at the same place before is overwritten."""
-        size = math.prod(shape)
-        buffer = self._buffers.get(place)
-        if buffer is None or buffer.numel() < size:
-            buffer = self._buffers[place] = torch.empty(size)
-        return buffer[:size].view(shape)
+        view = self._views.get(place)
+        if view is None or view.shape != shape:
+            size = math.prod(shape)
+            buffer = self._buffers.get(place)
+            if buffer is None or buffer.numel() < size:
+                buffer = self._buffers[place] = torch.empty(size)
+            view = self._views[place] = buffer[:size].view(shape)
+        return view
 
 
 class TanhStack:
@@ -236,7 +240,7 @@ class TanhStack:
                 torch.bmm(activations[layer].transpose(1, 2), slope, out=by_weight)
                 torch.sum(slope, dim=1, keepdim=True, out=by_bias)
             if layer > 0:
-                memory = self._slope_scratch.tensor(layer, tuple(activations[layer].shape))
+                memory = self._slope_scratch.tensor(layer, activations[layer].shape)
                 slope = torch.bmm(slope, self.weights[layer].transpose(1, 2), out=memory)
                 tanh_backward(slope, activations[layer], grad_input=slope)
 

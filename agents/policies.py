@@ -141,7 +141,10 @@ class StochasticPolicy:
             self.stack.activations(rows[block], scratch)
             for block, scratch in zip(pieces, self._scratch, strict=False)
         ]
-        outputs = torch.cat([layers[-1][0] for layers in activations]).requires_grad_()
+        outputs = (
+            activations[0][-1][0] if len(pieces) == 1 else torch.cat([each[-1][0] for each in activations])
+        )
+        outputs.requires_grad_()
         leaves = [outputs]
         if not self._is_categorical:
             leaves.append(self.log_std.clone().requires_grad_())

@@ -74,7 +74,7 @@ def measure(agent_name: str, options: dict[str, Any]) -> tuple[list[float], list
 def flops_a_millisecond() -> float:
     """Floating-point operations a millisecond in a product of two 1024 x 1024 matrices."""
     matrix = torch.ones(1024, 1024)
-    return 2.0 * 1024**3 / min(milliseconds(lambda: matrix @ matrix) for _ in range(10))
+    return 2.0 * 1024**3 / float(np.median([milliseconds(lambda: matrix @ matrix) for _ in range(15)]))
 
 
 def bare_flops_a_millisecond(rows: int) -> float:
@@ -94,7 +94,7 @@ def bare_flops_a_millisecond(rows: int) -> float:
 
     for layer in layers:
         layer.zero_()
-    return pass_flops(rows, sizes) / min(milliseconds(products) for _ in range(5))
+    return pass_flops(rows, sizes) / float(np.median([milliseconds(products) for _ in range(7)]))
 
 
 def forward_flops(rows: float, sizes: tuple[int, ...]) -> float:
