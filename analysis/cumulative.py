@@ -37,6 +37,8 @@ horizon, c_max largest cost of a step, delta, eps, gamma as in ``bounds``.
 
 from __future__ import annotations
 
+import functools
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +52,7 @@ from recrl.analysis.tables import number
 from recrl.environments.cmdp import Floats, Phase
 from recrl.environments.finite_cmdp import FiniteVectorEnv
 from recrl.environments.plugins import UnknownNameError
-from recrl.environments.registry import find_task, make_vector
+from recrl.environments.registry import find_task, make_vector, task_options
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
     MEAN_WEIGHTS,
@@ -264,7 +266,12 @@ def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | 
             return None
     except UnknownNameError:  # not installed here
         return None
-    environment = make_vector(name, 1, options=options)
+    return _sizes_of(name, task_options(name, options).model_dump_json(), cost)
+
+
+@functools.lru_cache(maxsize=256)
+def _sizes_of(name: str, canonical: str, cost: int) -> TaskSizes | None:
+    environment = make_vector(name, 1, options=json.loads(canonical))
     if not isinstance(environment, FiniteVectorEnv):
         return None
     model = environment.finite_cmdp()

@@ -17,6 +17,7 @@ from recrl.analysis.frames import Sweep, load
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialWriter
+from recrl.orchestrator.tracking import sync, tracking_uri
 
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0
@@ -190,3 +191,15 @@ def finished_sweep(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
 def finished(finished_sweep: SweepStore) -> Sweep:
     """The frames of ``finished_sweep``."""
     return load(finished_sweep)
+
+
+@pytest.fixture(scope="session")
+def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database with MLflow's tables, made once: making it takes MLflow seconds."""
+    store = SweepStore(tmp_path_factory.mktemp("empty"), "empty")
+    report = sync(store, tracking_uri(store, None))
+    assert report.problem == ""
+    for pragma in ("", "-wal", "-shm", "-journal"):
+        path = Path(f"{store.mlflow_database}{pragma}")
+        assert path.exists() == (pragma == "")
+    return store.mlflow_database

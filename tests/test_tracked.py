@@ -28,18 +28,22 @@ NOT_IN_MLFLOW = ["collect_seconds", "update_seconds"]
 
 
 @pytest.fixture(scope="module")
-def sweep(tmp_path_factory: pytest.TempPathFactory, finished_sweep: SweepStore) -> SweepStore:
+def sweep(
+    tmp_path_factory: pytest.TempPathFactory, finished_sweep: SweepStore, empty_database: Path
+) -> SweepStore:
     """Part of a finished sweep, with policies and a grid, and told to MLflow."""
     root = tmp_path_factory.mktemp("runs")
     store = SweepStore(root, finished_sweep.name)
     for trial in finished_sweep.trials():
-        if trial.spec.task.label == "river-a" and trial.spec.method.label != "linear":
+        labels = (trial.spec.task.label, trial.spec.agent.label)
+        if labels == ("river-a", "cpo") and trial.spec.method.label != "linear":
             shutil.copytree(trial.folder, store.trial(trial.spec).folder)
     trial = store.trials()[0]
     trial.policy_path.write_text("action_0,action_1\n0.25,0.75\n1.0,0.0\n")
     trial.provenance_path.write_text('{"torch": "9.9"}')
     store.grid_path.write_text("name: made-up\n")
     store.info_path.write_text("{}")
+    shutil.copy(empty_database, store.mlflow_database)
     assert sync(store, tracking_uri(store, None)).problem == ""
     return store
 
@@ -51,7 +55,7 @@ def from_files(sweep: SweepStore) -> Sweep:
 
 @pytest.fixture(scope="module")
 def from_mlflow(sweep: SweepStore) -> Sweep:
-    return tracked.load(tracking_uri(sweep, None))
+    return tracked.load(tracking_uri(sweep, None), sweep.name)
 
 
 @pytest.mark.parametrize("name", ["trials", "phases", "evaluations", "events", "policies"])
@@ -76,7 +80,7 @@ def test_settings_and_provenance_are_there(from_mlflow: Sweep, from_files: Sweep
 
 
 def test_an_infinite_limit_and_a_cost_of_no_episodes_come_back(
-    made_up_sweep: Callable[..., SweepStore], sweep: SweepStore
+    made_up_sweep: Callable[..., SweepStore], empty_database: Path
 ) -> None:
     store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["unconstrained"])
     trial = store.trials()[0]
@@ -90,8 +94,8 @@ def test_an_infinite_limit_and_a_cost_of_no_episodes_come_back(
     record = trial.record()
     record.committed[trial.updates_path.name] = length
     write_json(trial.state_path, asdict(record))
-    shutil.copy(sweep.mlflow_database, store.mlflow_database)
-    assert sync(store, tracking_uri(store, None), rebuild=True).problem == ""
+    shutil.copy(empty_database, store.mlflow_database)
+    assert sync(store, tracking_uri(store, None)).problem == ""
     updates = tracked.load(tracking_uri(store, None), store.name).updates
     assert np.isinf(updates["limit_0"].iloc[:38]).all()
     assert updates["limit_0"].iloc[38:].tolist() == [5.0, 5.0]
@@ -100,12 +104,13 @@ def test_an_infinite_limit_and_a_cost_of_no_episodes_come_back(
 
 
 def test_a_long_trial_is_thinned_but_true(
-    made_up_sweep: Callable[..., SweepStore], sweep: SweepStore, monkeypatch: pytest.MonkeyPatch
+    made_up_sweep: Callable[..., SweepStore], empty_database: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("recrl.orchestrator.tracking_points.POINTS_PER_METRIC", 10)
     store = made_up_sweep(seeds=2, tasks=["a"], agents=["cpo"], methods=["none"])
+    shutil.copy(empty_database, store.mlflow_database)
     assert sync(store, tracking_uri(store, None)).problem == ""
-    found, whole = tracked.load(tracking_uri(store, None)).updates, frames.load(store).updates
+    found, whole = tracked.load(tracking_uri(store, None), store.name).updates, frames.load(store).updates
     assert found["update"].tolist() == [1, *range(4, 41, 4)] * 2
     kept = whole.merge(found[["seed", "update"]])
     for name in ("phase", "end_step", "episodes", "episode_return", "cost_0", "limit_0", "kl", "time"):
@@ -131,18 +136,24 @@ def test_what_an_older_version_sent_is_named(sweep: SweepStore, tmp_path: Path) 
     database = tmp_path / "old.db"
     shutil.copy(sweep.mlflow_database, database)
     uri = f"sqlite:///{database}"
-    MlflowClient(uri).delete_tag(find_sweep(uri, None).trials[0].run_id, "recrl.spec")
+    MlflowClient(uri).delete_tag(find_sweep(uri, sweep.name).trials[0].run_id, "recrl.spec")
     assert (
         "1 trials: sent to MLflow by an older version, left out; recrl-sweep sync --rebuild sends them again"
-        in (tracked.load(uri).notes)
+        in (tracked.load(uri, sweep.name).notes)
     )
 
 
 @pytest.mark.parametrize(
     ("name", "sentence"),
-    [("other", "shows no sweep 'other'; it shows made-up"), ("mad'e", "shows no sweep")],
+    [
+        ("other", "shows no sweep 'other'; it shows empty, made-up"),
+        ("mad'e", "shows no sweep"),
+        (None, "shows 2 sweeps; say which one; it shows empty, made-up"),
+    ],
 )
-def test_a_sweep_that_mlflow_does_not_show_is_named(sweep: SweepStore, name: str, sentence: str) -> None:
+def test_a_sweep_that_mlflow_does_not_show_is_named(
+    sweep: SweepStore, name: str | None, sentence: str
+) -> None:
     with pytest.raises(TrackingError) as caught:
         tracked.load(tracking_uri(sweep, None), name)
     assert sentence in str(caught.value)
@@ -159,8 +170,8 @@ def test_commands_take_mlflow_or_a_compact_file_for_the_files(
 ) -> None:
     uri = tracking_uri(sweep, None)
     file = tmp_path / "made-up.zip"
-    assert main(["export", "--tracking-uri", uri, "--to", str(file)]) == ExitCode.OK
-    assert "12 trials" in capsys.readouterr().out
+    assert main(["export", "made-up", "--tracking-uri", uri, "--to", str(file)]) == ExitCode.OK
+    assert "6 trials" in capsys.readouterr().out
     assert len(compact.load(file).updates) == len(from_files.updates)
     assert main(["figures", str(file), "--band", "iqm"]) == ExitCode.OK
     assert (tmp_path / "figures" / "report.html").exists()

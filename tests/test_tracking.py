@@ -219,18 +219,6 @@ SMALL: dict[str, Any] = {
 NONE, DYNAMIC = "river-a cpo none seed 0", "river-a cpo dynamic seed 0"
 
 
-@pytest.fixture(scope="module")
-def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A database with MLflow's tables, made once: making it takes MLflow seconds."""
-    store = SweepStore(tmp_path_factory.mktemp("empty"), "empty")
-    report = sync(store, tracking_uri(store, None))
-    assert report.problem == ""
-    for pragma in ("", "-wal", "-shm", "-journal"):
-        path = Path(f"{store.mlflow_database}{pragma}")
-        assert path.exists() == (pragma == "")
-    return store.mlflow_database
-
-
 @pytest.fixture
 def write(made_up_sweep: Callable[..., SweepStore], empty_database: Path) -> Callable[..., SweepStore]:
     """A function that writes a made-up sweep with an MLflow store that is ready."""
