@@ -155,8 +155,10 @@ def _draw_behaviour(axes: Axes, river_map: RiverMap, behaviour: MeanBehaviour, s
     squares = np.argwhere(visits.sum(axis=(2, 3)) >= LEAST_VISITS)
     steps = visits.sum(axis=(2, 3))[tuple(squares.T)]
     insets = [Rectangle((x + 0.14, y + 0.14), 0.72, 0.72) for x, y in squares.tolist()]
+    shades = ScalarMappable(scale, VISIT_COLOURS).to_rgba(steps)
+    # the edge tells a visited square from the river in greyscale too
     axes.add_collection(
-        PatchCollection(insets, facecolors=ScalarMappable(scale, VISIT_COLOURS).to_rgba(steps), zorder=2.0)
+        PatchCollection(insets, facecolors=shades, edgecolors="0.3", linewidths=0.3, zorder=2.0)
     )
     arrows, dots = [], []
     for x, y, heading in np.argwhere(visits.sum(axis=3) >= LEAST_VISITS).tolist():
