@@ -163,8 +163,8 @@ def acceptance(
     """The line search's test of the policy as it is when asked.
 
     The KL is within delta; cost surrogate i rises by at most max(-c_i, 0); and the reward surrogate does not
-    fall, unless a constraint is violated. In recovery only the cost that is recovered and those within
-    their limits are judged: the other violated ones may have to wait.
+    fall, unless a constraint is violated. In recovery only the costs that are recovered and those within
+    their limits are judged: where constraints contradict one another, the other violated ones have to wait.
 
     Args:
         model: asked for surrogates and KL.
@@ -176,7 +176,7 @@ def acceptance(
     judged = np.ones(len(active.index), dtype=np.bool_)
     if solution.case is StepCase.RECOVERY:
         judged = active.violations <= 0.0
-        judged[solution.recovered] = True
+        judged[list(solution.recovered)] = True
     reward_may_fall = bool(np.any(active.violations > 0.0))
     allowed = before[1 + active.index] + np.maximum(-active.violations, 0.0)
 

@@ -25,7 +25,11 @@ A are feasible, and the optimum is among them: the best feasible candidate is th
 nu = 0 or nu = (lam c - r) / s, lam = sqrt((q - r^2 / s) / (2 delta - c^2 / s)), as in the paper.
 
 If no candidate is feasible, no step within the trust region meets all constraints, and the step recovers:
-straight down the cost that is violated most, -w_i sqrt(2 delta / S_ii) (the paper's equation 14); "most" is
+towards the nearest point that meets them all, x = -sum_i nu_i w_i with nu >= 0 and S nu >= c where nu_i > 0
+binds, as far as the trust region goes. Every violated cost falls on the way, and none that holds is broken.
+For k = 1 that is the paper's equation 14, -w sqrt(2 delta / s). Going straight down the cost that is violated
+most, in turns, a policy goes to and fro between two costs that must fall together, and stays above both
+limits. Only where the constraints contradict one another is the most violated one lowered alone; "most" is
 measured by the length c_i / sqrt(S_ii) of the step that would mend it, whatever the costs' units.
 
 Letters: k constraints.
@@ -96,14 +100,14 @@ class DualSolution:
         gradient_weight: of v; 1 / lam, or 0 in recovery.
         constraint_weights: of the w_i, [k]; nu_i / lam.
         multipliers: nu, [k], at least 0; NaN where lam is infinite and in recovery.
-        recovered: index of the constraint that recovery goes down, or None.
+        recovered: the violated constraints that recovery lowers; none in the other cases.
     """
 
     case: StepCase
     gradient_weight: float
     constraint_weights: Floats
     multipliers: Floats
-    recovered: int | None
+    recovered: tuple[int, ...]
 
 
 def solve_dual(problem: StepProblem) -> DualSolution:
@@ -146,7 +150,7 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
     else:  # lam is infinite where the face has only one point
         multipliers[index] = to_meet / gradient_weight - along if gradient_weight > 0.0 else np.nan
     case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
-    return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), None)
+    return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), ())
 
 
 def _meets(problem: StepProblem, solution: DualSolution, constraints: set[int]) -> bool:
@@ -157,11 +161,44 @@ def _meets(problem: StepProblem, solution: DualSolution, constraints: set[int]) 
 
 
 def _recovery(problem: StepProblem, usable: tuple[int, ...]) -> DualSolution:
-    """Straight down the most violated cost, to the edge of the trust region."""
-    index = list(usable)
-    lengths = problem.violations[index] / np.sqrt(np.diag(problem.gram)[index])
-    worst = usable[int(np.argmax(lengths))]
-    weights = np.zeros_like(problem.violations)
-    weights[worst] = np.sqrt(2.0 * problem.radius / problem.gram[worst, worst])
+    """Towards the nearest point that meets all constraints, to the edge of the trust region."""
+    weights = projection_weights(problem.gram, problem.violations)
+    recovered = tuple(i for i in usable if problem.violations[i] > 0.0)
+    if weights is None:
+        index = list(usable)
+        lengths = problem.violations[index] / np.sqrt(np.diag(problem.gram)[index])
+        worst = usable[int(np.argmax(lengths))]
+        weights, recovered = np.zeros_like(problem.violations), (worst,)
+        weights[worst] = 1.0
+    weights = weights * np.sqrt(2.0 * problem.radius / float(weights @ problem.gram @ weights))
     unknown = np.full_like(problem.violations, np.nan)
-    return DualSolution(StepCase.RECOVERY, 0.0, weights, unknown, worst)
+    return DualSolution(StepCase.RECOVERY, 0.0, weights, unknown, recovered)
+
+
+def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
+    """The weights nu of the module's complementarity problem, by trying every set of binding constraints.
+
+    Args:
+        gram: S, [k, k], symmetric and positive semidefinite.
+        excesses: e, [k].
+
+    Returns:
+        [k], or None if the constraints contradict one another.
+
+    >>> projection_weights(np.array([[4.0]]), np.array([2.0]))
+    array([0.5])
+    """
+    usable = [i for i in range(len(excesses)) if gram[i, i] > NO_INFLUENCE]
+    scale = max(float(np.abs(excesses).max(initial=0.0)), NO_INFLUENCE)
+    for size in range(len(usable) + 1):
+        for binding in itertools.combinations(usable, size):
+            index = list(binding)
+            block = gram[np.ix_(index, index)]
+            if index and np.linalg.cond(block) > 1.0 / NO_GRADIENT:
+                continue  # linearly dependent: a smaller set has the same face
+            weights = np.zeros_like(excesses)
+            weights[index] = np.linalg.solve(block, excesses[index])
+            left = (excesses - gram @ weights)[usable]
+            if np.all(weights >= 0.0) and np.all(left <= FEASIBILITY_TOLERANCE * scale):
+                return weights
+    return None

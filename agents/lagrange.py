@@ -107,6 +107,7 @@ def start_pid(num_costs: int, initial: float) -> dict[str, Floats]:
 def pid(
     state: MultiplierState,
     gaps: Floats,
+    limits: Floats,
     *,
     proportional: float,
     integral: float,
@@ -115,14 +116,22 @@ def pid(
 ) -> dict[str, Floats]:
     """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
 
-    I <- clip(I + K_I gap, 0, maximum); lambda = clip(K_P gap + I + K_D max(0, gap - last gap), 0, maximum).
+    I <- clip(I + K_I min(gap, max(d, 1)), 0, maximum);
+    lambda = clip(K_P gap + I + K_D max(0, gap - last gap), 0, maximum).
+
     The derivative acts only on growing violations, as in the source. The integral is held within what the
     multiplier itself can be, so that neither a long satisfied nor a long hopeless constraint winds it up; it
     includes its gain, so that a changed K_I does not make lambda jump.
 
+    The gap that is summed up is held, too. An episode costs at least 0, so it is never further than d below
+    the limit, but an untrained policy may be any distance above it: what ten updates of a cost of 50 sum up
+    under a limit of 1, no 400 later ones can take back. So a violation counts no more than the best that can
+    undo it. (The 1 is for limits near 0, which still must be answered.)
+
     Args:
         state: ``multipliers``, ``integral``, ``last_gap``.
         gaps: J - d, [k]; -inf where there is no constraint.
+        limits: d, [k], each at least 0, possibly infinite.
         proportional: K_P, at least 0, multiplier units per unit of episode cost; so are the next two.
         integral: K_I.
         derivative: K_D.
@@ -131,7 +140,7 @@ def pid(
     active = np.isfinite(gaps)
     gap = np.where(active, gaps, 0.0)
     rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
-    summed = np.clip(state["integral"] + integral * gap, 0.0, maximum)
+    summed = np.clip(state["integral"] + integral * np.minimum(gap, np.maximum(limits, 1.0)), 0.0, maximum)
     output = np.clip(proportional * gap + summed + derivative * rise, 0.0, maximum)
     return {
         "multipliers": np.where(active, output, 0.0),

@@ -24,6 +24,9 @@ from recrl.agents.lagrange import (
 )
 from recrl.environments.cmdp import Floats
 
+# (state, gaps J - d [k], limits d [k]) -> the next state
+MultiplierRule = Callable[[MultiplierState, Floats, Floats], MultiplierState]
+
 
 class Multipliers:
     """One multiplier a cost, moved by the rule that the options name.
@@ -47,7 +50,7 @@ class Multipliers:
             self._state = restarted(self._state, self._start, changed)
         self._last_limits = constraints.limits.copy()
         if constraints.known:
-            self._state = self._step(self._state, constraints.gaps)
+            self._state = self._step(self._state, constraints.gaps, constraints.limits)
         return np.where(np.isfinite(constraints.limits), self._state["multipliers"], 0.0)
 
     def state_dict(self) -> dict[str, Any]:
@@ -63,18 +66,17 @@ class Multipliers:
         self._last_limits = np.array(state["last_limits"], np.float64)
 
 
-def multiplier_step(config: MultiplierConfig) -> Callable[[MultiplierState, Floats], MultiplierState]:
-    """The multiplier rule that the options name, as a function of state and gaps."""
+def multiplier_step(config: MultiplierConfig) -> MultiplierRule:
+    """The multiplier rule that the options name, as a function of state, gaps and limits."""
     step, maximum = config.multiplier_step, config.multiplier_maximum
-    rules: dict[str, Callable[[MultiplierState, Floats], MultiplierState]] = {
-        "projected": partial(projected_ascent, step_size=step, maximum=maximum),
-        "softplus-adam": partial(softplus_adam, learning_rate=step),
-        "pid": partial(
-            pid,
-            proportional=config.multiplier_proportional,
-            integral=step,
-            derivative=config.multiplier_derivative,
-            maximum=maximum,
-        ),
-    }
-    return rules[config.multiplier_rule]
+    if config.multiplier_rule == "projected":
+        return lambda state, gaps, _: projected_ascent(state, gaps, step_size=step, maximum=maximum)
+    if config.multiplier_rule == "softplus-adam":
+        return lambda state, gaps, _: softplus_adam(state, gaps, learning_rate=step)
+    return partial(
+        pid,
+        proportional=config.multiplier_proportional,
+        integral=step,
+        derivative=config.multiplier_derivative,
+        maximum=maximum,
+    )

@@ -19,53 +19,21 @@ costs, P parameters.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student
 from recrl.agents.config import PCPOConfig
 from recrl.agents.cpo import constrained_step
 from recrl.agents.cpo_dual import (
-    FEASIBILITY_TOLERANCE,
-    NO_GRADIENT,
     NO_INFLUENCE,
     DualSolution,
     StepCase,
     StepProblem,
+    projection_weights,
 )
 from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
-from recrl.environments.cmdp import CMDPSpec, Floats
-
-
-def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
-    """The weights nu of the module's complementarity problem, by trying every set of binding constraints.
-
-    Args:
-        gram: S, [k, k], symmetric and positive semidefinite.
-        excesses: e, [k].
-
-    Returns:
-        [k], or None if the constraints contradict one another.
-
-    >>> projection_weights(np.array([[4.0]]), np.array([2.0]))
-    array([0.5])
-    """
-    usable = [i for i in range(len(excesses)) if gram[i, i] > NO_INFLUENCE]
-    scale = max(float(np.abs(excesses).max(initial=0.0)), NO_INFLUENCE)
-    for size in range(len(usable) + 1):
-        for binding in itertools.combinations(usable, size):
-            index = list(binding)
-            block = gram[np.ix_(index, index)]
-            if index and np.linalg.cond(block) > 1.0 / NO_GRADIENT:
-                continue  # linearly dependent: a smaller set has the same face
-            weights = np.zeros_like(excesses)
-            weights[index] = np.linalg.solve(block, excesses[index])
-            left = (excesses - gram @ weights)[usable]
-            if np.all(weights >= 0.0) and np.all(left <= FEASIBILITY_TOLERANCE * scale):
-                return weights
-    return None
+from recrl.environments.cmdp import CMDPSpec
 
 
 def projected_step(problem: StepProblem) -> DualSolution:
@@ -90,7 +58,7 @@ def projected_step(problem: StepProblem) -> DualSolution:
     scale = min(1.0, float(np.sqrt(2.0 * problem.radius / max(length, NO_INFLUENCE))))
     case = StepCase.CONSTRAINED if weights.any() else StepCase.UNCONSTRAINED
     multipliers = weights / reach if reach > 0.0 else np.full_like(weights, np.nan)
-    return DualSolution(case, scale * reach, scale * weights, multipliers, None)
+    return DualSolution(case, scale * reach, scale * weights, multipliers, ())
 
 
 class ProjectionBasedConstrainedPolicyOptimisation:

@@ -54,12 +54,27 @@ def test_the_constraint_that_points_against_the_reward_binds() -> None:
     assert (step(solution, gradient, costs) @ EAST) == pytest.approx(0.25)
 
 
-def test_recovery_goes_down_the_cost_that_is_furthest_from_its_limit() -> None:
-    # Cost 1 is in units a hundred times smaller: 500 is 5 steps of length 1 away, 10 is 10.
+def test_recovery_goes_towards_the_nearest_point_that_meets_all_constraints() -> None:
+    # Cost 1 is in units a hundred times smaller: that point is 10 steps of length 1 west and 5 south.
     costs = np.stack([EAST, 100.0 * NORTH])
     solution = solve_dual(reduced(-EAST, costs, np.array([10.0, 500.0]), 0.5))
-    assert solution.recovered == 0
+    assert solution.recovered == (0, 1)
+    assert step(solution, -EAST, costs) == pytest.approx((-10.0 * EAST - 5.0 * NORTH) / np.sqrt(125.0))
+
+
+def test_recovery_leaves_constraints_that_hold_as_they_are() -> None:
+    # North-east must fall by far; north is at its limit and would rise by going south-west, were it south.
+    costs = np.stack([EAST + NORTH, -NORTH])
+    solution = solve_dual(reduced(-EAST, costs, np.array([10.0, 0.0]), 0.5))
+    assert solution.recovered == (0,)
     assert step(solution, -EAST, costs) == pytest.approx(-EAST)
+
+
+def test_where_constraints_contradict_one_another_recovery_lowers_the_furthest_from_its_limit() -> None:
+    costs = np.stack([EAST, -100.0 * EAST])
+    solution = solve_dual(reduced(NORTH, costs, np.array([10.0, 500.0]), 0.5))
+    assert solution.recovered == (0,)
+    assert step(solution, NORTH, costs) == pytest.approx(-EAST)
 
 
 def test_a_cost_that_no_step_can_change_is_left_out() -> None:

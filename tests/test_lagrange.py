@@ -18,6 +18,7 @@ from recrl.agents.lagrange import (
 )
 
 UNLIMITED = -math.inf
+NO_LIMIT_AND_2 = np.array([math.inf, 2.0])
 
 
 def test_projected_ascent_climbs_with_the_gap_and_stops_at_zero_and_at_the_maximum() -> None:
@@ -54,22 +55,32 @@ def test_softplus_adam_equals_pytorch() -> None:
 
 def test_pid_adds_its_three_terms() -> None:
     gains = {"proportional": 0.1, "integral": 0.01, "derivative": 1.0, "maximum": 100.0}
-    state = pid(start_pid(1, 0.0), np.array([10.0]), **gains)
+    limits = np.array([20.0])
+    state = pid(start_pid(1, 0.0), np.array([10.0]), limits, **gains)
     assert state["multipliers"] == pytest.approx([1.1])  # 0.1 * 10 + 0.01 * 10; nothing to differ from yet
-    state = pid(state, np.array([12.0]), **gains)
+    state = pid(state, np.array([12.0]), limits, **gains)
     assert state["multipliers"] == pytest.approx([1.2 + 0.22 + 2.0])
-    state = pid(state, np.array([11.0]), **gains)
+    state = pid(state, np.array([11.0]), limits, **gains)
     assert state["multipliers"] == pytest.approx([1.1 + 0.33])  # a falling gap is not differentiated
 
 
 def test_pid_does_not_wind_up() -> None:
     gains = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 2.0}
-    state = start_pid(2, 0.0)
+    state, limits = start_pid(2, 0.0), np.array([10.0, 10.0])
     for _ in range(1000):
-        state = pid(state, np.array([10.0, -10.0]), **gains)
+        state = pid(state, np.array([10.0, -10.0]), limits, **gains)
     assert state["integral"].tolist() == [2.0, 0.0]
-    state = pid(state, np.array([-10.0, 10.0]), **gains)
+    state = pid(state, np.array([-10.0, 10.0]), limits, **gains)
     assert state["multipliers"].tolist() == [1.0, 1.0]
+
+
+def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates() -> None:
+    gains = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
+    state, limits = start_pid(3, 1.0), np.array([5.0, 2.0, 0.0])
+    state = pid(state, np.array([60.0, 1.0, 60.0]), limits, **gains)
+    assert state["integral"].tolist() == pytest.approx([1.5, 1.1, 1.1])
+    state = pid(state, -limits, limits, **gains)
+    assert state["integral"].tolist() == pytest.approx([1.0, 0.9, 1.1])
 
 
 @pytest.mark.parametrize("rule", STARTS)
@@ -78,7 +89,13 @@ def test_no_limit_means_no_multiplier_and_leaves_no_trace(rule: str) -> None:
         "projected": lambda state, gaps: projected_ascent(state, gaps, step_size=0.1, maximum=10.0),
         "softplus-adam": lambda state, gaps: softplus_adam(state, gaps, learning_rate=0.1),
         "pid": lambda state, gaps: pid(
-            state, gaps, proportional=0.1, integral=0.1, derivative=0.1, maximum=10.0
+            state,
+            gaps,
+            np.array([math.inf, 2.0]),
+            proportional=0.1,
+            integral=0.1,
+            derivative=0.1,
+            maximum=10.0,
         ),
     }
     start = STARTS[rule](2, 1.0)

@@ -12,11 +12,11 @@ from scipy.optimize import nnls
 from recrl.agents.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import CRPOConfig, PCPOConfig, TRPOLagConfig
-from recrl.agents.cpo_dual import StepCase, StepProblem
+from recrl.agents.cpo_dual import StepCase, StepProblem, projection_weights
 from recrl.agents.crpo import ConstraintRectifiedPolicyOptimisation, most_violated
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import NetworkForm, orthogonal
-from recrl.agents.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step, projection_weights
+from recrl.agents.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.trpo_lag import TRPOLagrangian
 from recrl.environments.cmdp import Floats
