@@ -51,7 +51,7 @@ from recrl.orchestrator.store import SweepStore, TrialRecord
 from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 
 STOP_QUESTION_SECONDS = 0.5
-HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats
+HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats, at least
 CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
@@ -301,7 +301,7 @@ class _Silence:
     def end(self, trials: Sequence[Any]) -> None:
         """End those of Tune's trials whose recrl trial runs without a heartbeat."""
         now = time.monotonic()
-        if now < self._looked_at + min(HEARTBEAT_SECONDS, self._seconds / 4.0):
+        if now < self._looked_at + look_seconds(self._seconds):
             return
         self._looked_at = now
         for trial in trials:
@@ -318,6 +318,11 @@ class _Silence:
                 self._heard[trial.trial_id] = (sign, float("inf"))  # once for a silence
                 logger.warning("%s: no sign of work for %.0f seconds", spec.title, self._seconds)
                 _end_process(record, trial.temporary_state.ray_actor)
+
+
+def look_seconds(silence_seconds: float) -> float:
+    """How long not to look at the heartbeats: each look opens a file for every running trial."""
+    return min(max(HEARTBEAT_SECONDS, silence_seconds / 30.0), silence_seconds / 4.0)
 
 
 def _end_process(record: TrialRecord, actor: Any) -> None:

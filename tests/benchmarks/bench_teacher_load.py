@@ -5,7 +5,7 @@
 Fake trials: threads of a few worker processes, each of which asks the service for one lesson after the other
 with 30 finished episodes, as a trial does, but trains nothing. First without pause, which says how many
 questions a second the service answers; then with a pause between questions as long as a policy update takes,
-which says how long a trial waits. Midway through the second the service is killed. Every trial's lessons and
+which says how long a trial waits, and the same with the service killed midway. Every trial's lessons and
 final state are then compared with those of a teacher that was asked in this process.
 
 Beside it, what else grows with the number of trials at once: the driver's look at every trial's heartbeat.
@@ -22,6 +22,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,9 @@ import numpy as np
 import ray
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.orchestrator.ray_executor import HEARTBEAT_SECONDS, local_cluster
+from recrl.orchestrator.ray_executor import local_cluster, look_seconds
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.status import SILENCE_SECONDS
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.teachers.registry import make_teacher
@@ -114,6 +116,10 @@ def fake_trials(trials: Sequence[int], updates: int, pause: float) -> list[Walk]
         return list(threads.map(one, trials))
 
 
+def cpu_seconds(service: Any) -> float:
+    return float(ray.get(service.__ray_call__.remote(lambda _: time.process_time())))
+
+
 def kill_service(service: Any) -> None:
     pid = ray.get(service.__ray_call__.remote(lambda _: os.getpid()))
     assert isinstance(pid, int)
@@ -124,7 +130,7 @@ def bench_service(*, trials: int, updates: int, pause: float, kill: bool) -> Non
     with local_cluster(num_cpus=PROCESSES):
         service = start_teacher_service(SERVICE)
         ray.get(service.start.remote(teacher_spec(updates)))
-        began = time.perf_counter()
+        began, cpu_before = time.perf_counter(), cpu_seconds(service)
         shares = [list(range(first, trials, PROCESSES)) for first in range(PROCESSES)]
         answers = [fake_trials.remote(share, updates, pause) for share in shares]
         killer = threading.Timer(max(5.0, 0.5 * pause * updates), kill_service, [service])
@@ -137,9 +143,10 @@ def bench_service(*, trials: int, updates: int, pause: float, kill: bool) -> Non
         )
         killer.cancel()
         wall = time.perf_counter() - began
+        cpu = cpu_seconds(service) - (0.0 if kill else cpu_before)
     expected = {trial: walk(make_teacher(teacher_spec(updates)), trial, updates, 0.0) for trial in walks}
     same = sum(replace(walks[trial], seconds=()) == replace(expected[trial], seconds=()) for trial in walks)
-    changes = sum(len(set(one.lessons)) - 1 for one in walks.values())
+    changes = sum(old != new for one in walks.values() for old, new in pairwise(one.lessons))
     seconds = np.concatenate([one.seconds for one in walks.values()])
     p50, p99, worst = np.quantile(seconds, [0.5, 0.99, 1.0]) * 1e3
     how = f"{pause:g} s between questions" if pause else "without pause"
@@ -152,14 +159,16 @@ def bench_service(*, trials: int, updates: int, pause: float, kill: bool) -> Non
         f"an answer takes p50 {p50:.1f} ms, p99 {p99:.1f} ms, max {worst:.0f} ms"
     )
     print(
-        f"  {same} of {trials} trials got exactly the lessons of a teacher of their own "
-        f"({changes} different lessons)"
+        f"  {same} of {trials} trials got exactly the lessons of a teacher of their own, "
+        f"{changes} changes of the lesson among them"
     )
+    if not kill:
+        print(f"  the service used {cpu / len(seconds) * 1e3:.2f} ms of a core a question")
     assert same == trials, "an update was lost or doubled"
 
 
 def bench_heartbeats(trials: int) -> None:
-    """The driver reads every running trial's state.json, a few times a minute or more."""
+    """The driver reads every running trial's state.json, a few times a minute."""
     spec = TrialSpec(
         task=Choice("two-state"),
         agent=Choice("ppo-lag"),
@@ -183,9 +192,10 @@ def bench_heartbeats(trials: int) -> None:
             trial.record()
         seconds = time.perf_counter() - before
         size = sum(trial.state_path.stat().st_size for trial in files) / trials
+    pause = look_seconds(SILENCE_SECONDS)
     print(
         f"\n{trials} heartbeats read in {seconds * 1e3:.0f} ms ({size:.0f} bytes each), every "
-        f"{HEARTBEAT_SECONDS:g} s: {seconds / HEARTBEAT_SECONDS:.1%} of the driver's time on a local disk"
+        f"{pause:g} s: {seconds / pause:.1%} of the driver's time on a local disk"
     )
 
 
@@ -201,7 +211,8 @@ def main() -> None:
         f"on {os.cpu_count()} cores"
     )
     bench_service(trials=given.trials, updates=min(5, given.updates), pause=0.0, kill=False)
-    bench_service(trials=given.trials, updates=given.updates // 3, pause=10.0, kill=True)
+    bench_service(trials=given.trials, updates=given.updates // 3, pause=10.0, kill=False)
+    bench_service(trials=given.trials, updates=given.updates // 6, pause=10.0, kill=True)
     bench_service(trials=given.trials // 10, updates=given.updates, pause=1.0, kill=False)
     bench_heartbeats(given.trials)
 
