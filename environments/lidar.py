@@ -31,24 +31,21 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _HALF_TURN, _FADE = np.float32(_HALF), np.float32(_HALF - 1.5)
 
 
-def egocentric(points: Floats, rotation: Floats, position: Floats) -> Reading:
+def egocentric(turned: Floats, position: Floats) -> Reading:
     """Where objects on the floor lie in the robot's frame, as seen from above.
 
-    ego = ((x, y, 0) - robot position) R = (x, y, 0) R - (robot position) R, of which the first two numbers.
+    With R the rotation from the robot's frame to the world's, ego = ((x, y, 0) - robot position) R, of which
+    the first two numbers.
 
     Args:
-        points: (x, y) of the objects, metres, [B, P, 2].
-        rotation: R, from the robot's frame to the world's, [B, 3, 3].
+        turned: (x, y, 0) R of the objects, metres, [B, P, 3].
         position: (robot position) R, metres, [B, 3].
 
     Returns:
-        metres, [P, B, 2].
+        metres, [2, P, B].
     """
-    turned = points @ rotation[:, :2, :2]
-    turned -= position[:, None, :2]
-    ego = np.empty((points.shape[1], points.shape[0], 2), np.float32)
-    ego[...] = turned.transpose(1, 0, 2)
-    return ego
+    ego = turned.transpose(2, 1, 0)[:2] - position.T[:2, None]
+    return ego.astype(np.float32, order="C")
 
 
 def lidar(ego: Reading, kinds: Sequence[slice], out: Reading) -> None:
@@ -59,11 +56,11 @@ def lidar(ego: Reading, kinds: Sequence[slice], out: Reading) -> None:
     whole turn, the shorter way round is t = 8 - |8 - |a||.
 
     Args:
-        ego: objects in the robot's frame, those of a kind together, [P, B, 2].
+        ego: objects in the robot's frame, those of a kind together, [2, P, B].
         kinds: where in P each kind is, G of them.
         out: for the readings, in [0, 1], [G, B, 16].
     """
-    x, y = ego[..., 0], ego[..., 1]
+    x, y = ego
     reach = np.hypot(x, y)
     reach *= _NEARNESS
     reach += _ONE

@@ -7,7 +7,9 @@ gyro the angular velocity, which MuJoCo keeps in the robot's frame.
 At the sizes of these arrays what costs time is the number of NumPy's calls. So the sensors of a robot are an
 object that looks, once, where its numbers lie, and then writes them in a few calls.
 
-Letters: B environments.
+The same product with R turns the places of the objects that the lidar sees into the robot's frame.
+
+Letters: B environments, P objects.
 """
 
 from __future__ import annotations
@@ -68,12 +70,16 @@ class RobotSensors(Protocol):
         places: for each sensor, by name, where in ``readings`` its numbers are, [B, size].
         rotation: R, from the robots' frames to the world's, [B, 3, 3].
         position: (the robots' positions) R, metres, [B, 3].
+        points: (x, y) of objects on the floor, metres, to be written before ``read``, [B, P, 2].
+        turned: (x, y, 0) R of them, [B, P, 3].
     """
 
     readings: Floats
     places: dict[str, Places]
     rotation: Floats
     position: Floats
+    points: Floats
+    turned: Floats
 
     def read(self) -> None:
         """Compute the readings from the state as it is now."""
@@ -85,11 +91,13 @@ class CarSensors:
     Args:
         qpos, qvel, qacc: live views of coordinates, velocities and accelerations, those of the robot first:
             [B, 13 or more], [B, 11 or more], [B, 11 or more].
+        objects: P.
     """
 
-    def __init__(self, qpos: Floats, qvel: Floats, qacc: Floats) -> None:
+    def __init__(self, qpos: Floats, qvel: Floats, qacc: Floats, objects: int) -> None:
         number = len(qpos)
-        self.readings, (local, rotations, spins), places = _parts(number, (4, 3), (2, 9), (2, 3))
+        shapes = (4 + objects, 3), (2, 9), (2, 3)
+        self.readings, (local, rotations, spins), places = _parts(number, *shapes)
         self.places = {
             "accelerometer": places[0][:, 0],
             "velocimeter": places[0][:, 1],
@@ -98,8 +106,8 @@ class CarSensors:
             "gyro": places[2][:, 0],
             "ballangvel_rear": places[2][:, 1],
         }
-        # In the world's frame and in the robot's: acceleration, velocity, magnetic field, position.
-        self._world, self._local = np.zeros((number, 4, 3)), local
+        # In the world's frame and in the robot's: acceleration, velocity, magnetic field, position, objects.
+        self._world, self._local = np.zeros_like(local), local
         self._world[:, 2] = MAGNETIC_FIELD
         self._rows = [self._world[:, row] for row in range(4)]
         self._acceleration, self._velocity, self._position = qacc[:, :3], qvel[:, :3], qpos[:, :3]
@@ -113,6 +121,7 @@ class CarSensors:
         self._spins, self._felt_spins = qvel[:, 1:11].reshape(number, 2, 5)[..., 2:], spins
         self.rotation = rotations.reshape(number, 2, 3, 3)[:, 0]
         self.position = local[:, 3]
+        self.points, self.turned = self._world[:, 4:, :2], local[:, 4:]
 
     def read(self) -> None:
         """Compute the readings from the state as it is now."""
@@ -132,18 +141,19 @@ class PointSensors:
     Args:
         qpos, qvel, qacc: live views of coordinates, velocities and accelerations, (x, y, yaw) of the robot
             first: [B, 3 or more] each.
+        objects: P.
     """
 
-    def __init__(self, qpos: Floats, qvel: Floats, qacc: Floats) -> None:
+    def __init__(self, qpos: Floats, qvel: Floats, qacc: Floats, objects: int) -> None:
         number = len(qpos)
-        self.readings, (local, spins), places = _parts(number, (4, 3), (3,))
+        self.readings, (local, spins), places = _parts(number, (4 + objects, 3), (3,))
         self.places = {
             "accelerometer": places[0][:, 0],
             "velocimeter": places[0][:, 1],
             "magnetometer": places[0][:, 2],
             "gyro": places[1],
         }
-        self._world, self._local = np.zeros((number, 4, 3)), local
+        self._world, self._local = np.zeros_like(local), local
         self._world[:, 0, 2] = GRAVITY
         self._world[:, 2] = MAGNETIC_FIELD
         self._world[:, 3, 2] = ROBOT_HEIGHT
@@ -155,6 +165,7 @@ class PointSensors:
         self._cosines = self.rotation[:, 0, 0], self.rotation[:, 1, 1]
         self._sines = self.rotation[:, 1, 0], self.rotation[:, 0, 1]
         self.position = local[:, 3]
+        self.points, self.turned = self._world[:, 4:, :2], local[:, 4:]
 
     def read(self) -> None:
         """Compute the readings from the state as it is now."""
@@ -168,9 +179,9 @@ class PointSensors:
         self._felt_spin[...] = self._spin
 
 
-def make_sensors(robot: Robot, qpos: Floats, qvel: Floats, qacc: Floats) -> RobotSensors:
+def make_sensors(robot: Robot, qpos: Floats, qvel: Floats, qacc: Floats, objects: int = 0) -> RobotSensors:
     """The sensors of B robots of one kind, whose numbers come first in these live views."""
-    return _SENSORS[robot](qpos, qvel, qacc)
+    return _SENSORS[robot](qpos, qvel, qacc, objects)
 
 
 _SENSORS: dict[str, type[CarSensors] | type[PointSensors]] = {"Car": CarSensors, "Point": PointSensors}

@@ -213,7 +213,7 @@ class SafetyWorlds:
         self._sensors.read()
         self._felt[...] = self._sensors.readings
         lidar(
-            egocentric(self.points, self._sensors.rotation, self._sensors.position),
+            egocentric(self._sensors.turned, self._sensors.position),
             self._kinds,
             self._seen,
         )
@@ -330,7 +330,8 @@ class SafetyWorlds:
         for kind in task.lidars:
             self.group[kind] = slice(end, end + counts[kind])
             end += counts[kind]
-        self.points = np.zeros((number, end, 2))
+        self._sensors = make_sensors(task.robot, self.qpos, self.qvel, self.qacc, end)
+        self.points = self._sensors.points
         self.ranges = np.zeros((number, end))
         # (x, y) as x + iy: one operation instead of five for a distance.
         self._plane = self.points.view(np.complex128)[..., 0]
@@ -362,7 +363,6 @@ class SafetyWorlds:
     def _lay_out_observations(self) -> None:
         """Decide where the parts of an observation are computed, and from where they are taken."""
         task, number = self.task, self.number
-        self._sensors = make_sensors(task.robot, self.qpos, self.qvel, self.qacc)
         seen = (len(task.lidars), number, LIDAR_BINS)
         self._readings = np.zeros(len(self._sensors.readings) + math.prod(seen), np.float32)
         self._felt, self._seen = np.split(self._readings, [len(self._sensors.readings)])
@@ -420,6 +420,8 @@ class SafetyWorlds:
             self.touching[...] = False
             self._touched = []
         if not (self._anything_near and self.scene.touchable):
+            return
+        if self._has_vases and not self._anything_stirs:
             return
         robot, roots = self.scene.robot_body, self._root
         for index in np.logical_or.reduce(self._near_touchable, axis=1).nonzero()[0].tolist():

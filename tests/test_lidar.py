@@ -14,12 +14,12 @@ from recrl.environments.scene import upright
 
 
 def reading(x: float, y: float) -> Reading:
-    bins: Reading = readings(np.array([[[x, y]]], np.float32), [slice(0, 1)])[0, 0]
+    bins: Reading = readings(np.array([[[x]], [[y]]], np.float32), [slice(0, 1)])[0, 0]
     return bins
 
 
 def readings(ego: Reading, kinds: list[slice]) -> Reading:
-    out = np.full((len(kinds), ego.shape[1], 16), np.nan, np.float32)
+    out = np.full((len(kinds), ego.shape[2], 16), np.nan, np.float32)
     lidar(ego, kinds, out)
     return out
 
@@ -60,9 +60,9 @@ def test_readings_are_those_of_the_literal_definition() -> None:
 
 
 def test_turning_the_robot_by_a_sector_turns_the_reading_by_a_sector() -> None:
-    points, kinds = np.array([[[0.7, 0.4], [-1.0, 0.2]]]), [slice(0, 1), slice(1, 2)]
+    points, kinds = np.array([[[0.7, 0.4, 0.0], [-1.0, 0.2, 0.0]]]), [slice(0, 1), slice(1, 2)]
     still, turned = (
-        readings(egocentric(points, rotation_matrices(upright([yaw])), np.zeros((1, 3))), kinds)
+        readings(egocentric(points @ rotation_matrices(upright([yaw])), np.zeros((1, 3))), kinds)
         for yaw in (0.0, -math.pi / 8)
     )
     np.testing.assert_allclose(turned, np.roll(still, 1, axis=-1), atol=1e-6)
@@ -72,11 +72,11 @@ def test_a_tilted_robot_sees_the_floor_from_its_height() -> None:
     # Turned by 90 degrees about its x axis, it has the floor at distance 0.1 along its own y axis.
     rotation = rotation_matrices(np.array([[math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0]]))
     place = np.array([[0.0, 0.0, 0.1]]) @ rotation[0]
-    ego = egocentric(np.array([[[1.0, 5.0]]]), rotation, place)
-    np.testing.assert_allclose(ego[0, 0], [1.0, -0.1], atol=1e-6)
+    ego = egocentric(np.array([[[1.0, 5.0, 0.0]]]) @ rotation, place)
+    np.testing.assert_allclose(ego[:, 0, 0], [1.0, -0.1], atol=1e-6)
 
 
 def test_of_several_objects_each_sector_shows_the_one_that_reads_most() -> None:
     objects = np.random.default_rng(1).uniform(-2.0, 2.0, (5, 2))
-    together = readings(objects[:, None].astype(np.float32), [slice(0, 5)])[0, 0]
+    together = readings(objects.T[..., None].astype(np.float32), [slice(0, 5)])[0, 0]
     np.testing.assert_array_equal(together, np.max([reading(x, y) for x, y in objects], axis=0))
