@@ -138,17 +138,17 @@ def bench_trial(root: Path, updates: int) -> None:
     trial, files, teacher = inline_trial(store, car_trial(updates))
     mirrored = mirror_cpu(store) - mirror_cpu(empty)
     print(f"CarGoal2, {updates * STEPS_PER_UPDATE:,} steps: {trial:.1f} CPU s")
+    show("its files, checkpoints and heartbeats", files / trial)
+    show("its points in MLflow", mirrored / trial)
+    show("its teacher, inline", teacher / trial)
     with local_cluster(num_cpus=1):
         short, around_short = around_on_ray(root, max(2, updates // 10))
         long, around_long = around_on_ray(root, updates)
-    ray_share = (around_long - around_short) / (long - short)
-    for label, share in (
-        ("its files, checkpoints and heartbeats", files / trial),
-        ("its points in MLflow", mirrored / trial),
-        ("its teacher, inline", teacher / trial),
-        ("Ray and the teacher service", ray_share),
-    ):
-        print(f"  {label:40} {share:7.2%}")
+    show("Ray and the teacher service", (around_long - around_short) / (long - short))
+
+
+def show(label: str, share: float) -> None:
+    print(f"  {label:40} {share:7.2%}", flush=True)
 
 
 def wall(work: Callable[[], object]) -> float:
