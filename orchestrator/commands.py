@@ -186,34 +186,37 @@ def run_evaluate(arguments: argparse.Namespace, console: Console) -> ExitCode:
     import pandas as pd  # noqa: PLC0415
 
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415  (imports gymnasium)
-    from recrl.orchestrator.frozen import FrozenTrial, NoCheckpointError, summary  # noqa: PLC0415  (torch)
+    from recrl.orchestrator.frozen import FrozenTrial, summary  # noqa: PLC0415  (imports torch)
     from recrl.orchestrator.videos import VideoFormat  # noqa: PLC0415
 
     store = _store(arguments)
     policies = tuple(FrozenPolicy) if arguments.policy == "both" else (FrozenPolicy(arguments.policy),)
-    rows, written, videos = [], [], []
+    thawed, left_out = [], []
     for trial in _chosen(store, arguments):
         try:
-            frozen = FrozenTrial.thaw(trial)
-        except NoCheckpointError as error:
-            _say(console, f"left out: {error}")
-            continue
+            thawed.append(FrozenTrial.thaw(trial))
+        except RecrlError as error:
+            left_out.append(error)
+    if not thawed:
+        raise left_out[0]
+    rows, written = [], []
+    for frozen in thawed:
         num_episodes = arguments.episodes or frozen.spec.evaluation_episodes or DEFAULT_EPISODES
         episodes, path = frozen.evaluate(policies, num_episodes=num_episodes, seed=arguments.seed)
         rows += summary(episodes, frozen)
         written.append(path)
-        if arguments.video:
-            kind = VideoFormat(arguments.video)
-            videos += [frozen.film(policy, kind, seed=arguments.seed) for policy in policies]
-    if not rows:
-        raise RecrlError(f"{store.name}: none of the chosen trials has a checkpoint yet")
     _show(pd.DataFrame(rows), console)
     _say(console, "Means and standard errors; within: episodes in which no cost exceeded its d_d.")
-    for name, paths in (("Episodes", written), ("Videos", videos)):
-        for path in paths:
-            _say(console, f"{name:<10} {_short(path)}")
-    if videos:
-        _tell_mlflow(store, arguments, console)
+    for path in written:
+        _say(console, f"Episodes   {_short(path)}")
+    for error in left_out:
+        _say(console, f"left out   {error}")
+    if arguments.video:
+        for frozen in thawed:
+            for policy in policies:
+                video = frozen.film(policy, VideoFormat(arguments.video), seed=arguments.seed)
+                _say(console, f"Video      {_short(video)}")
+    _tell_mlflow(store, arguments, console)
     return ExitCode.OK
 
 

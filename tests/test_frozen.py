@@ -215,11 +215,10 @@ def test_evaluate_leaves_out_what_has_no_checkpoint(
     begun = replace(SPEC, seed=6)
     store.trial(begun).begin(begun)
     assert main(["evaluate", "--root", root]) == ExitCode.OK
-    assert capsys.readouterr().out.startswith(
-        "left out: two-state ppo-lag none seed 6: has no intact checkpoint yet\n"
-    )
+    sentence = "two-state ppo-lag none seed 6: has no intact checkpoint yet\n"
+    assert capsys.readouterr().out.endswith(f"left out   {sentence}")
     assert main(["evaluate", "--root", root, "--only", "seed=6"]) == ExitCode.WRONG_INPUT
-    assert capsys.readouterr().err == "recrl-sweep: small: none of the chosen trials has a checkpoint yet\n"
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}"
     assert main(["evaluate", "--root", root, "small", "nobody"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err == (
         "recrl-sweep: small: no trials on disk begin with 'nobody'; status names them\n"
@@ -232,7 +231,7 @@ def test_evaluate_films_on_demand(crossing: TrialStore, capsys: pytest.CaptureFi
     assert main(arguments) == ExitCode.OK
     (video,) = crossing.videos_folder.iterdir()
     assert video.name == "update-00000009__seed-own__deterministic.gif"
-    assert capsys.readouterr().out.splitlines()[-1] == f"Videos     {video}"
+    assert capsys.readouterr().out.splitlines()[-1] == f"Video      {video}"
 
 
 def test_a_launch_films_what_the_grid_wants(

@@ -445,6 +445,20 @@ def test_figures_are_artifacts_of_the_parent_and_survive_a_rebuild(write: Callab
     assert [file.path for file in connect(store).list_artifacts(parent, "figures")] == ["figures/curves.png"]
 
 
+def test_what_is_filmed_after_a_trials_end_reaches_its_run(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    trial = trial_titled(store, DYNAMIC)
+    trial.videos_folder.mkdir()
+    (trial.videos_folder / "update-00000040__seed-own__stochastic.gif").write_bytes(b"gif")
+    sync(store, uri)
+    run = runs(store)[DYNAMIC].info.run_id
+    assert [file.path for file in connect(store).list_artifacts(run, "videos")] == [
+        "videos/update-00000040__seed-own__stochastic.gif"
+    ]
+
+
 # With MLflow away
 
 
