@@ -11,6 +11,7 @@ from recrl.analysis.frames import Sweep
 from recrl.analysis.policy_map import mean_behaviour, policy_maps, river_task
 from recrl.environments.river_grid import FORWARD, LEFT, RIGHT, RiverGridOptions, state_index
 from recrl.environments.river_maps import MAPS, RiverMap, parse_map
+from recrl.orchestrator.spec import Choice, TrialSpec
 
 OPTIONS = RiverGridOptions(horizon=30)
 
@@ -39,8 +40,16 @@ def river_sweep(finished: Sweep) -> Sweep:
         labels = pd.Categorical([label] * len(policies), finished.trials[name].cat.categories, ordered=True)
         policies[name] = labels
     trials = finished.trials.assign(task_name="rivergrid-1b")
-    options = dict.fromkeys(finished.task_options, OPTIONS.model_dump())
-    return dataclasses.replace(finished, trials=trials, policies=policies, task_options=options)
+    facts = [
+        dataclasses.replace(it, spec=dataclasses.replace(it.spec, task=river_task_of(it.spec)))
+        for it in finished.facts
+    ]
+    return dataclasses.replace(finished, trials=trials, policies=policies, facts=tuple(facts))
+
+
+def river_task_of(spec: TrialSpec) -> Choice:
+    """RiverGrid 1b under the label that the trial's task has."""
+    return Choice("rivergrid-1b", OPTIONS.model_dump(), spec.task.label)
 
 
 def test_swimming_and_walking_average_to_what_is_counted_by_hand(river_sweep: Sweep) -> None:

@@ -9,7 +9,7 @@ from PIL import Image
 
 from recrl.analysis import compact, report, styles
 from recrl.analysis.cumulative import cumulative_costs
-from recrl.analysis.frames import KEY, Sweep
+from recrl.analysis.frames import Sweep
 
 RESULTS = Path(__file__).parent.parent / "results" / "rivergrid"
 PINNED = "matplotlib==" + mpl.__version__
@@ -25,18 +25,9 @@ def rivergrid() -> Sweep:
 
 
 @pytest.mark.parametrize(
-    "stem",
-    [
-        "learning-curves_cpo",
-        "curricula",
-        "diagnostics_rivergrid-1b_ppo-lag",
-        "policies_ppo-lag",
-        "bounds_cpo",
-        "return-against-cost",
-        "performance-profiles",
-    ],
+    "stem", ["learning-curves_cpo", "curricula", "policies_ppo-lag", "return-against-cost"]
 )
-def test_a_figure_of_each_kind_is_redrawn_pixel_by_pixel(rivergrid: Sweep, tmp_path: Path, stem: str) -> None:
+def test_figures_are_redrawn_pixel_by_pixel(rivergrid: Sweep, tmp_path: Path, stem: str) -> None:
     figure = report.drawings(rivergrid)[stem]()
     assert figure is not None
     redrawn = styles.save_png(figure, tmp_path / "figure.png")
@@ -66,10 +57,10 @@ def test_measured_cost_lies_under_the_bounds_on_river_grid(rivergrid: Sweep) -> 
 
 
 def test_measured_cost_lies_under_proposition_1_with_the_runs_own_advantages(rivergrid: Sweep) -> None:
-    crude = cumulative_costs(rivergrid).set_index(list(KEY))
-    own = cumulative_costs(compact.load(RESULTS / "advantages.zip")).set_index(list(KEY))
-    assert len(own) == 10
-    for key, row in own.iterrows():
-        # the discounted cost, which the bound is on, is at most the measured one
-        assert row["cost_sum"] < row["discounted_bound"] < crude.loc[key, "discounted_bound"]
-        assert row["cost_sum"] == pytest.approx(crude.loc[key, "cost_sum"])
+    own = cumulative_costs(compact.load(RESULTS / "advantages.zip"))
+    crude = cumulative_costs(rivergrid).query("agent == 'cpo' and seed == 0").reset_index()
+    assert len(own) == len(crude) == 10
+    # the discounted cost, which the bound is on, is at most the measured one
+    assert (own["cost_sum"] < own["discounted_bound"]).all()
+    assert (own["discounted_bound"] < crude["discounted_bound"]).all()
+    assert own["cost_sum"].tolist() == pytest.approx(crude["cost_sum"].tolist())
