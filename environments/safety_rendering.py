@@ -48,10 +48,12 @@ FAINTEST = 0.1
 MAX_GEOMS = 1000
 CAMERA_DISTANCE, CAMERA_ELEVATION, CAMERA_AZIMUTH = 6.5, -50.0, 90.0
 
+# Without a graphics card, smoothed edges and finer spheres are four fifths of the time of a picture.
 _ROOM = """
 <visual>
   <headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5" specular="0 0 0"/>
   <global offwidth="1920" offheight="1080"/>
+  <quality offsamples="0" numslices="20" numstacks="10"/>
 </visual>
 <asset>
   <texture type="skybox" builtin="gradient" rgb1="0.5 0.6 0.9" rgb2="0.1 0.1 0.4" width="64" height="64"/>
