@@ -12,11 +12,12 @@ The other half of ``tracking``. Three kinds of queries, whatever the number of r
 * Small files: artifacts, from this machine's disk where the store says they are there, else a few requests
   at once.
 
-Measured (tests/benchmarks/bench_tracking_reader.py): see there.
+How long a thousand runs of 300 updates take: tests/benchmarks/bench_tracking_reader.py.
 """
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -118,17 +119,25 @@ class TrackedSweep:
 
     def histories(self, metrics: Sequence[str]) -> dict[str, History]:
         """Every point of each of some metrics."""
-        with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
-            return dict(zip(metrics, pool.map(self._history, metrics), strict=True))
+        collects = gc.isenabled()
+        gc.disable()  # a million new tuples would make it walk through all of them again and again
+        try:
+            with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
+                return dict(zip(metrics, pool.map(self._history, metrics), strict=True))
+        finally:
+            if collects:
+                gc.enable()
 
     def _history(self, metric: str) -> History:
         read = self._from_server if is_server(self.uri) else self._from_database
-        runs, steps, values, times = read(metric)
-        numbers, known = pd.factorize(np.array(runs, dtype=object))
+        rows = pd.DataFrame.from_records(read(metric), columns=["run", "step", "value", "time"])
+        numbers, known = pd.factorize(rows["run"])
         positions = {trial.run_id: position for position, trial in enumerate(self.trials)}
         trials = np.array([positions.get(run, -1) for run in known], dtype=np.int64)[numbers]
+        steps = rows["step"].to_numpy(np.int64)
         order = np.lexsort((steps, trials))
         order = order[trials[order] >= 0]
+        values, times = rows["value"].to_numpy(np.float64), rows["time"].to_numpy(np.int64)
         return History(trials[order], steps[order], values[order], times[order])
 
     def files(self, name: str) -> list[bytes | None]:
@@ -139,16 +148,15 @@ class TrackedSweep:
         """A file of the sweep's own run, None where it has none."""
         return _files([self.parent_artifacts], name, self.uri)[0] if self.parent_artifacts else None
 
-    def _from_database(self, metric: str) -> tuple[Sequence[str], Ints, Floats, Ints]:
+    def _from_database(self, metric: str) -> list[tuple[Any, ...]]:
         from sqlalchemy import text  # noqa: PLC0415  (MLflow's own way to its database)
 
         store: Any = self._client._tracking_client.store  # its engine knows the database
         with store.engine.connect() as connection:
             result = connection.execute(text(SELECT), {"key": metric, "experiment": int(self.experiment_id)})
-            rows = result.cursor.fetchall()  # plain tuples: a million rows of SQLAlchemy's take seconds
-        return _columns(rows)
+            return list(result.cursor.fetchall())  # plain tuples: SQLAlchemy's rows take longer
 
-    def _from_server(self, metric: str) -> tuple[Sequence[str], Ints, Floats, Ints]:
+    def _from_server(self, metric: str) -> list[tuple[Any, ...]]:
         runs = [trial.run_id for trial in self.trials if metric in trial.metrics]
         rows: list[tuple[Any, ...]] = []
         for start in range(0, len(runs), RUNS_A_REQUEST):
@@ -156,7 +164,7 @@ class TrackedSweep:
             rows += [
                 (it["run_id"], it.get("step", 0), it.get("value", 0.0), it["timestamp"]) for it in points
             ]
-        return _columns(rows)
+        return rows
 
     def _ask_server(self, metric: str, runs: Sequence[str]) -> list[dict[str, Any]]:
         from mlflow.utils.rest_utils import http_request_safe  # noqa: PLC0415
@@ -253,12 +261,6 @@ def _trial(run: Run) -> TrackedTrial:
 
 def _with_nan(row: dict[str, Any]) -> dict[str, Any]:
     return {name: math.nan if value is None else value for name, value in row.items()}
-
-
-def _columns(rows: Sequence[tuple[Any, ...]]) -> tuple[Sequence[str], Ints, Floats, Ints]:
-    """Runs, steps, values and times of points."""
-    runs, steps, values, times = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return runs, np.array(steps, np.int64), np.array(values, np.float64), np.array(times, np.int64)
 
 
 def _files(places: Sequence[str], name: str, uri: str) -> list[bytes | None]:
