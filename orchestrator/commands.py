@@ -209,8 +209,8 @@ def run_evaluate(arguments: argparse.Namespace, console: Console) -> ExitCode:
     _say(console, "Means and standard errors; within: episodes in which no cost exceeded its d_d.")
     for path in written:
         _say(console, f"Episodes   {_short(path)}")
-    for error in left_out:
-        _say(console, f"left out   {error}")
+    for reason in left_out:
+        _say(console, f"left out   {reason}")
     if arguments.video:
         for frozen in thawed:
             for policy in policies:

@@ -171,26 +171,29 @@ def summary(rows: pd.DataFrame, frozen: FrozenTrial) -> list[dict[str, Any]]:
     costs = [f"cost_{i}" for i in range(frozen.cmdp.num_costs)]
     limits = frozen.spec.deploy_limits.array
     table = []
-    for policy in rows["policy"].unique():
+    for policy in FrozenPolicy:
         episodes = rows[rows["policy"] == policy]
+        if episodes.empty:
+            continue
         within = float((episodes[costs].to_numpy() <= limits).all(axis=1).mean())
         table.append(
             {
                 "trial": frozen.spec.title,
                 "update": f"{frozen.update} of {frozen.spec.num_updates}",
-                "policy": str(policy),
+                "policy": policy.value,
                 "episodes": str(len(episodes)),
                 "return": _mean_text(episodes["episode_return"]),
                 "costs": ", ".join(_mean_text(episodes[column]) for column in costs),
-                "d_d": ", ".join(f"{limit:g}" for limit in limits),
+                "d_d": ", ".join(f"{limit:g}" for limit in frozen.spec.deploy_limits),
                 "within": f"{within:.0%}",
             }
         )
     return table
 
 
-def _mean_text(values: pd.Series[float]) -> str:
+def _mean_text(column: pd.Series[float]) -> str:
     """``9.50 ± 0.02``, the mean and its standard error; the mean alone of a single value."""
+    values = column.to_numpy(np.float64)
     if len(values) < 2:
         return f"{values.mean():.2f}"
-    return f"{values.mean():.2f} ± {values.sem():.2f}"
+    return f"{values.mean():.2f} ± {values.std(ddof=1) / np.sqrt(len(values)):.2f}"

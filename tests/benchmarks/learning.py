@@ -188,7 +188,7 @@ def main() -> None:
         start = time.process_time()
         runs = [learn(lesson, seed) for seed in arguments.seeds]
         seconds = (time.process_time() - start) / len(runs)
-        row = {"student": lesson.agent, "task": lesson.exercise, "optimum": optimum}
+        row: dict[str, Any] = {"student": lesson.agent, "task": lesson.exercise, "optimum": optimum}
         for name, values in (
             ("average", [mean_value(run) for run in runs]),
             ("last", [run[-1] for run in runs]),
