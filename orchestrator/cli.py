@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 from recrl.orchestrator.errors import ClusterError, GridError, RecrlError, SweepBusyError, TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -47,6 +48,7 @@ Exit codes:
   130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 SWEEP_HELP = "a sweep's name, or its grid file; may be left out where there is only one"
 
 
@@ -75,101 +77,14 @@ def parser() -> argparse.ArgumentParser:
         _command(commands, "stop", "ask the launch that runs a sweep to save its trials and end, and wait")
     )
 
-    logs = _command(commands, "logs", "print a trial's log")
-    _add_sweep(logs)
-    logs.add_argument(
-        "trial",
-        nargs="*",
-        metavar="TRIAL",
-        help="the beginning of its id, title or folder, as status shows them; by default the one that runs",
-    )
-    logs.add_argument("--follow", action="store_true", help="wait for more as long as the trial runs")
-    logs.add_argument("--folder", action="store_true", help="print the trial's folder instead")
-
-    evaluate = _command(
-        commands, "evaluate", "run the frozen policies of trials for whole episodes; film them on demand"
-    )
-    _add_sweep(evaluate)
-    evaluate.add_argument(
-        "trial",
-        nargs="*",
-        metavar="TRIAL",
-        help="the beginning of its id, title or folder, or of several; by default all that have a checkpoint",
-    )
-    _add_only(evaluate)
-    evaluate.add_argument(
-        "--episodes",
-        type=_at_least_one,
-        metavar="N",
-        help="of each policy; by default as many as the trial itself evaluates at its end",
-    )
-    evaluate.add_argument(
-        "--seed",
-        type=_at_least_zero,
-        metavar="S",
-        help="of the episodes; by default that of the trial's own evaluation, which then comes out again",
-    )
-    evaluate.add_argument(
-        "--policy",
-        choices=("stochastic", "deterministic", "both"),
-        default="both",
-        help="act as in training, by the most likely action, or one after the other (default)",
-    )
-    evaluate.add_argument(
-        "--video",
-        choices=("gif", "mp4"),
-        nargs="?",
-        const="gif",
-        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; MLflow gets it",
-    )
-    _add_tracking(evaluate)
-
-    figures = _command(commands, "figures", "draw the figures, tables and report of what is there so far")
-    _add_source(figures)
-    figures.add_argument(
-        "--to", type=Path, metavar="FOLDER", help="where to; by default the sweep's figures folder"
-    )
-    figures.add_argument(
-        "--band",
-        choices=("mean", "iqm"),
-        default="mean",
-        help="of learning curves: mean and standard error (default), or interquartile mean and 95%% "
-        "bootstrap band",
-    )
-
-    export = _command(commands, "export", "write one small file that figures and tables can be drawn from")
-    _add_source(export)
-    export.add_argument(
-        "--to", type=Path, metavar="FILE.zip", help="by default the sweep's name, in this folder"
-    )
-
-    bound = _command(commands, "bound", "what training cost beside its bounds; which d_t a budget allows")
-    _add_source(bound)
-    bound.add_argument(
-        "--budget",
-        type=float,
-        metavar="COST",
-        help="cost above d_d that may be spent over all training episodes: say the largest d_t for it",
-    )
-    bound.add_argument(
-        "--cost", type=_at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
-    )
-
+    _add_logs(commands)
+    _add_evaluate(commands)
+    _add_figures(commands)
+    _add_export(commands)
+    _add_bound(commands)
     _add_replay(commands)
-
-    user_interface = _command(commands, "ui", "open MLflow's pages about a sweep, on this machine only")
-    _add_sweep(user_interface)
-    _add_tracking(user_interface)
-    user_interface.add_argument(
-        "--port", type=int, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)"
-    )
-
-    sync = _command(commands, "sync", "bring MLflow up to the files, for example after it was unreachable")
-    _add_sweep(sync)
-    _add_tracking(sync)
-    sync.add_argument(
-        "--rebuild", action="store_true", help="send everything again, for example to an empty MLflow"
-    )
+    _add_ui(commands)
+    _add_sync(commands)
     return top
 
 
@@ -231,9 +146,7 @@ def _parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser
     )
 
 
-def _command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, summary: str
-) -> argparse.ArgumentParser:
+def _command(commands: Commands, name: str, summary: str) -> argparse.ArgumentParser:
     command = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
     if name != "validate":
         command.add_argument(
@@ -242,7 +155,7 @@ def _command(
     return command
 
 
-def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_launch(commands: Commands) -> None:
     launch = _command(
         commands, "launch", "run what is not complete, draw the figures, say where everything is"
     )
@@ -278,7 +191,97 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
 
 
-def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_logs(commands: Commands) -> None:
+    logs = _command(commands, "logs", "print a trial's log")
+    _add_sweep(logs)
+    logs.add_argument(
+        "trial",
+        nargs="*",
+        metavar="TRIAL",
+        help="the beginning of its id, title or folder, as status shows them; by default the one that runs",
+    )
+    logs.add_argument("--follow", action="store_true", help="wait for more as long as the trial runs")
+    logs.add_argument("--folder", action="store_true", help="print the trial's folder instead")
+
+
+def _add_evaluate(commands: Commands) -> None:
+    evaluate = _command(
+        commands, "evaluate", "run the frozen policies of trials for whole episodes; film them on demand"
+    )
+    _add_sweep(evaluate)
+    evaluate.add_argument(
+        "trial",
+        nargs="*",
+        metavar="TRIAL",
+        help="the beginning of its id, title or folder, or of several; by default all that have a checkpoint",
+    )
+    _add_only(evaluate)
+    evaluate.add_argument(
+        "--episodes",
+        type=_at_least_one,
+        metavar="N",
+        help="of each policy; by default as many as the trial itself evaluates at its end",
+    )
+    evaluate.add_argument(
+        "--seed",
+        type=_at_least_zero,
+        metavar="S",
+        help="of the episodes; by default that of the trial's own evaluation, which then comes out again",
+    )
+    evaluate.add_argument(
+        "--policy",
+        choices=("stochastic", "deterministic", "both"),
+        default="both",
+        help="act as in training, by the most likely action, or one after the other (default)",
+    )
+    evaluate.add_argument(
+        "--video",
+        choices=("gif", "mp4"),
+        nargs="?",
+        const="gif",
+        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; MLflow gets it",
+    )
+    _add_tracking(evaluate)
+
+
+def _add_figures(commands: Commands) -> None:
+    figures = _command(commands, "figures", "draw the figures, tables and report of what is there so far")
+    _add_source(figures)
+    figures.add_argument(
+        "--to", type=Path, metavar="FOLDER", help="where to; by default the sweep's figures folder"
+    )
+    figures.add_argument(
+        "--band",
+        choices=("mean", "iqm"),
+        default="mean",
+        help="of learning curves: mean and standard error (default), or interquartile mean and 95%% "
+        "bootstrap band",
+    )
+
+
+def _add_export(commands: Commands) -> None:
+    export = _command(commands, "export", "write one small file that figures and tables can be drawn from")
+    _add_source(export)
+    export.add_argument(
+        "--to", type=Path, metavar="FILE.zip", help="by default the sweep's name, in this folder"
+    )
+
+
+def _add_bound(commands: Commands) -> None:
+    bound = _command(commands, "bound", "what training cost beside its bounds; which d_t a budget allows")
+    _add_source(bound)
+    bound.add_argument(
+        "--budget",
+        type=float,
+        metavar="COST",
+        help="cost above d_d that may be spent over all training episodes: say the largest d_t for it",
+    )
+    bound.add_argument(
+        "--cost", type=_at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
+    )
+
+
+def _add_replay(commands: Commands) -> None:
     replay = _command(
         commands, "replay", "what limits another teacher would have set on the recorded episodes"
     )
@@ -295,6 +298,24 @@ def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         help="options of the teacher other than the sweep's, window=8",
     )
     _add_only(replay)
+
+
+def _add_ui(commands: Commands) -> None:
+    user_interface = _command(commands, "ui", "open MLflow's pages about a sweep, on this machine only")
+    _add_sweep(user_interface)
+    _add_tracking(user_interface)
+    user_interface.add_argument(
+        "--port", type=int, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)"
+    )
+
+
+def _add_sync(commands: Commands) -> None:
+    sync = _command(commands, "sync", "bring MLflow up to the files, for example after it was unreachable")
+    _add_sweep(sync)
+    _add_tracking(sync)
+    sync.add_argument(
+        "--rebuild", action="store_true", help="send everything again, for example to an empty MLflow"
+    )
 
 
 def _add_grid(command: argparse.ArgumentParser) -> None:
