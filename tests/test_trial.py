@@ -97,8 +97,8 @@ def test_interrupted_equals_uninterrupted(tmp_path: Path, agent: str, method: st
     assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 0, 7, 11))
 
 
-@pytest.mark.parametrize("agent", AGENTS)
-def test_every_student_interrupted_equals_itself_uninterrupted(tmp_path: Path, agent: str) -> None:
+@pytest.mark.parametrize("agent", sorted(set(AGENTS) - {"ppo-lag", "cpo"}))
+def test_every_other_student_interrupted_equals_itself_uninterrupted(tmp_path: Path, agent: str) -> None:
     spec = replace(SPEC, agent=Choice(agent, SMALL))
     assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 8))
 
