@@ -18,7 +18,8 @@ NUM_ENVS = 32
 class Lesson:
     """A task, a student, limits that bind, how long to learn, and with how many seeds it is tested here.
 
-    With no seed, a lesson is only in the table of ``tests/benchmarks/learning.py``.
+    With no seed, a lesson is only in the table of ``tests/benchmarks/learning.py``. ``miss`` says by how
+    much a student is known to miss the bound.
     """
 
     agent: str
@@ -27,6 +28,7 @@ class Lesson:
     updates: int
     options: dict[str, Any] = field(default_factory=dict)
     seeds: int = 1
+    miss: str = ""
 
 
 LESSONS = [
@@ -43,7 +45,7 @@ LESSONS = [
     Lesson("pcpo", "two-state-2", (5.0, 2.0), 100),
     Lesson("pcpo", "continuous-bandit", (2.5,), 100),
     Lesson("focops", "two-state", (3.0,), 150),
-    Lesson("focops", "two-state-2", (5.0, 2.0), 150),
+    Lesson("focops", "two-state-2", (5.0, 2.0), 150, miss="exact mean cost 5.077 for the limit 5, seed 0"),
     Lesson("p3o", "two-state", (3.0,), 200),
     Lesson("p3o", "two-state-2", (5.0, 2.0), 200),
     Lesson("ipo", "two-state", (3.0,), 200),
@@ -53,8 +55,8 @@ LESSONS = [
 ]
 
 
-def last_quarter(lesson: Lesson, seed: int) -> tuple[float, Floats, Floats]:
-    """Mean return and costs [k] of the last quarter's episodes, and the standard errors of the costs [k]."""
+def last_quarter(lesson: Lesson, seed: int) -> tuple[float, Floats]:
+    """Mean return and costs [k] of the episodes of the last quarter of learning."""
     environment_seed, agent_seed, policy_seed = np.random.SeedSequence(seed).spawn(3)
     environments = make_vector(lesson.task, NUM_ENVS)
     agent = make_agent(lesson.agent, environments.cmdp, lesson.options, agent_seed)
@@ -69,15 +71,18 @@ def last_quarter(lesson: Lesson, seed: int) -> tuple[float, Floats, Floats]:
         if update >= 0.75 * lesson.updates:
             kept += episodes
     returns = [episode.episode_return for episode in kept]
-    all_costs = np.array([episode.costs for episode in kept])
-    errors = all_costs.std(axis=0, ddof=1) / np.sqrt(len(kept))
-    return float(np.mean(returns)), all_costs.mean(axis=0), errors
+    return float(np.mean(returns)), np.mean([episode.costs for episode in kept], axis=0)
 
 
 @pytest.mark.parametrize(
     ("lesson", "seed"),
     [
-        pytest.param(lesson, seed, id=f"{lesson.agent}-{lesson.task}-{seed}")
+        pytest.param(
+            lesson,
+            seed,
+            id=f"{lesson.agent}-{lesson.task}-{seed}",
+            marks=[pytest.mark.xfail(reason=lesson.miss)] if lesson.miss else [],
+        )
         for lesson in LESSONS
         for seed in range(lesson.seeds)
     ],
@@ -87,8 +92,8 @@ def test_a_student_reaches_the_constrained_optimum(lesson: Lesson, seed: int) ->
     unconstrained = optimal_return(lesson.task, {}, CostLimits.unlimited(len(lesson.limits)))
     assert optimum is not None and unconstrained is not None
     assert unconstrained > optimum + 1.0  # the constraint binds
-    episode_return, costs, errors = last_quarter(lesson, seed)
-    assert np.all(costs - errors <= np.array(lesson.limits) + 0.05)  # what they are is known to one error
+    episode_return, costs = last_quarter(lesson, seed)
+    assert np.all(costs <= np.array(lesson.limits) + 0.05)
     assert episode_return >= optimum - 0.1
 
 
@@ -96,6 +101,6 @@ def test_a_student_reaches_the_constrained_optimum(lesson: Lesson, seed: int) ->
 def test_a_control_reaches_the_unconstrained_optimum_whatever_the_limit(agent: str) -> None:
     optimum = optimal_return("two-state", {}, CostLimits.unlimited(1))
     assert optimum is not None
-    episode_return, costs, _ = last_quarter(Lesson(agent, "two-state", (3.0,), 80), seed=0)
+    episode_return, costs = last_quarter(Lesson(agent, "two-state", (3.0,), 80), seed=0)
     assert episode_return >= optimum - 0.1
     assert costs[0] == pytest.approx(9.0, abs=0.1)
