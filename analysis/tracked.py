@@ -17,14 +17,14 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from recrl.analysis.frames import DRAWN_METRICS, EVENT_COLUMNS, TRIAL, Sweep, TrialFacts, assemble, joined
+from recrl.analysis.frames import DRAWN_METRICS, EVENT_COLUMNS, TRIAL, Sweep, TrialFacts, assemble
 from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.tracking_reader import History, TrackedSweep, TrackedTrial, find_sweep
 
@@ -46,9 +46,8 @@ def load(uri: str, name: str | None = None) -> Sweep:
     complete = [bool(trial.phases) for trial in tracked.trials]
     provenance = tracked.files("provenance.json")
 
-    def rows(file: str, read: Callable[[bytes], pd.DataFrame]) -> pd.DataFrame:
-        found = tracked.files(file) if any(complete) else [None] * len(complete)
-        return joined([pd.DataFrame() if data is None else read(data) for data in found])
+    def files(name: str) -> list[bytes | None]:
+        return tracked.files(name) if any(complete) else [None] * len(complete)
 
     notes = ["Read from MLflow, which holds only some of the updates of a long trial."]
     if tracked.untold:
@@ -60,11 +59,11 @@ def load(uri: str, name: str | None = None) -> Sweep:
     return assemble(
         tracked.name,
         [_facts(trial, data) for trial, data in zip(tracked.trials, provenance, strict=True)],
-        phases=joined([pd.DataFrame(trial.phases) for trial in tracked.trials]),
+        phases=_records([trial.phases for trial in tracked.trials]),
         updates=_updates(tracked),
-        evaluations=rows("evaluation.csv", lambda data: pd.read_csv(io.BytesIO(data))),
-        events=rows("events.jsonl", _events),
-        policies=rows("policy.csv", _policy),
+        evaluations=_tables(files("evaluation.csv")),
+        events=_records([_events(data) for data in files("events.jsonl")]),
+        policies=_with_states(_tables(files("policy.csv"))),
         grid=grid.decode() if grid else "",
         notes=notes,
     )
@@ -149,10 +148,37 @@ class _Cells:
         return history.trials * self._scale + np.minimum(history.steps, self._scale - 1)
 
 
-def _events(data: bytes) -> pd.DataFrame:
-    lines = [json.loads(line) for line in data.splitlines()]
-    return pd.DataFrame([{name: event.get(name) for name in EVENT_COLUMNS} for event in lines])
+def _events(data: bytes | None) -> list[dict[str, Any]]:
+    lines = [json.loads(line) for line in (data or b"").splitlines()]
+    return [{name: event.get(name) for name in EVENT_COLUMNS} for event in lines]
 
 
-def _policy(data: bytes) -> pd.DataFrame:
-    return pd.read_csv(io.BytesIO(data)).rename_axis("state").reset_index()
+def _records(of_trials: Sequence[Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
+    """Rows of all trials, with the column TRIAL."""
+    rows = pd.DataFrame([row for rows in of_trials for row in rows])
+    return rows.assign(**{TRIAL: np.repeat(np.arange(len(of_trials)), [len(rows) for rows in of_trials])})
+
+
+def _tables(files: Sequence[bytes | None]) -> pd.DataFrame:
+    """CSV files of all trials, with the column TRIAL; those with the same head are parsed at once.
+
+    Args:
+        files: one of each trial, None where it has none; a line is a row.
+    """
+    of_head: dict[bytes, list[tuple[int, bytes]]] = {}
+    for trial, data in enumerate(files):
+        head, _, body = (data or b"").rstrip(b"\n").partition(b"\n")
+        if body:
+            of_head.setdefault(head, []).append((trial, body))
+    tables = []
+    for head, bodies in of_head.items():
+        table = pd.read_csv(io.BytesIO(b"\n".join([head, *(body for _, body in bodies)])))
+        lines = [body.count(b"\n") + 1 for _, body in bodies]
+        tables.append(table.assign(**{TRIAL: np.repeat([trial for trial, _ in bodies], lines)}))
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame({TRIAL: []}, dtype=np.int64)
+
+
+def _with_states(policies: pd.DataFrame) -> pd.DataFrame:
+    """Numbers the states of each trial, which are in their order."""
+    policies.insert(0, "state", policies.groupby(TRIAL).cumcount())
+    return policies

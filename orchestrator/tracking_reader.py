@@ -2,13 +2,11 @@
 
 The other half of ``tracking``. Three kinds of queries, whatever the number of runs:
 
-* Runs, with their tags: ``search_runs``, a page of 1,000 runs a request.
-* Histories of metrics. MLflow's client has none for many runs at once (mlflow#7365), and one request a run
-  and metric takes a tenth of a second each. A database is asked by one SELECT a metric over the sweep's
-  experiment, which sqlite answers from the primary key of MLflow's table ``metrics`` alone: with (key,
-  timestamp, step, run_uuid, value, is_nan) it holds all of it. A server is asked by
-  ``metrics/get-history-bulk-interval`` of its REST API, for 100 runs and one metric a request, a few requests
-  at once; beyond 2,500 points of a run it thins them evenly.
+* Runs, with their tags: a database is asked by one SELECT a table, a server by ``search_runs``, a page of
+  1,000 runs a request.
+* Histories of metrics: a database is asked by one SELECT a metric (``tracking_database``). A server, whose
+  client has no request for many runs at once (mlflow#7365), by ``metrics/get-history-bulk-interval`` of its
+  REST API, for 100 runs and one metric a request; beyond 2,500 points of a run it thins them evenly.
 * Small files: artifacts, from this machine's disk where the store says they are there, else a few requests
   at once.
 
@@ -17,7 +15,6 @@ How long a thousand runs of 300 updates take: tests/benchmarks/bench_tracking_re
 
 from __future__ import annotations
 
-import gc
 import json
 import math
 import os
@@ -26,32 +23,22 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 from urllib.parse import unquote, urlparse
 
 import numpy as np
-import numpy.typing as npt
-import pandas as pd
 
 from recrl.environments.cmdp import Floats
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.tracking import ENVIRONMENT, PHASES_TAG, PROGRESS_TAG, SPEC_TAG, is_server
-
-if TYPE_CHECKING:
-    from mlflow.entities import Run
-    from mlflow.tracking import MlflowClient
-
-Ints = npt.NDArray[np.int64]
+from recrl.orchestrator.tracking_database import Database, Ints, Points, ShownRun, points_of, unreadable
 
 EXPERIMENTS = "recrl/"  # what the names of a sweep's experiment begin with
 RUNS_A_REQUEST = 100  # of metric histories; a server takes no more
 POINTS_A_RUN = 2_500  # likewise
 REQUESTS_AT_ONCE = 4
 HISTORY = "/api/2.0/mlflow/metrics/get-history-bulk-interval"
-SELECT = """\
-SELECT m.run_uuid, m.step, m.value, m.timestamp FROM metrics AS m
-WHERE m.key = :key AND m.run_uuid IN (SELECT run_uuid FROM runs WHERE experiment_id = :experiment)"""
 
 
 @dataclass(frozen=True)
@@ -96,6 +83,19 @@ class History:
     milliseconds: Ints
 
 
+class Source(Protocol):
+    """Where MLflow's runs are read from: a ``Database`` or a ``Server``."""
+
+    def experiments(self) -> dict[str, str]:
+        """The identity of every experiment of ours, by its name; others may be among them."""
+
+    def runs(self, experiment_id: str) -> list[ShownRun]:
+        """The runs of an experiment."""
+
+    def points(self, metric: str, experiment_id: str) -> Points:
+        """Every point of a metric in an experiment whose runs were asked for before."""
+
+
 @dataclass(frozen=True, eq=False)
 class TrackedSweep:
     """A sweep as MLflow shows it; of ``find_sweep``.
@@ -115,30 +115,20 @@ class TrackedSweep:
     uri: str
     experiment_id: str
     parent_artifacts: str
-    _client: MlflowClient = field(repr=False)
+    _source: Source = field(repr=False)
 
     def histories(self, metrics: Sequence[str]) -> dict[str, History]:
         """Every point of each of some metrics."""
-        collects = gc.isenabled()
-        gc.disable()  # a million new tuples would make it walk through all of them again and again
-        try:
-            with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
-                return dict(zip(metrics, pool.map(self._history, metrics), strict=True))
-        finally:
-            if collects:
-                gc.enable()
+        with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
+            return dict(zip(metrics, pool.map(self._history, metrics), strict=True))
 
     def _history(self, metric: str) -> History:
-        read = self._from_server if is_server(self.uri) else self._from_database
-        rows = pd.DataFrame.from_records(read(metric), columns=["run", "step", "value", "time"])
-        numbers, known = pd.factorize(rows["run"])
+        points = self._source.points(metric, self.experiment_id)
         positions = {trial.run_id: position for position, trial in enumerate(self.trials)}
-        trials = np.array([positions.get(run, -1) for run in known], dtype=np.int64)[numbers]
-        steps = rows["step"].to_numpy(np.int64)
-        order = np.lexsort((steps, trials))
+        trials = np.array([positions.get(run, -1) for run in points.run_ids], dtype=np.int64)[points.runs]
+        order = np.lexsort((points.steps, trials))
         order = order[trials[order] >= 0]
-        values, times = rows["value"].to_numpy(np.float64), rows["time"].to_numpy(np.int64)
-        return History(trials[order], steps[order], values[order], times[order])
+        return History(trials[order], points.steps[order], points.values[order], points.milliseconds[order])
 
     def files(self, name: str) -> list[bytes | None]:
         """A file of every trial, None where it has none."""
@@ -148,25 +138,65 @@ class TrackedSweep:
         """A file of the sweep's own run, None where it has none."""
         return _files([self.parent_artifacts], name, self.uri)[0] if self.parent_artifacts else None
 
-    def _from_database(self, metric: str) -> list[tuple[Any, ...]]:
-        from sqlalchemy import text  # noqa: PLC0415  (MLflow's own way to its database)
 
-        store: Any = self._client._tracking_client.store  # its engine knows the database
-        with store.engine.connect() as connection:
-            result = connection.execute(text(SELECT), {"key": metric, "experiment": int(self.experiment_id)})
-            return list(result.cursor.fetchall())  # plain tuples: SQLAlchemy's rows take longer
+class Server:
+    """An MLflow server.
 
-    def _from_server(self, metric: str) -> list[tuple[Any, ...]]:
-        runs = [trial.run_id for trial in self.trials if metric in trial.metrics]
-        rows: list[tuple[Any, ...]] = []
+    Args:
+        uri: its address.
+    """
+
+    def __init__(self, uri: str) -> None:
+        for key, value in ENVIRONMENT.items():
+            os.environ.setdefault(key, value)
+        from mlflow.exceptions import MlflowException  # noqa: PLC0415
+        from mlflow.tracking import MlflowClient  # noqa: PLC0415  (takes seconds)
+
+        try:
+            self._client = MlflowClient(uri)
+            self._client.search_experiments(max_results=1)
+        except MlflowException as error:
+            raise unreadable(uri, error) from error
+        self._runs: list[ShownRun] = []
+
+    def experiments(self) -> dict[str, str]:
+        """The identity of every experiment, by its name."""
+        found = self._client.search_experiments(filter_string=f"name LIKE '{EXPERIMENTS}%'")
+        return {str(it.name): str(it.experiment_id) for it in found}
+
+    def runs(self, experiment_id: str) -> list[ShownRun]:
+        """The runs of an experiment."""
+        found: list[ShownRun] = []
+        token: str | None = None
+        while True:
+            page = self._client.search_runs([experiment_id], max_results=1_000, page_token=token)
+            found += [
+                ShownRun(
+                    run_id=str(run.info.run_id),
+                    artifacts=str(run.info.artifact_uri),
+                    start_time=int(run.info.start_time or 0),
+                    tags=run.data.tags,
+                    metrics=frozenset(run.data.metrics),
+                )
+                for run in page
+            ]
+            token = page.token
+            if not token:
+                self._runs = found
+                return found
+
+    def points(self, metric: str, experiment_id: str) -> Points:
+        """Every point of a metric in the experiment whose runs were asked for last."""
+        runs = [run.run_id for run in self._runs if metric in run.metrics]
+        rows: list[tuple[str, int, float, int]] = []
         for start in range(0, len(runs), RUNS_A_REQUEST):
-            points = self._ask_server(metric, runs[start : start + RUNS_A_REQUEST])
+            points = self._ask(metric, runs[start : start + RUNS_A_REQUEST])
             rows += [
                 (it["run_id"], it.get("step", 0), it.get("value", 0.0), it["timestamp"]) for it in points
             ]
-        return rows
+        return points_of(rows)
 
-    def _ask_server(self, metric: str, runs: Sequence[str]) -> list[dict[str, Any]]:
+    def _ask(self, metric: str, runs: Sequence[str]) -> list[dict[str, Any]]:
         from mlflow.utils.rest_utils import http_request_safe  # noqa: PLC0415
 
         store: Any = self._client._tracking_client.store  # it knows the credentials
@@ -188,10 +218,11 @@ def find_sweep(uri: str, name: str | None) -> TrackedSweep:
     Raises:
         TrackingError: MLflow cannot be reached, or shows no such sweep.
     """
-    client = _connect(uri)
+    source: Source = Server(uri) if is_server(uri) else Database(uri)
     names = {
-        str(each.name).removeprefix(EXPERIMENTS): str(each.experiment_id)
-        for each in client.search_experiments(filter_string=f"name LIKE '{EXPERIMENTS}%'")
+        title.removeprefix(EXPERIMENTS): identity
+        for title, identity in source.experiments().items()
+        if title.startswith(EXPERIMENTS)
     }
     if name is None and len(names) == 1:
         (name,) = names
@@ -199,63 +230,36 @@ def find_sweep(uri: str, name: str | None) -> TrackedSweep:
         listed = f"it shows {', '.join(sorted(names))}" if names else "it shows none"
         which = f"no sweep {name!r}" if name else f"{len(names)} sweeps; say which one"
         raise TrackingError(f"MLflow at {uri} shows {which}; {listed}")
-    runs = _runs(client, names[name])
-    parents = [run for run in runs if run.data.tags.get("recrl.kind") == "sweep"]
-    newest = max(parents, key=lambda run: int(run.info.start_time or 0), default=None)
+    runs = source.runs(names[name])
+    parents = [run for run in runs if run.tags.get("recrl.kind") == "sweep"]
+    newest = max(parents, key=lambda run: run.start_time, default=None)
     if newest is not None:
-        identity = newest.data.tags.get("recrl.sweep_id")
-        runs = [run for run in runs if run.data.tags.get("recrl.sweep_id") == identity]
-    members = [run for run in runs if run.data.tags.get("recrl.kind") == "trial"]
-    told = [run for run in members if run.data.tags.get(SPEC_TAG)]
+        identity = newest.tags.get("recrl.sweep_id")
+        runs = [run for run in runs if run.tags.get("recrl.sweep_id") == identity]
+    members = [run for run in runs if run.tags.get("recrl.kind") == "trial"]
+    told = [run for run in members if run.tags.get(SPEC_TAG)]
     return TrackedSweep(
         name=name,
         trials=tuple(sorted(map(_trial, told), key=lambda trial: trial.spec.folder_name)),
         untold=len(members) - len(told),
         uri=uri,
         experiment_id=names[name],
-        parent_artifacts=str(newest.info.artifact_uri) if newest is not None else "",
-        _client=client,
+        parent_artifacts=newest.artifacts if newest is not None else "",
+        _source=source,
     )
 
 
-def _connect(uri: str) -> MlflowClient:
-    for key, value in ENVIRONMENT.items():
-        os.environ.setdefault(key, value)
-    from mlflow.exceptions import MlflowException  # noqa: PLC0415
-    from mlflow.tracking import MlflowClient  # noqa: PLC0415  (takes seconds)
-
-    if uri.startswith("sqlite:///") and not Path(uri.removeprefix("sqlite:///")).exists():
-        raise TrackingError(f"{uri.removeprefix('sqlite:///')}: no such file; MLflow would make an empty one")
-    try:
-        client = MlflowClient(uri)
-        client.search_experiments(max_results=1)
-    except MlflowException as error:
-        raise TrackingError(f"MLflow at {uri} cannot be read: {str(error).splitlines()[0]}") from error
-    return client
-
-
-def _runs(client: MlflowClient, experiment_id: str) -> list[Run]:
-    found: list[Run] = []
-    token: str | None = None
-    while True:
-        page = client.search_runs([experiment_id], max_results=1_000, page_token=token)
-        found += page
-        token = page.token
-        if not token:
-            return found
-
-
-def _trial(run: Run) -> TrackedTrial:
-    tags = run.data.tags
+def _trial(run: ShownRun) -> TrackedTrial:
+    tags = run.tags
     return TrackedTrial(
         spec=TrialSpec.from_json(json.loads(tags[SPEC_TAG])),
         status=TrialState(tags.get("recrl.status", TrialState.WAITING)),
         error=tags.get("recrl.error", ""),
         progress=json.loads(tags.get(PROGRESS_TAG) or "{}"),
         phases=[_with_nan(row) for row in json.loads(tags.get(PHASES_TAG) or "[]")],
-        run_id=str(run.info.run_id),
-        artifacts=str(run.info.artifact_uri),
-        metrics=frozenset(run.data.metrics),
+        run_id=run.run_id,
+        artifacts=run.artifacts,
+        metrics=run.metrics,
     )
 
 

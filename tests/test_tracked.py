@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +20,7 @@ from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.store import SweepStore, write_json
 from recrl.orchestrator.tracking import sync, tracking_uri
+from recrl.orchestrator.tracking_database import Database, OtherTables, Points, ShownRun, SqliteTables
 from recrl.orchestrator.tracking_reader import find_sweep
 from recrl.orchestrator.tracking_ui import UI, open_ui
 
@@ -128,6 +131,51 @@ def test_a_server_says_what_its_database_says(server: UI, from_mlflow: Sweep) ->
     found = tracked.load("http://127.0.0.1:5713", "made-up")
     for name in ("trials", "phases", "updates", "evaluations", "events", "policies"):
         pd.testing.assert_frame_equal(getattr(found, name), getattr(from_mlflow, name), check_exact=True)
+
+
+def test_every_way_to_a_database_gives_the_same(sweep: SweepStore) -> None:
+    uri = tracking_uri(sweep, None)
+    one, other = Database(uri, SqliteTables(uri)), Database(uri, OtherTables(uri))
+    experiment = one.experiments()["recrl/made-up"]
+    assert one.experiments() == other.experiments()
+
+    def runs(database: Database) -> list[ShownRun]:
+        return sorted(database.runs(experiment), key=lambda run: run.run_id)
+
+    assert runs(one) == runs(other)
+    metrics = {metric for run in runs(one) for metric in run.metrics}
+    assert {"train/return", "curriculum/limit_0", "student/kl"} < metrics
+    for metric in [*metrics, "of nobody"]:
+        found = rows(one.points(metric, experiment))
+        assert found == rows(other.points(metric, experiment))
+        assert bool(found) == (metric in metrics)
+
+
+def rows(points: Points) -> list[tuple[str, int, float, int]]:
+    runs = [points.run_ids[run] for run in points.runs]
+    numbers = (array.tolist() for array in (points.steps, points.values, points.milliseconds))
+    return sorted(zip(runs, *numbers, strict=True))
+
+
+def test_reading_waits_for_whoever_writes(sweep: SweepStore, tmp_path: Path) -> None:
+    database = tmp_path / "busy.db"
+    shutil.copy(sweep.mlflow_database, database)
+    writer = sqlite3.connect(database, check_same_thread=False)
+    writer.execute("BEGIN EXCLUSIVE")
+    end = threading.Timer(0.3, writer.rollback)
+    end.start()
+    assert "recrl/made-up" in Database(f"sqlite:///{database}").experiments()
+    end.join()
+    writer.close()
+
+
+def test_a_file_that_is_no_database_of_mlflows_is_named(tmp_path: Path) -> None:
+    (tmp_path / "other.db").write_text("no database")
+    with pytest.raises(TrackingError, match=r"other\.db cannot be read: .*file is not a database"):
+        tracked.load(f"sqlite:///{tmp_path / 'other.db'}")
+    sqlite3.connect(tmp_path / "empty.db").execute("CREATE TABLE other (key TEXT)")
+    with pytest.raises(TrackingError, match=r"empty\.db cannot be read: .*no such table: experiments"):
+        tracked.load(f"sqlite:///{tmp_path / 'empty.db'}")
 
 
 def test_what_an_older_version_sent_is_named(sweep: SweepStore, tmp_path: Path) -> None:
