@@ -14,7 +14,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from recrl.orchestrator.errors import ClusterError, GridError, RecrlError, SweepBusyError, TrackingError
+from recrl.orchestrator.errors import (
+    ClusterError,
+    GridError,
+    RecrlError,
+    StorageError,
+    SweepBusyError,
+    TrackingError,
+)
 from recrl.orchestrator.exit_codes import ExitCode
 
 DESCRIPTION = """\
@@ -37,13 +44,15 @@ Going on:
   recrl-sweep evaluate demo 3f2a --video  run its policy again, and film an episode
   recrl-sweep launch grids/demo.yaml --retry-failed
   recrl-sweep launch grids/demo.yaml --only method=dynamic task=rivergrid-1b
+  recrl-sweep launch grids/demo.yaml --address auto --storage s3://bucket/folder
+  recrl-sweep status demo --storage s3://bucket/folder     from any machine that has its credentials
 
 Exit codes:
   0    done, or nothing to do
   1    some trials failed or could not be finished
   2    the grid or the arguments are wrong; nothing was started
   3    another process is running this sweep
-  4    Ray or MLflow could not be started or reached, or files could not be written
+  4    Ray, MLflow or the storage could not be reached, or files could not be written
   5    plan --check: a launch would have something to do
   130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
 
@@ -66,6 +75,13 @@ def parser() -> argparse.ArgumentParser:
     plan.add_argument(
         "--check", action="store_true", help="end with 5 if a launch would have something to do"
     )
+    room = plan.add_mutually_exclusive_group()
+    room.add_argument(
+        "--address",
+        metavar="HOST:PORT",
+        help="estimate for this Ray cluster, which is asked; by default for this machine",
+    )
+    room.add_argument("--cores", type=_at_least_one, metavar="N", help="estimate for so many cores")
 
     _add_grid(_command(commands, "validate", "check a grid file; all mistakes at once, with their lines"))
 
@@ -134,7 +150,8 @@ def main(given: Sequence[str] | None = None) -> int:
 def _code_of(error: RecrlError) -> ExitCode:
     if isinstance(error, SweepBusyError):
         return ExitCode.BUSY
-    return ExitCode.CANNOT_RUN if isinstance(error, ClusterError | TrackingError) else ExitCode.WRONG_INPUT
+    cannot_run = isinstance(error, ClusterError | StorageError | TrackingError)
+    return ExitCode.CANNOT_RUN if cannot_run else ExitCode.WRONG_INPUT
 
 
 def _parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser:
@@ -151,6 +168,12 @@ def _command(commands: Commands, name: str, summary: str) -> argparse.ArgumentPa
     if name != "validate":
         command.add_argument(
             "--root", type=_folder, default=Path("runs"), help="the folder of all sweeps (default: runs)"
+        )
+        command.add_argument(
+            "--storage",
+            metavar="URI",
+            help="keep the sweep in an object store (s3://bucket/folder, gs://, abfs://...) that all nodes "
+            "reach; its folder under --root is then a mirror, and remembers the address",
         )
     return command
 
@@ -374,7 +397,8 @@ def _add_tracking(command: argparse.ArgumentParser) -> None:
 def _folder(text: str) -> Path:
     if "://" in text:  # trials append to their files and hold locks, which object stores know nothing of
         raise argparse.ArgumentTypeError(
-            f"must be a folder, on a file system that all nodes share where there are several, got {text!r}"
+            "must be a folder, on a file system that all nodes share where there are several; an object "
+            f"store is given by --storage, got {text!r}"
         )
     return Path(text)
 

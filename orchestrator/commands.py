@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import logging
 import re
 import shlex
 import signal
@@ -23,7 +24,7 @@ from rich.console import Console
 
 from recrl.environments.plugins import UnknownNameError
 from recrl.orchestrator import display
-from recrl.orchestrator.errors import RecrlError, TrackingError
+from recrl.orchestrator.errors import RecrlError, StorageError, TrackingError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid
@@ -50,10 +51,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from recrl.analysis.frames import Sweep
+    from recrl.orchestrator.remote_sweep import RemoteSweep
 
 DEFAULT_ROOT = Path("runs")
 MIRROR_INTERVAL_SECONDS = 5.0
 DEFAULT_EPISODES = 100  # of an evaluation, for trials that make none themselves
+
+logger = logging.getLogger("recrl.sweep")
 
 Command = Callable[[argparse.Namespace, Console], ExitCode]
 
@@ -74,10 +78,14 @@ def run_validate(arguments: argparse.Namespace, console: Console) -> ExitCode:
 def run_plan(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Say what a launch would do; nothing is started or written."""
     grid, store = _grid_and_store(arguments)
+    storage = _storage(store, arguments.storage)
+    if storage is not None:
+        _pull(storage, store)
     plan = make_plan(grid.trials(), store, only=_only(arguments.only), retry_failed=arguments.retry_failed)
+    at_once, where = _room(grid, arguments)
     console.print(display.plan_table(plan))
     _say(console, "")
-    _say_plan(plan, grid, arguments, console)
+    _say_plan(plan, grid, console, at_once=at_once, where=where)
     for orphan in plan.orphans:
         _say(console, f"not in the grid any more, left alone: {_short(orphan.folder)}")
     return ExitCode.TRIALS_LEFT if arguments.check and plan.to_do else ExitCode.OK
@@ -87,12 +95,17 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Work on everything in the grid that is not complete."""
     grid, store = _grid_and_store(arguments)
     only = _only(arguments.only)
-    executor = _executor(grid, arguments)
+    storage = _storage(store, arguments.storage)
+    if storage is not None:
+        storage.objects.probe()
+        storage.mark(store)
+    executor = _executor(grid, storage, arguments)
+    at_once, where = _room(grid, arguments)
     uri = tracking_uri(store, arguments.tracking_uri) if arguments.mlflow else None
     stop = threading.Event()
 
     def watch(plan: Plan) -> None:
-        _say_plan(plan, grid, arguments, console)
+        _say_plan(plan, grid, console, at_once=at_once, where=where)
         if plan.to_do:
             chosen = [trial.spec for trial in plan.trials]
             shown.enter_context(display.live_progress(lambda: progress(chosen, store), console))
@@ -119,11 +132,13 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
             stop=stop,
             only=only,
             retry_failed=arguments.retry_failed,
+            storage=storage,
             start_mirror=_mirror_to(uri) if uri else None,
             watch=watch,
             finish=finish,
         )
-    _say(console, f"Results    {_short(store.folder)}")
+    kept = f", a mirror of {storage.objects.uri}" if storage else ""
+    _say(console, f"Results    {_short(store.folder)}{kept}")
     if uri:
         _say_mirrored(store, uri, arguments, console)
     return _say_result(result, store, arguments, console)
@@ -144,25 +159,33 @@ def run_status(arguments: argparse.Namespace, console: Console) -> ExitCode:
 def run_stop(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Ask the launch that runs a sweep to save its trials and end, and wait until it has."""
     store = _store(arguments)
-    still_runs = request_stop(store)
+    storage = _storage(store, arguments.storage)
+    still_runs = request_stop(store, storage)
     if not still_runs():
         _say(console, f"{store.name}: no launch runs this sweep")
         return ExitCode.OK
     _say(console, f"{store.name}: its trials save where they are")
     while still_runs():
         time.sleep(REQUEST_SECONDS)
+    if storage is not None:
+        _pull(storage, store)
     _say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
     return ExitCode.OK
 
 
 def run_logs(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Print a trial's log, or say where its folder is."""
-    trial = _trial(_store(arguments), " ".join(arguments.trial))
+    store = _store(arguments)
+    trial = _trial(store, " ".join(arguments.trial))
     if arguments.folder:
         _say(console, str(_short(trial.folder)))
         return ExitCode.OK
-    for text in display.lines_of(trial, follow=arguments.follow):
-        _say(console, text)
+    storage = _storage(store, arguments.storage)
+    with contextlib.ExitStack() as following:
+        if arguments.follow and storage is not None and not store.is_locked():
+            following.enter_context(storage.mirrored(store, threading.Event()))
+        for text in display.lines_of(trial, follow=arguments.follow):
+            _say(console, text)
     return ExitCode.OK
 
 
@@ -189,7 +212,7 @@ def run_evaluate(arguments: argparse.Namespace, console: Console) -> ExitCode:
     from recrl.orchestrator.frozen import FrozenTrial, summary  # noqa: PLC0415  (imports torch)
     from recrl.orchestrator.videos import VideoFormat  # noqa: PLC0415
 
-    store = _store(arguments)
+    store = _store(arguments, checkpoints=True)
     policies = tuple(FrozenPolicy) if arguments.policy == "both" else (FrozenPolicy(arguments.policy),)
     thawed, left_out = [], []
     for trial in _chosen(store, arguments):
@@ -383,28 +406,58 @@ def run_sync(arguments: argparse.Namespace, console: Console) -> ExitCode:
     return ExitCode.OK
 
 
-def sweep_store(root: Path, sweep: str | None) -> SweepStore:
+def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
     """The sweep that a person means.
 
     Args:
         root: the folder of all sweeps.
-        sweep: its name, or its grid file; None for the only one under ``root``.
+        sweep: its name, or its grid file; None for the only one there.
+        storage: the address of an object store to look at; None to look at ``root``.
 
     Raises:
         RecrlError: there is no such sweep, or more than one that could be meant.
     """
-    names = sorted(path.parent.name for path in root.glob("*/sweep.json"))
+    place: str | Path = storage or root
+    if storage:
+        from recrl.orchestrator.remote_sweep import sweeps_at  # noqa: PLC0415  (imports fsspec)
+
+        names = sweeps_at(storage)
+    else:
+        names = sorted(path.parent.name for path in root.glob("*/sweep.json"))
     if sweep is None:
         if len(names) == 1:
             return SweepStore(root, names[0])
         listed = f"say which one: {', '.join(names)}" if names else "launch one first"
-        raise RecrlError(f"{root}: holds {len(names)} sweeps; {listed}")
+        raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
     if sweep.endswith((".yaml", ".yml")):
         sweep = read_grid(Path(sweep)).name
     if sweep not in names:
         listed = f" (there: {', '.join(names)})" if names else ", nothing was launched there yet"
-        raise RecrlError(f"{root}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
+        raise RecrlError(f"{place}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
     return SweepStore(root, sweep)
+
+
+def _storage(store: SweepStore, given: str | None) -> RemoteSweep | None:
+    """The object store that a sweep is kept in: as given, or as its folder remembers."""
+    if not given and not store.storage_path.exists():
+        return None
+    from recrl.orchestrator.remote_sweep import RemoteSweep  # noqa: PLC0415  (imports fsspec)
+
+    return RemoteSweep(given, store.name) if given else RemoteSweep.of(store)
+
+
+def _pull(storage: RemoteSweep, store: SweepStore, *, checkpoints: bool = False) -> None:
+    """Bring the sweep's folder up to what is kept, or say that it is not."""
+    if store.is_locked():
+        return  # the launch that runs here does it all the time
+    try:
+        if storage.is_there():
+            storage.mark(store)
+            storage.pull(store, checkpoints=checkpoints)
+    except StorageError as error:
+        if not store.info_path.exists():
+            raise
+        logger.warning("%s; what follows is as of the last look", error)
 
 
 def _grid_and_store(arguments: argparse.Namespace) -> tuple[GridSpec, SweepStore]:
@@ -423,11 +476,15 @@ def _only(pairs: Sequence[str]) -> dict[str, list[str]]:
     return wanted
 
 
-def _executor(grid: GridSpec, arguments: argparse.Namespace) -> Executor:
+def _executor(grid: GridSpec, storage: RemoteSweep | None, arguments: argparse.Namespace) -> Executor:
     if arguments.ship_package and not arguments.address:
         raise RecrlError("--ship-package: needs an --address to ship to")
     if arguments.executor == "inline":
-        return InlineExecutor()
+        return InlineExecutor(storage)
+    if storage is not None and storage.uri.startswith("memory://"):
+        raise RecrlError(
+            f"{storage.uri}: is one process's memory, which others do not see; see --executor inline"
+        )
     from recrl.orchestrator.ray_executor import RayExecutor  # noqa: PLC0415  (imports ray)
 
     return RayExecutor(
@@ -439,6 +496,7 @@ def _executor(grid: GridSpec, arguments: argparse.Namespace) -> Executor:
         max_concurrent=arguments.max_concurrent or grid.resources.max_concurrent,
         teacher=grid.resources.teacher,
         silence_seconds=grid.resources.silence_seconds,
+        storage=storage,
     )
 
 
@@ -481,14 +539,23 @@ def _show(table: pd.DataFrame, console: Console) -> None:
     console.print(display.text_table(list(map(str, table)), table.to_numpy().tolist()))
 
 
-def _say_plan(plan: Plan, grid: GridSpec, arguments: argparse.Namespace, console: Console) -> None:
+def _room(grid: GridSpec, arguments: argparse.Namespace) -> tuple[int, str]:
+    """How many trials run at once, and where that is so: on a cluster if there is an address, else here."""
     inline = arguments.command == "launch" and arguments.executor == "inline"
-    at_once = trials_at_once(
-        cpus_per_trial=grid.resources.cpus_per_trial,
-        max_concurrent=1 if inline else arguments.max_concurrent or grid.resources.max_concurrent,
-    )
+    most = 1 if inline else arguments.max_concurrent or grid.resources.max_concurrent
+    if arguments.address and not inline:
+        from recrl.orchestrator.ray_executor import room_on_cluster  # noqa: PLC0415  (imports ray)
+
+        room = room_on_cluster(arguments.address, grid.resources)
+        return most or max(1, room), "on the cluster as it is now"
+    cores = arguments.cores if arguments.command == "plan" else None
+    room = trials_at_once(cpus_per_trial=grid.resources.cpus_per_trial, max_concurrent=most, cores=cores)
+    return room, f"on {cores} cores" if cores else "on this machine"
+
+
+def _say_plan(plan: Plan, grid: GridSpec, console: Console, *, at_once: int, where: str) -> None:
     _say(console, f"{grid.name}: {display.plan_sentence(plan)}")
-    _say(console, display.estimate_sentence(estimate(plan, concurrent=at_once)))
+    _say(console, display.estimate_sentence(estimate(plan, concurrent=at_once), where))
 
 
 def _say_failures(now: SweepProgress, store: SweepStore, console: Console) -> None:
@@ -537,8 +604,13 @@ def _say_result(
     return ExitCode.TRIALS_FAILED
 
 
-def _store(arguments: argparse.Namespace) -> SweepStore:
-    return sweep_store(arguments.root, arguments.sweep)
+def _store(arguments: argparse.Namespace, *, checkpoints: bool = False) -> SweepStore:
+    """The folder of the sweep that is meant, up to date also where it is a mirror."""
+    store = sweep_store(arguments.root, arguments.sweep, arguments.storage)
+    storage = _storage(store, arguments.storage)
+    if storage is not None:
+        _pull(storage, store, checkpoints=checkpoints)
+    return store
 
 
 def _short(path: Path) -> Path:

@@ -60,12 +60,12 @@ def plan_sentence(plan: Plan) -> str:
     return f"{_counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
 
 
-def estimate_sentence(estimate: Estimate) -> str:
-    """``about 4 min with 2 trials at once, 1.9 GB of memory``."""
+def estimate_sentence(estimate: Estimate, where: str) -> str:
+    """``about 4 min with 2 trials at once on this machine, about 1.9 GB of memory``."""
     if not estimate.concurrent:
         return "nothing to do"
     memory = f"about {estimate.gigabytes:.1f} GB of memory"
-    at_once = f"{_counted(estimate.concurrent, 'trial')} at once"
+    at_once = f"{_counted(estimate.concurrent, 'trial')} at once {where}"
     if estimate.wall_seconds is None:
         names = ", ".join(dict.fromkeys(estimate.unknown))
         return f"time unknown until a first trial has run ({names}); {at_once}, {memory}"

@@ -20,7 +20,7 @@ class CheckpointError(RecrlError):
 
 
 class StorageError(RecrlError):
-    """A trial's files cannot be written; its last commit stands, and it goes on when they can be."""
+    """A trial's files cannot be written, or read where they are kept; its last commit stands."""
 
 
 class LostLeaseError(RecrlError):

@@ -10,11 +10,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.store import SweepStore
+
+if TYPE_CHECKING:
+    from recrl.orchestrator.remote_sweep import RemoteSweep
 
 
 class Executor(Protocol):
@@ -31,7 +35,13 @@ class Executor(Protocol):
 
 @dataclass(frozen=True)
 class InlineExecutor:
-    """Runs the trials one after the other in this process."""
+    """Runs the trials one after the other in this process.
+
+    Attributes:
+        storage: where the trials are kept; None for the sweep's folder itself.
+    """
+
+    storage: RemoteSweep | None = None
 
     def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
         """See ``Executor.run``."""
@@ -40,4 +50,10 @@ class InlineExecutor:
         for spec in specs:
             if stop.is_set():
                 return
-            run_recorded(spec, store.trial(spec), should_stop=stop.is_set)
+            place = (
+                self.storage.working_copy(spec, stop.is_set)
+                if self.storage
+                else nullcontext(store.trial(spec))
+            )
+            with place as trial:
+                run_recorded(spec, trial, should_stop=stop.is_set)

@@ -162,9 +162,9 @@ def estimate(plan: Plan, *, concurrent: int) -> Estimate:
     )
 
 
-def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None) -> int:
-    """How many trials fit on this machine's cores; at least 1."""
-    fitting = max(1, int((os.cpu_count() or 1) / cpus_per_trial))
+def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: int | None = None) -> int:
+    """How many trials fit on so many cores, by default this machine's; at least 1."""
+    fitting = max(1, int((cores or os.cpu_count() or 1) / cpus_per_trial))
     return min(fitting, max_concurrent or fitting)
 
 

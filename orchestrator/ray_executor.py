@@ -13,9 +13,9 @@ which is the first case again.
 A signal to the launch and to its whole process group (Ctrl-C, ``timeout``) reaches the driver alone: Ray's
 processes have sessions of their own, and serve until the trials are saved.
 
-Assumes that every node sees the results folder under the same path, and has the same recrl: where the cluster
-is somebody else's, every node is asked for both before the first trial. Leaves out growing with an elastic
-cluster beyond ``max_concurrent``.
+Assumes that every node sees the results folder under the same path, or reaches the object store that the
+trials are kept in, and has the same recrl: where the cluster is somebody else's, every node is asked for both
+before the first trial. Leaves out growing with an elastic cluster beyond ``max_concurrent``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import ray
 from ray import cloudpickle, tune
@@ -44,11 +44,15 @@ from ray.tune.search import BasicVariantGenerator
 from recrl.orchestrator.errors import ClusterError, StorageError, TeacherUnavailableError
 from recrl.orchestrator.own_package import copy_package
 from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
+from recrl.orchestrator.remote_sweep import RemoteSweep, StopObject
 from recrl.orchestrator.scratch import scratch_folder
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import SILENCE_SECONDS
-from recrl.orchestrator.store import SweepStore, TrialRecord
+from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore
 from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
+
+if TYPE_CHECKING:
+    from recrl.orchestrator.grid_file import Resources
 
 STOP_QUESTION_SECONDS = 0.5
 HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats, at least
@@ -92,6 +96,7 @@ class RayExecutor:
         max_failures: how often a trial whose process died is started again, at least 0.
         commit_seconds: wall seconds between a trial's checkpoints, above 0.
         silence_seconds: wall seconds without a heartbeat after which a trial hangs, above 0.
+        storage: where the trials are kept; None for the sweep's folder, which every node then sees.
     """
 
     num_cpus: int | None = None
@@ -105,6 +110,7 @@ class RayExecutor:
     max_failures: int = 3
     commit_seconds: float = 20.0
     silence_seconds: float = SILENCE_SECONDS
+    storage: RemoteSweep | None = None
 
     def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
         """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if it is.
@@ -115,10 +121,15 @@ class RayExecutor:
         """
         if not specs or stop.is_set():
             return
-        with _environment(QUIET | WORKER), self._cluster(), StopFile.open(store.folder) as stop_file:
-            if self.address:
-                check_nodes(stop_file.path)
-            self._run_on_cluster(specs, store, stop, stop_file)
+        with _environment(QUIET | WORKER), self._cluster(), self._stop_sign(store) as stop_sign:
+            if self.address and isinstance(stop_sign, StopObject):
+                check_nodes(stop_sign.key, stop_sign.uri)
+            elif self.address:
+                check_nodes(stop_sign.place)
+            self._run_on_cluster(specs, store, stop, stop_sign)
+
+    def _stop_sign(self, store: SweepStore) -> AbstractContextManager[StopFile | StopObject]:
+        return StopObject.open(self.storage.objects) if self.storage else StopFile.open(store.folder)
 
     def _cluster(self) -> AbstractContextManager[None]:
         if ray.is_initialized():
@@ -128,10 +139,15 @@ class RayExecutor:
         return local_cluster(self.num_cpus)
 
     def _run_on_cluster(
-        self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event, stop_file: StopFile
+        self,
+        specs: Sequence[TrialSpec],
+        store: SweepStore,
+        stop: threading.Event,
+        stop_sign: StopFile | StopObject,
     ) -> None:
         queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
-        watch = _Watch(stop, stop_file, queue, store, _Silence(store, self.silence_seconds))
+        silence = _Silence(store, self.silence_seconds, self.storage)
+        watch = _Watch(stop, stop_sign, queue, store, silence, storage=self.storage)
         service_name = f"teacher-{secrets.token_hex(8)}" if self.teacher == "service" else ""
         service = start_teacher_service(service_name) if service_name else None
         with scratch_folder(tempfile.gettempdir()) as scratch:
@@ -140,7 +156,8 @@ class RayExecutor:
                 param_space={
                     "spec": tune.grid_search([json.dumps(spec.to_json()) for spec in specs]),
                     "sweep": str(store.folder),
-                    "stop_file": str(stop_file.path),
+                    "storage": self.storage.uri if self.storage else "",
+                    "stop_sign": stop_sign.place,
                     "teacher_service": service_name,
                     "commit_seconds": self.commit_seconds,
                 },
@@ -186,6 +203,26 @@ class RayExecutor:
         return min(slots, self.max_concurrent or slots)
 
 
+def room_on_cluster(address: str, resources: Resources) -> int:
+    """How many trials an existing cluster holds at once, at least 0.
+
+    Args:
+        address: as ``existing_cluster`` has it.
+        resources: what a trial takes.
+
+    Raises:
+        ClusterError: it cannot be reached.
+    """
+    with _environment(QUIET | WORKER), existing_cluster(address):
+        return trials_that_fit(
+            {
+                "CPU": resources.cpus_per_trial,
+                "GPU": resources.gpus_per_trial,
+                **resources.custom_per_trial,
+            }
+        )
+
+
 class TuneTrial(tune.Trainable):
     """A worker process, as Tune sees it; each of its trials is one long step.
 
@@ -207,25 +244,36 @@ class TuneTrial(tune.Trainable):
 
         Raises:
             TeacherUnavailableError: the teacher is gone; Tune tries the trial again.
+            StorageError: the object store was down for too long; the same.
         """
         from recrl.orchestrator.trial import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
-        if not self._stop_file.is_set():
-            with _given_gpu():
+        if not self._stop_sign.is_set():
+            with _given_gpu(), self._place() as trial:
                 run_recorded(
                     self._spec,
-                    self._store.trial(self._spec),
-                    should_stop=self._stop_file.is_set,
+                    trial,
+                    should_stop=self._stop_sign.is_set,
                     teacher=self._teacher,
                     commit_seconds=self._commit_seconds,
                 )
         return {"done": True}
 
+    def _place(self) -> AbstractContextManager[TrialStore]:
+        """The folder to work in: the trial's own, or one on this machine if it is kept in an object store."""
+        if self._kept_at is None:
+            return nullcontext(self._store.trial(self._spec))
+        return self._kept_at.working_copy(self._spec, self._stop_sign.is_set)
+
     def _take(self, config: Mapping[str, Any]) -> None:
         self._spec = TrialSpec.from_json(json.loads(config["spec"]))
         sweep = Path(config["sweep"])
         self._store = SweepStore(sweep.parent, sweep.name)
-        self._stop_file = StopFile(Path(config["stop_file"]))
+        uri, place = config["storage"], config["stop_sign"]
+        self._kept_at = RemoteSweep(uri, sweep.name) if uri else None
+        self._stop_sign: StopFile | StopObject = (
+            StopObject(self._kept_at.objects, place) if self._kept_at else StopFile(Path(place))
+        )
         self._commit_seconds: float = config["commit_seconds"]
         name = config["teacher_service"]
         self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
@@ -255,6 +303,11 @@ class StopFile:
         self.path = path
         self._answer = False
         self._asked_at = float("-inf")
+
+    @property
+    def place(self) -> str:
+        """By which workers find it."""
+        return str(self.path)
 
     @classmethod
     @contextmanager
@@ -292,9 +345,10 @@ class _Silence:
     nodes need not agree.
     """
 
-    def __init__(self, store: SweepStore, seconds: float) -> None:
+    def __init__(self, store: SweepStore, seconds: float, storage: RemoteSweep | None) -> None:
         self._store = store
         self._seconds = seconds
+        self._storage = storage
         self._heard: dict[str, tuple[tuple[int, float], float]] = {}
         self._looked_at = float("-inf")
 
@@ -304,6 +358,9 @@ class _Silence:
         if now < self._looked_at + look_seconds(self._seconds):
             return
         self._looked_at = now
+        if self._storage is not None and self._storage.is_out_of_touch:
+            self._heard.clear()  # it is this machine that hears nothing
+            return
         for trial in trials:
             if trial.status != "RUNNING":
                 self._heard.pop(trial.trial_id, None)
@@ -347,13 +404,16 @@ class _Watch(tune.Callback):
     def __init__(
         self,
         stop: threading.Event,
-        stop_file: StopFile,
+        stop_sign: StopFile | StopObject,
         queue: BasicVariantGenerator,
         store: SweepStore,
         silence: _Silence,
+        *,
+        storage: RemoteSweep | None,
     ) -> None:
         self._stop = stop
-        self._stop_file = stop_file
+        self._stop_sign = stop_sign
+        self._storage = storage
         self._queue = queue
         self._store = store
         self._silence = silence
@@ -365,7 +425,7 @@ class _Watch(tune.Callback):
         if self._stop.is_set():
             if not self._queue.is_finished():
                 self._queue.set_finished()  # type: ignore[no-untyped-call]
-            self._stop_file.set()
+            self._stop_sign.set()
             self.stopped_and_idle = all(trial.status != "RUNNING" for trial in trials)
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -374,8 +434,12 @@ class _Watch(tune.Callback):
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
-        cause = _last_error(trial)
-        files = self._store.trial(_spec_of(trial))
+        cause, spec = _last_error(trial), _spec_of(trial)
+        if isinstance(cause, StorageError):
+            logger.warning("%s: %s; it waits", spec.title, cause)
+            return
+        self._refresh(spec)
+        files = self._store.trial(spec)
         if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
             what = f"{type(cause).__name__}: {_first_line(cause)}" if cause else "unknown"
             error = f"failures of its process: {trial.num_failures}; the last: {what}"
@@ -383,6 +447,14 @@ class _Watch(tune.Callback):
                 files.set_status(TrialState.FAILED, error=error)
             except StorageError as also:
                 logger.warning("%s; %s", error, also)
+
+    def _refresh(self, spec: TrialSpec) -> None:
+        """See to it that the files here say what the storage does."""
+        if self._storage is not None:
+            try:
+                self._storage.pull_trial(self._store, spec)
+            except StorageError as error:
+                logger.warning("%s", error)
 
     def __getstate__(self) -> dict[str, Any]:
         """Nothing: Tune pickles its callbacks to restore them, which nobody does, and events cannot be."""

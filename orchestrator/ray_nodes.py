@@ -1,7 +1,8 @@
 """The nodes of a Ray cluster: how many trials they hold, and whether those of somebody else's can stand in.
 
 A trial's result is the same on every machine only if its code is, and it can be kept only where the results
-folder is. Ray itself refuses nodes with another Python or Ray than its head's.
+folder, or the object store in its place, is seen. Ray itself refuses nodes with another Python or Ray than
+its head's.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from recrl.orchestrator.errors import ClusterError
 
 DISTRIBUTIONS = ("recrl", "ray", "torch", "numpy")
 ANSWER_SECONDS = 180.0  # a node may have to start its first process
-SIGHT = "the results folder"
+SIGHT = "what keeps it from the results"
 
 
 def trials_that_fit(wanted: Mapping[str, float]) -> int:
@@ -33,11 +34,12 @@ def trials_that_fit(wanted: Mapping[str, float]) -> int:
     )
 
 
-def check_nodes(probe: Path) -> None:
+def check_nodes(probe: str, uri: str = "") -> None:
     """Hold every node that has cores against this machine, before any trial.
 
     Args:
-        probe: a file that is there, in the sweep's folder.
+        probe: a file that is there, in the sweep's folder; or the key of an object.
+        uri: of the object store that the sweep is kept in, if it is.
 
     Raises:
         ClusterError: one sentence that names every node that differs, and in what.
@@ -48,12 +50,13 @@ def check_nodes(probe: Path) -> None:
     for node in _nodes():
         if node["Resources"].get("CPU", 0.0) > 0.0:
             only = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-            answer = task.options(num_cpus=0, scheduling_strategy=only).remote(DISTRIBUTIONS, str(probe))
+            answer = task.options(num_cpus=0, scheduling_strategy=only).remote(DISTRIBUTIONS, probe, uri)
             asked[answer] = node["NodeManagerAddress"]
     if not asked:
         return
     ready, _ = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_SECONDS)
-    here = look(DISTRIBUTIONS, str(probe))
+    here = look(DISTRIBUTIONS, probe, uri)
+    place = uri or str(Path(probe).parent)
     problems = []
     for answer, address in asked.items():
         if answer not in ready:
@@ -61,7 +64,7 @@ def check_nodes(probe: Path) -> None:
             continue
         try:
             there = ray.get(answer)
-            problems += differences(address, here, there, probe.parent)
+            problems += differences(address, here, there, place)
         except RayError as error:
             cause = error.cause if isinstance(error, RayTaskError) else error
             problems.append(f"{address} cannot run anything: {type(cause).__name__}: {_first_line(cause)}")
@@ -72,14 +75,14 @@ def check_nodes(probe: Path) -> None:
         )
 
 
-def differences(address: str, here: Mapping[str, str], there: Mapping[str, str], folder: Path) -> list[str]:
+def differences(address: str, here: Mapping[str, str], there: Mapping[str, str], place: str) -> list[str]:
     """What a node lacks or has otherwise, a sentence each.
 
     Args:
         address: the node's.
         here: what this machine has, by name.
-        there: what the node has.
-        folder: that it must see.
+        there: what the node has; under SIGHT what is wrong if it does not see the place.
+        place: that it must see, a folder or the address of an object store.
     """
     others = [
         f"{name} {there.get(name) or 'missing'} (here {value})"
@@ -87,8 +90,8 @@ def differences(address: str, here: Mapping[str, str], there: Mapping[str, str],
         if name != SIGHT and there.get(name) != value
     ]
     found = [f"{address} has {', '.join(others)}"] if others else []
-    if not there.get(SIGHT):
-        found.append(f"{address} does not see {folder}, which must be on a file system that all nodes share")
+    if there.get(SIGHT):
+        found.append(f"{address} does not see {place}{there[SIGHT]}")
     return found
 
 
@@ -102,10 +105,10 @@ def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "")
 
 
-def _look() -> Callable[[tuple[str, ...], str], dict[str, str]]:
+def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
     """What is run on the nodes. A closure is sent by value: they may have another recrl, or none."""
 
-    def look(distributions: tuple[str, ...], probe: str) -> dict[str, str]:
+    def look(distributions: tuple[str, ...], probe: str, uri: str) -> dict[str, str]:
         import importlib  # noqa: PLC0415
         import importlib.metadata  # noqa: PLC0415
         import platform  # noqa: PLC0415
@@ -121,11 +124,19 @@ def _look() -> Callable[[tuple[str, ...], str], dict[str, str]]:
             found["recrl's source"] = package.source_digest()
         except ImportError:
             found["recrl's source"] = ""
-        try:  # a network file system may remember that a file is absent; opening it asks the server
-            with open(probe):
-                found["the results folder"] = probe
+        try:
+            if uri:
+                package = importlib.import_module("recrl.orchestrator.object_store")
+                seen = package.ObjectStore(uri).read(probe) is not None
+                found["what keeps it from the results"] = "" if seen else ", but another in its place"
+            else:  # a network file system may remember that a file is absent; opening it asks the server
+                with open(probe):
+                    found["what keeps it from the results"] = ""
         except OSError:
-            found["the results folder"] = ""
+            shared = ", which must be on a file system that all nodes share"
+            found["what keeps it from the results"] = shared
+        except Exception as error:  # of a class that may be missing here
+            found["what keeps it from the results"] = f" ({error})"
         return found
 
     return look

@@ -6,6 +6,7 @@
         trials.jsonl            the trials of that grid, a TrialSpec a line, in their order
         lock                    held by the one process that runs the sweep
         stop.request            there while somebody asks that process to stop
+        storage.json            of a mirror: the address of the object store that the sweep is kept in
         figures/                what ``recrl-sweep figures`` drew
         mlflow.db, mlartifacts/ the default MLflow store
         mirror/                 how far MLflow has been told, for each store it was told to
@@ -198,9 +199,18 @@ class SweepStore:
         """Whether the process that runs the sweep is asked to stop."""
         return self.folder / "stop.request"
 
+    @property
+    def storage_path(self) -> Path:
+        """Where the sweep is kept, if this folder only mirrors it."""
+        return self.folder / "storage.json"
+
     def trial(self, spec: TrialSpec) -> TrialStore:
         """The trial's folder; it need not exist yet."""
-        return TrialStore(self.trials_folder / spec.folder_name)
+        return self.trial_named(spec.folder_name)
+
+    def trial_named(self, folder_name: str) -> TrialStore:
+        """The trial in a folder of this name; it need not exist yet."""
+        return TrialStore(self.trials_folder / folder_name)
 
     def specs(self) -> list[TrialSpec]:
         """The trials of the last launch's grid, in their order; none if there was no launch."""

@@ -13,10 +13,10 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from types import FrameType
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import Executor
@@ -26,6 +26,9 @@ from recrl.orchestrator.provenance import collect
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
 from recrl.orchestrator.store import SweepStore, write_atomically, write_json
+
+if TYPE_CHECKING:
+    from recrl.orchestrator.remote_sweep import RemoteSweep
 
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
 MIRROR_SECONDS = 120.0
@@ -77,6 +80,7 @@ def launch(
     stop: threading.Event,
     only: Mapping[str, Sequence[str]] | None = None,
     retry_failed: bool = False,
+    storage: RemoteSweep | None = None,
     start_mirror: Callable[[SweepStore], Mirror] | None = None,
     watch: Callable[[Plan], None] | None = None,
     finish: Callable[[SweepProgress], None] | None = None,
@@ -90,18 +94,24 @@ def launch(
         stop: once set, running trials save where they are, and the call returns.
         only: the trials to work on, as ``plan.select`` reads it; all by default.
         retry_failed: whether failed trials are tried again.
+        storage: where the trials are kept, if ``store`` is only a mirror; the executor's as well.
         start_mirror: begins to show the sweep elsewhere, before the first trial.
         watch: told the plan before the first trial.
         finish: called after the last trial, before the mirror stops: draws figures, for example.
 
     Raises:
         SweepBusyError: another process is running this sweep.
+        StorageError: the storage cannot be used.
         RecrlError: ``only`` names what is not in the grid, or the executor cannot run at all.
     """
     specs = grid.trials()
     make_plan(specs, store, only=only)  # a mistake in ``only`` leaves no trace
-    with store.lock(), _stopping_on_request(store, stop):
+    with store.lock(), _stopping_on_request(store, stop), _held(storage, stop):
+        if storage is not None:
+            storage.pull(store)
         _write_files(grid, specs, store)
+        if storage is not None:
+            storage.publish(store)
         _leave_none_running(specs, store)  # of a launch that died
         plan = make_plan(specs, store, only=only, retry_failed=retry_failed)
         chosen = [trial.spec for trial in plan.trials]
@@ -112,9 +122,11 @@ def launch(
         mirrored: bool | None = None
         try:
             try:
-                executor.run(plan.to_do, store, stop)
+                with _mirrored(storage, store, stop):
+                    executor.run(plan.to_do, store, stop)
             finally:
                 _leave_none_running(plan.to_do, store)
+                _settle(plan.to_do, store, storage)
             after = progress(chosen, store)
             if finish is not None:
                 finish(after)
@@ -126,15 +138,41 @@ def launch(
     return SweepResult(plan, after, stopped=stop.is_set(), mirrored=mirrored)
 
 
-def request_stop(store: SweepStore) -> Callable[[], bool]:
+def request_stop(store: SweepStore, storage: RemoteSweep | None = None) -> Callable[[], bool]:
     """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
+
+    Args:
+        store: the sweep's folder.
+        storage: what that is the mirror of, if it is one.
 
     Returns:
         Whether it still runs; to be asked until it does not.
     """
     if store.is_locked():
         store.stop_request_path.touch()
+    elif storage is not None and storage.is_held():
+        storage.request_stop()
+        return storage.is_held
     return store.is_locked
+
+
+def _held(storage: RemoteSweep | None, stop: threading.Event) -> AbstractContextManager[None]:
+    return storage.held(stop) if storage else nullcontext()
+
+
+def _mirrored(
+    storage: RemoteSweep | None, store: SweepStore, stop: threading.Event
+) -> AbstractContextManager[None]:
+    return storage.mirrored(store, stop) if storage else nullcontext()
+
+
+def _settle(specs: Sequence[TrialSpec], store: SweepStore, storage: RemoteSweep | None) -> None:
+    """Tell the storage what only this machine knows; it must not hide what came before."""
+    if storage is not None:
+        try:
+            storage.settle(specs, store)
+        except StorageError as error:
+            logger.warning("%s; how its trials ended is known on this machine only", error)
 
 
 @contextmanager

@@ -44,13 +44,24 @@ ADAPTERS = {
     "yaml": r"orchestrator\.located_yaml",
     "rich": r"orchestrator\.(cli|commands|display)",
     "safetensors": r"orchestrator\.checkpoint",
+    "fsspec": r"orchestrator\.object_store",
 }
 # The order inside the orchestrator: no module may import one that stands in a later line.
 LAYERS = (
     ("errors", "exit_codes", "located_yaml", "own_package", "phase_totals", "provenance", "scratch"),
-    ("spec", "checkpoint", "heartbeat"),
+    ("spec", "checkpoint", "heartbeat", "object_store"),
     ("store", "validation"),
-    ("grid_file", "status", "tracking_database", "tracking_points", "plan", "trial", "videos"),
+    (
+        "grid_file",
+        "status",
+        "tracking_database",
+        "tracking_points",
+        "plan",
+        "trial",
+        "videos",
+        "remote_trial",
+        "remote_sweep",
+    ),
     ("grid", "executors", "frozen", "ray_nodes", "tracking", "teacher_service"),
     ("sweep", "ray_executor", "refresh", "tracking_mirror", "tracking_reader", "tracking_ui"),
     ("display",),

@@ -252,13 +252,18 @@ def test_nodes_hold_as_many_trials_as_fit_on_each() -> None:
 @pytest.mark.usefixtures("cluster")
 def test_nodes_are_asked_before_any_trial(tmp_path: Path) -> None:
     (tmp_path / "probe").touch()
-    check_nodes(tmp_path / "probe")
+    check_nodes(str(tmp_path / "probe"))
+    check_nodes("probe", tmp_path.as_uri())
     with pytest.raises(
         ClusterError,
         match=r"^not every node of the cluster can run these trials: \S+ does not see /nowhere, which must "
         r"be on a file system that all nodes share; give all of them the same environment or image ",
     ):
-        check_nodes(Path("/nowhere/probe"))
+        check_nodes("/nowhere/probe")
+    with pytest.raises(
+        ClusterError, match=r": \S+ does not see memory://bucket, but another in its place; give "
+    ):
+        check_nodes("probe", "memory://bucket")
 
 
 @pytest.mark.usefixtures("cluster")

@@ -19,7 +19,7 @@ HERE = {
     "recrl": "0.1.0",
     "ray": "2.60.0",
     "recrl's source": "0123456789",
-    SIGHT: "/r/s/stop",
+    SIGHT: "",
 }
 GRID = """\
 name: small
@@ -32,19 +32,20 @@ run: {total_steps: 160, num_envs: 4, rollout_steps: 10}
 
 
 def test_equal_nodes_do_not_differ() -> None:
-    assert differences("10.0.0.1", HERE, HERE, Path("/r/s")) == []
+    assert differences("10.0.0.1", HERE, HERE, "/r/s") == []
 
 
 def test_every_difference_of_a_node_is_named_with_what_is_here() -> None:
     there = {**HERE, "Python": "3.11.9", "recrl": "", "recrl's source": ""}
-    assert differences("10.0.0.1", HERE, there, Path("/r/s")) == [
+    assert differences("10.0.0.1", HERE, there, "/r/s") == [
         "10.0.0.1 has Python 3.11.9 (here 3.11.7), recrl missing (here 0.1.0), "
         "recrl's source missing (here 0123456789)"
     ]
 
 
 def test_a_node_that_does_not_see_the_results_is_named() -> None:
-    assert differences("10.0.0.1", HERE, {**HERE, SIGHT: ""}, Path("/r/s")) == [
+    there = {**HERE, SIGHT: ", which must be on a file system that all nodes share"}
+    assert differences("10.0.0.1", HERE, there, "/r/s") == [
         "10.0.0.1 does not see /r/s, which must be on a file system that all nodes share"
     ]
 
@@ -89,7 +90,7 @@ def test_an_object_store_is_no_results_folder(capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit) as end:
         main(["launch", "grid.yaml", "--root", "s3://bucket/runs"])
     assert end.value.code == ExitCode.WRONG_INPUT
-    assert "must be a folder, on a file system that all nodes share" in capsys.readouterr().err
+    assert "an object store is given by --storage, got 's3://bucket/runs'" in capsys.readouterr().err
 
 
 def test_nothing_is_shipped_nowhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,566 @@
+"""A trial that is kept in an object store: its way there, attempt by attempt, and its way back.
+
+    <address>/<sweep>/trials/<trial>/<attempt>-<token>/
+        parts/<file>.<first byte>.<sum>     a run of bytes of one of the trial's files
+        manifest-<number>.json              a TrialRecord, and of which parts each file is made
+        alive.json                          while the attempt works: its record, every few seconds
+
+A trial works in a folder of the machine that it runs on, as any trial does (``store`` has the files and
+their rules). Beside it, this takes what each commit changed to the store: new bytes of the row files and the
+new checkpoint first, then a manifest. Rules. Readers believe manifests, and of a manifest only what its
+lengths and sums confirm: what was cut short is not there. Every attempt writes below its own name and
+depends on no other, so what a node writes that comes back from the dead damages nobody, and is not read:
+only the newest attempt with a manifest is. An attempt begins with the newest manifest of those before it,
+which gives the bytes of a trial that never moved, and says so by a manifest of its own; then it clears away
+the others. An attempt that finds a newer one ends itself.
+
+A store that is down stops no trial: what could not be sent is sent later, and a trial is complete when its
+last manifest is there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import re
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
+
+from recrl.orchestrator.errors import LostLeaseError, StorageError
+from recrl.orchestrator.object_store import ObjectStore
+from recrl.orchestrator.scratch import scratch_folder
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.store import TrialRecord, TrialStore, write_atomically, write_json
+
+FORMAT = 1
+LOOK_SECONDS = 0.5  # between two looks at the trial's folder
+ALIVE_SECONDS = 15.0  # between two signs of life
+FIRST_PAUSE_SECONDS = 1.0  # before a failed upload is tried again; doubled each time
+LONGEST_PAUSE_SECONDS = 60.0
+PATIENCE_SECONDS = 900.0  # for a store that is down when a trial begins or has ended
+STOPPING_SECONDS = 60.0  # the same, once the sweep is to stop
+KEPT_MANIFESTS = 2  # a reader may still be at the one before the last
+RETRIES = 3  # of a reader whose manifest was cleared away meanwhile
+
+APPENDED = ("episodes.csv", "updates.csv", "events.jsonl", "log.txt")
+WHOLE = ("spec.json", "provenance.json", "error.txt", "evaluation.csv", "policy.csv")
+ALIVE = "alive.json"
+PULLED = ".pulled.json"
+_CHECKPOINT = re.compile(r"checkpoints/checkpoint-\d{8}\.recrl")
+_ATTEMPT = re.compile(r"(\d{6})-[0-9a-f]{16}")
+_MANIFEST = re.compile(r"manifest-\d{8}\.json")
+
+logger = logging.getLogger("recrl.trial")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A run of bytes of a file, which is one object.
+
+    Attributes:
+        key: of the object, below the attempt.
+        start: of its first byte in the file.
+        length: bytes, at least 1.
+        sha256: of them, in hex.
+    """
+
+    key: str
+    start: int
+    length: int
+    sha256: str
+
+    @classmethod
+    def of(cls, name: str, start: int, data: bytes) -> Self:
+        """The part of a file that these bytes are."""
+        digest = hashlib.sha256(data).hexdigest()
+        return cls(f"parts/{name.rpartition('/')[2]}.{start}.{digest[:16]}", start, len(data), digest)
+
+    @property
+    def end(self) -> int:
+        """The byte after its last one."""
+        return self.start + self.length
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A set of files that belong together.
+
+    Attributes:
+        record: where the trial stood.
+        files: the parts of each file without a gap, by its path in the trial's folder.
+    """
+
+    record: TrialRecord
+    files: Mapping[str, tuple[Part, ...]]
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """Of all its parts."""
+        return frozenset(part.key for parts in self.files.values() for part in parts)
+
+    def to_bytes(self) -> bytes:
+        """Strict JSON; ``from_bytes`` is its inverse."""
+        files = {name: [asdict(part) for part in parts] for name, parts in self.files.items()}
+        value = {"format": FORMAT, "record": asdict(self.record), "files": files}
+        return json.dumps(value, indent=1, allow_nan=False).encode()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """What ``to_bytes`` wrote.
+
+        Raises:
+            ValueError: the bytes are no manifest of this version, or a part of one.
+        """
+        try:
+            value = json.loads(data)
+            if value["format"] != FORMAT:
+                raise ValueError(f"a manifest of format {FORMAT} is expected, got {value['format']!r}")
+            files = {name: tuple(Part(**part) for part in parts) for name, parts in value["files"].items()}
+            manifest = cls(TrialRecord.from_json(value["record"]), files)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"no manifest: {error}") from error
+        for name, parts in files.items():
+            if name not in (*APPENDED, *WHOLE) and not _CHECKPOINT.fullmatch(name):
+                raise ValueError(f"a manifest names a file that no trial has: {name!r}")
+            if [part.start for part in parts] != [0, *(part.end for part in parts)][:-1]:
+                raise ValueError(f"a manifest's parts of {name} leave a gap")
+        return manifest
+
+
+class RemoteTrial:
+    """One trial in an object store.
+
+    Attributes:
+        name: ``TrialSpec.folder_name``.
+    """
+
+    def __init__(self, objects: ObjectStore, name: str) -> None:
+        """Look at nothing yet.
+
+        Args:
+            objects: what lies below the trial's folder.
+            name: the folder's.
+        """
+        self.objects = objects
+        self.name = name
+
+    def take_up(self, trial: TrialStore) -> None:
+        """Bring what the newest manifest names into an empty folder, for another attempt.
+
+        Raises:
+            StorageError: the store cannot be read.
+        """
+        keys = self.objects.keys_in()
+        manifest = self._pull(trial, keys, checkpoints=True)
+        record = manifest.record if manifest else TrialRecord()
+        begun = [int(attempt.partition("-")[0]) for attempt in _attempts(keys)]
+        # the next attempt is to be the newest, also where one before it never came to a manifest
+        record = replace(record, attempt=max([record.attempt, *begun]))
+        if record.attempt:
+            trial.folder.mkdir(parents=True, exist_ok=True)
+            write_json(trial.state_path, asdict(record))
+
+    def mirror(self, trial: TrialStore, keys: Sequence[str] | None = None, *, checkpoints: bool) -> None:
+        """Make a folder show the newest manifest, and how far the trial has come since.
+
+        What was said here of a running attempt from outside (``TrialStore.set_status``) stands until that one
+        says itself how it ended, or a newer one begins.
+
+        Args:
+            trial: the folder; only this ever writes there, but for ``set_status``.
+            keys: what there is below the trial's folder, if that is known.
+            checkpoints: whether to bring the checkpoint of a trial that still runs.
+
+        Raises:
+            StorageError: the store cannot be read.
+        """
+        keys = self.objects.keys_in() if keys is None else keys
+        attempts = _attempts(keys)
+        if not attempts:
+            return
+        manifest = self._pull(trial, keys, checkpoints=checkpoints)
+        record = manifest.record if manifest else TrialRecord()
+        newest = max(attempts)
+        if ALIVE in attempts[newest] and (
+            record.status is TrialState.RUNNING or _attempt_of(record) != newest
+        ):
+            record = _with_life(record, self.objects.read(f"{newest}/{ALIVE}"))
+        if record.attempt == 0:
+            return
+        trial.folder.mkdir(parents=True, exist_ok=True)
+        with trial.locked():
+            here = trial.record()
+            silent = record.status is TrialState.RUNNING
+            judged = here.token == "" and here.attempt >= record.attempt and silent
+            if not judged and here != record:
+                write_json(trial.state_path, asdict(record))
+
+    def _pull(self, trial: TrialStore, keys: Sequence[str], *, checkpoints: bool) -> Manifest | None:
+        """Bring the files of the newest intact manifest; None if there is none."""
+        for _ in range(RETRIES):
+            found = False
+            for attempt, names in sorted(_attempts(keys).items(), reverse=True):
+                for name in sorted(filter(_MANIFEST.fullmatch, names), reverse=True):
+                    found = True
+                    manifest = self._pull_manifest(trial, attempt, name, checkpoints=checkpoints)
+                    if manifest is not None:
+                        return manifest
+            if not found:
+                return None
+            keys = self.objects.keys_in()  # a newer one took their place, and cleared them away
+        logger.warning("%s: no intact manifest of it is there", self.objects.uri)
+        return None
+
+    def _pull_manifest(
+        self, trial: TrialStore, attempt: str, name: str, *, checkpoints: bool
+    ) -> Manifest | None:
+        """Bring the files of one manifest, all or none; None if it is not intact."""
+        before = _pulled(trial)
+        try:
+            if before.get("place") == f"{attempt}/{name}":
+                manifest = Manifest.from_bytes(before["manifest"].encode())
+            else:
+                manifest = Manifest.from_bytes(self.objects.read(f"{attempt}/{name}") or b"")
+        except ValueError as error:
+            logger.warning("%s/%s/%s: passed over: %s", self.objects.uri, attempt, name, error)
+            return None
+        old: Mapping[str, tuple[Part, ...]] = {}
+        if str(before.get("place", "")).startswith(f"{attempt}/"):
+            old = Manifest.from_bytes(before["manifest"].encode()).files
+        wants_checkpoint = checkpoints or manifest.record.status.is_finished
+        news: dict[str, tuple[int, bytes]] = {}
+        for file, parts in manifest.files.items():
+            if _CHECKPOINT.fullmatch(file) and not wants_checkpoint:
+                continue
+            size = _size(trial, file)
+            if parts == old.get(file) and size >= sum(part.length for part in parts):
+                continue
+            have = sum(part.length for part in old.get(file, ())) if file in APPENDED else 0
+            missing = [part for part in parts if part.end > (have if size >= have else 0)]
+            data = [self._part(attempt, part) for part in missing]
+            if None in data:
+                logger.warning(
+                    "%s/%s/%s: passed over: %s is not intact", self.objects.uri, attempt, name, file
+                )
+                return None
+            if missing:
+                news[file] = (missing[0].start, b"".join(piece for piece in data if piece is not None))
+        for file, (start, piece) in news.items():
+            _place(trial, file, start, piece)
+        for path in trial.checkpoints()[1:] if any(map(_CHECKPOINT.fullmatch, news)) else ():
+            path.unlink()
+        if news or before.get("place") != f"{attempt}/{name}":
+            trial.folder.mkdir(parents=True, exist_ok=True)
+            write_json(
+                trial.folder / PULLED,
+                {"place": f"{attempt}/{name}", "manifest": manifest.to_bytes().decode()},
+            )
+        return manifest
+
+    def _part(self, attempt: str, part: Part) -> bytes | None:
+        """A part's bytes, or None if they are not what the manifest says."""
+        data = self.objects.read(f"{attempt}/{part.key}")
+        intact = data is not None and hashlib.sha256(data).hexdigest() == part.sha256
+        return data if intact else None
+
+
+class Upload:
+    """An attempt's way from the folder in which it works to the store."""
+
+    def __init__(self, remote: RemoteTrial, trial: TrialStore) -> None:
+        """Begin with whatever attempt takes the trial next (``TrialStore.begin``).
+
+        Args:
+            remote: where to.
+            trial: where from; as ``RemoteTrial.take_up`` left it.
+        """
+        self._remote = remote
+        self._trial = trial
+        self._before = trial.record().token
+        self._parts: dict[str, tuple[Part, ...]] = {}
+        self._manifests: list[tuple[str, Manifest]] = []
+        self._written: set[str] = set()
+        self._number = 0
+        self._shown: tuple[Any, ...] | None = None
+        self._spoke_at = float("-inf")
+
+    def follow(self) -> None:
+        """Send what is new, if anything is, and now and then a sign of life.
+
+        Raises:
+            StorageError: the store cannot be written; nothing is lost, the next call tries again.
+            LostLeaseError: a newer attempt runs the trial.
+        """
+        record = self._trial.record()
+        if not record.token or record.token == self._before:
+            return
+        if self._shown is None or time.monotonic() >= self._spoke_at + ALIVE_SECONDS:
+            self._speak(record)
+        if self._shown != _commit_of(record):
+            self.push()
+
+    def finish(self) -> None:
+        """Send the rest, after the attempt's end.
+
+        Raises:
+            StorageError: the store cannot be written; nothing is lost, the next call tries again.
+            LostLeaseError: a newer attempt runs the trial.
+        """
+        record = self._trial.record()
+        if not record.token or record.token == self._before:
+            return
+        self._speak(replace(record, heartbeat=time.time()))  # to send much takes long
+        self.push()
+        self._remote.objects.delete([f"{_attempt_of(record)}/{ALIVE}"])
+
+    def push(self) -> None:
+        """Send a set of files as of this moment, and name it by a manifest.
+
+        Raises:
+            StorageError: the store cannot be written; the manifest before stands.
+            LostLeaseError: a newer attempt runs the trial.
+        """
+        record, parts, data = self._capture()
+        attempt = _attempt_of(record)
+        others = self._other_attempts(attempt)
+        for key, piece in data.items():
+            if key not in self._written:
+                self._remote.objects.write(f"{attempt}/{key}", piece)
+                self._written.add(key)
+        manifest = Manifest(record, parts)
+        name = f"manifest-{self._number + 1:08d}.json"
+        self._remote.objects.write(f"{attempt}/{name}", manifest.to_bytes())
+        self._number += 1
+        self._parts, self._shown = parts, _commit_of(record)
+        self._manifests.append((name, manifest))
+        self._clear(attempt, others)
+
+    def revoke(self) -> None:
+        """Take the trial's lease back, so that its attempt ends."""
+        self._trial.set_status(TrialState.WAITING)
+
+    def _speak(self, record: TrialRecord) -> None:
+        """Claim the trial, and say that it lives. That it is over only a manifest may say."""
+        said = replace(record, status=TrialState.RUNNING)
+        self._remote.objects.write(f"{_attempt_of(record)}/{ALIVE}", _json(asdict(said)))
+        self._spoke_at = time.monotonic()
+
+    def _capture(self) -> tuple[TrialRecord, dict[str, tuple[Part, ...]], dict[str, bytes]]:
+        """The record, all parts and the bytes of the new ones, while nobody commits."""
+        data: dict[str, bytes] = {}
+        parts: dict[str, tuple[Part, ...]] = {}
+        with self._trial.locked():
+            record = self._trial.record()
+            lengths = {**record.committed, "log.txt": _size(self._trial, "log.txt")}
+            for name in APPENDED:
+                parts[name] = self._appended(name, lengths.get(name, 0), data)
+            newest = [f"checkpoints/{path.name}" for path in self._trial.checkpoints()[:1]]
+            for name in (*WHOLE, *newest):
+                path = self._trial.folder / name
+                content = path.read_bytes() if path.exists() else b""
+                part = Part.of(name, 0, content)
+                parts[name] = (part,) if content else ()
+                data[part.key] = content
+        return record, {name: found for name, found in parts.items() if found}, data
+
+    def _appended(self, name: str, length: int, data: dict[str, bytes]) -> tuple[Part, ...]:
+        """The parts of a row file; its new bytes go into ``data``.
+
+        A new part takes in those before it that are no longer than it: n commits leave about log2(n) parts,
+        and each byte is sent about log2(n) times at most.
+        """
+        parts = list(self._parts.get(name, ()))
+        if parts and parts[-1].end > length:  # cut back: not what was sent
+            parts.clear()
+        start = parts[-1].end if parts else 0
+        if start == length:
+            return tuple(parts)
+        while parts and parts[-1].length <= length - start:
+            start = parts.pop().start
+        with (self._trial.folder / name).open("rb") as file:
+            file.seek(start)
+            content = file.read(length - start)
+        part = Part.of(name, start, content)
+        data[part.key] = content
+        return (*parts, part)
+
+    def _other_attempts(self, attempt: str) -> list[str]:
+        """The keys of the attempts before this one."""
+        others = _attempts(self._remote.objects.keys_in())
+        if max(others, default="") > attempt:
+            raise LostLeaseError(f"{self._remote.name}: another attempt runs this trial now")
+        return [f"{other}/{name}" for other, names in others.items() if other != attempt for name in names]
+
+    def _clear(self, attempt: str, others: Sequence[str]) -> None:
+        """Delete what no manifest of the last ones names, and the attempts before this one."""
+        old, new = self._manifests[:-KEPT_MANIFESTS], self._manifests[-KEPT_MANIFESTS:]
+        spare = self._written.difference(*(manifest.keys for _, manifest in new))
+        names = [*(name for name, _ in old), *sorted(spare)]
+        self._remote.objects.delete([*(f"{attempt}/{name}" for name in names), *others])
+        self._manifests = new
+        self._written -= spare
+
+
+@contextmanager
+def working_copy(
+    remote: RemoteTrial, spec: TrialSpec, should_stop: Callable[[], bool]
+) -> Iterator[TrialStore]:
+    """A folder on this machine for one attempt at a trial that is kept in an object store.
+
+    It holds what the attempts before left. What the body commits there is sent meanwhile, what is left at the
+    end: this returns when all of it is there.
+
+    Args:
+        remote: where the trial is kept.
+        spec: the trial.
+        should_stop: once true, a store that is down is waited for no longer than ``STOPPING_SECONDS``.
+
+    Raises:
+        StorageError: the store is down, and was for ``PATIENCE_SECONDS``; its last manifest stands.
+    """
+    with scratch_folder(tempfile.gettempdir()) as folder:
+        trial = TrialStore(folder / spec.folder_name)
+        patiently(lambda: remote.take_up(trial), should_stop)
+        upload = Upload(remote, trial)
+        try:
+            with _followed(upload):
+                yield trial
+        except Exception:  # but not a KeyboardInterrupt: that means at once
+            _finish(upload, should_stop)
+            raise
+        _finish(upload, should_stop)
+
+
+def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:
+    """Send what is left, unless a newer attempt has made it worthless."""
+    try:
+        patiently(upload.finish, should_stop)
+    except LostLeaseError as error:
+        logger.warning("%s", error)
+
+
+@contextmanager
+def _followed(upload: Upload) -> Iterator[None]:
+    """Send what is committed, from a thread beside the body."""
+
+    def follow() -> None:
+        pause = LOOK_SECONDS
+        while not over.wait(pause):
+            try:
+                upload.follow()
+            except LostLeaseError as error:
+                logger.warning("%s", error)
+                upload.revoke()
+                return
+            except (StorageError, OSError) as error:
+                if pause == LOOK_SECONDS:
+                    logger.warning("%s; the trial goes on, this is tried again", error)
+                pause = min(2.0 * max(pause, FIRST_PAUSE_SECONDS / 2.0), LONGEST_PAUSE_SECONDS)
+            else:
+                if pause > LOOK_SECONDS:
+                    logger.info("the storage takes everything again")
+                pause = LOOK_SECONDS
+
+    over = threading.Event()
+    thread = threading.Thread(target=follow, name="upload", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
+    """Do what needs the store, again and again while that is down, with growing pauses.
+
+    Args:
+        act: what to do; may be done more than once.
+        should_stop: once true, for ``STOPPING_SECONDS`` more.
+
+    Raises:
+        StorageError: it was down for ``PATIENCE_SECONDS``.
+    """
+    began = time.monotonic()
+    pause, stopping_since = FIRST_PAUSE_SECONDS, float("inf")
+    while True:
+        try:
+            return act()
+        except StorageError as error:
+            now = time.monotonic()
+            if should_stop():
+                stopping_since = min(stopping_since, now)
+            left = min(began + PATIENCE_SECONDS, stopping_since + STOPPING_SECONDS) - now
+            if left <= 0.0:
+                raise
+            if pause == FIRST_PAUSE_SECONDS:
+                logger.warning("%s; it is tried again for %.0f minutes", error, left / 60.0)
+            time.sleep(min(pause, left))
+            pause = min(2.0 * pause, LONGEST_PAUSE_SECONDS)
+
+
+def _attempts(keys: Sequence[str]) -> dict[str, list[str]]:
+    """What there is of each attempt: the keys below it. Names of attempts are in the order of their age."""
+    found: dict[str, list[str]] = {}
+    for key in keys:
+        attempt, _, name = key.partition("/")
+        if _ATTEMPT.fullmatch(attempt) and name:
+            found.setdefault(attempt, []).append(name)
+    return found
+
+
+def _attempt_of(record: TrialRecord) -> str:
+    return f"{record.attempt:06d}-{record.token}"
+
+
+def _commit_of(record: TrialRecord) -> tuple[Any, ...]:
+    """What differs between two records only if there was a commit, a beginning or an end between them."""
+    return (record.token, record.status, record.error, record.cpu_seconds, *sorted(record.committed.items()))
+
+
+def _with_life(record: TrialRecord, sign: bytes | None) -> TrialRecord:
+    """What a sign of life adds to the record of the last manifest: all but which bytes are there."""
+    try:
+        alive = TrialRecord.from_json(json.loads(sign or b"null"))
+    except (ValueError, KeyError, TypeError):
+        return record  # it was cleared away, or cut short: there will be another
+    if alive.token == record.token and alive.heartbeat < record.heartbeat:
+        return record
+    return replace(alive, committed=record.committed)
+
+
+def _pulled(trial: TrialStore) -> dict[str, Any]:
+    """What was last brought into a folder: the manifest's place, and its text."""
+    try:
+        value = json.loads((trial.folder / PULLED).read_text())
+        Manifest.from_bytes(value["manifest"].encode())
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        return {}
+    return dict(value)
+
+
+def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
+    """Put bytes into a file: behind those that are there, or in place of the whole file."""
+    path = trial.folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if start == 0:
+        write_atomically(path, data)
+        return
+    with path.open("r+b") as file:
+        file.seek(start)
+        file.write(data)
+
+
+def _size(trial: TrialStore, name: str) -> int:
+    path = trial.folder / name
+    return path.stat().st_size if path.exists() else 0
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, allow_nan=False).encode()
