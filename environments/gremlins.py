@@ -32,7 +32,6 @@ ON_COURSE = 0.005
 ALERT = 0.1
 """A gremlin becomes a body when it is less than this, metres, from where the robot could touch it: in one
 environment step the two come nearer by two thirds of this at most."""
-NO_GREMLIN = -1
 IDLE_PLACE = (0.0, 0.0, 20.0)
 """Where the body hovers while it is no gremlin, metres."""
 

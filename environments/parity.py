@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.gremlins import gremlin_course
 from recrl.environments.safety_tasks import SAFETY_TASKS, SafetyTask
 from recrl.environments.safety_worlds import SafetyWorlds
 
@@ -87,16 +88,16 @@ def _compare_episode(
     for start in range(0, length + 1, worlds.number):
         now = np.minimum(np.arange(start, start + worlds.number), length)
         _put_into(worlds, meta, episode, at=now, pursuing=now)
-        worlds.qacc[:, : meta["nv_robot"]] = _acceleration(task, meta, episode, now)
+        worlds.acceleration[...] = _acceleration(task, meta, episode, now)
+        worlds.perceive()
         seen.append(worlds.observations())
         before = np.maximum(now - 1, 0)
         _put_into(worlds, meta, episode, at=before, pursuing=before)
-        last = worlds.measure()
+        last = worlds.measured.copy()
         _put_into(worlds, meta, episode, at=now, pursuing=before)
-        worlds.distances = worlds.measure()
-        met.append(worlds.goal_met())
-        rewards.append((last - worlds.distances).sum(axis=1) + met[-1])
-        terms.append(worlds.cost_terms())
+        met.append(worlds.goal_met.copy())
+        rewards.append((last - worlds.measured).sum(axis=1) + met[-1])
+        terms.append(worlds.terms.copy())
     ours = [np.concatenate(parts)[: length + 1] for parts in (seen, rewards, terms, met)]
     mismatches, costly = _cost_mismatches(task, meta, episode, ours[2][1:])
     return Comparison(
@@ -140,14 +141,13 @@ def _put_into(
             worlds.points[:, worlds.group[f"{kind}s"]] = places
         if len(mocap):
             worlds.mocap_pos[:, list(mocap), :2] = places
-    gremlins = _put_gremlins(worlds, meta, episode, at) if task.gremlins.number else None
-    worlds.simulations.forward(np.arange(worlds.number))
-    worlds.refresh()
-    if gremlins is not None:  # recorded ones may be off course; only their lidar looks at their places
-        worlds.points[:, worlds.group["gremlins"]] = gremlins
+    if task.gremlins.number:
+        _put_gremlins(worlds, meta, episode, at)
     if task.goal == "Button":
         worlds.goal_button[:] = episode["goal_button"][pursuing]
         worlds.button_timer[:] = episode["buttons_timer"][pursuing]
+    worlds.simulations.forward(np.arange(worlds.number))
+    worlds.refresh()
 
 
 def _robot_state(
@@ -170,7 +170,7 @@ def _robot_state(
 
 
 def _acceleration(task: SafetyTask, meta: dict[str, Any], episode: dict[str, Any], at: Integers) -> Floats:
-    """The robot's recorded acceleration, [B, ...]; zero where it was not recorded."""
+    """The robot's recorded acceleration, [B, 3]; zero where it was not recorded."""
     every = meta["obs_every"]
     acceleration = np.zeros((len(at), meta["nv_robot"]))
     recorded = at % every == 0
@@ -179,7 +179,8 @@ def _acceleration(task: SafetyTask, meta: dict[str, Any], episode: dict[str, Any
         pose = episode["robot_pose"][:, at].T
         yaw = np.arctan2(pose[:, 6], pose[:, 3])
         acceleration = _turned(acceleration, yaw - episode["qpos_robot"][2, at])
-    return acceleration
+        acceleration[:, 2] = 0.0  # of its yaw
+    return acceleration[:, :3]
 
 
 def _turned(vectors: Floats, angle: Floats) -> Floats:
@@ -200,10 +201,8 @@ def _body(meta: dict[str, Any], episode: dict[str, Any], name: str, at: Integers
     )
 
 
-def _put_gremlins(
-    worlds: SafetyWorlds, meta: dict[str, Any], episode: dict[str, Any], at: Integers
-) -> Floats:
-    """Make the gremlin nearest the robot the body; return where all are, [B, gremlins, 2]."""
+def _put_gremlins(worlds: SafetyWorlds, meta: dict[str, Any], episode: dict[str, Any], at: Integers) -> None:
+    """Make the gremlin nearest the robot the body; all are where they were recorded, even off course."""
     scene = worlds.scene
     names = [f"gremlin{index}obj" for index in range(worlds.task.gremlins.number)]
     bodies = [_body(meta, episode, name, at) for name in names]
@@ -214,10 +213,9 @@ def _put_gremlins(
     qpos, qvel = scene.gremlin_qpos, scene.gremlin_qvel
     worlds.qpos[:, qpos : qpos + 7] = coordinates[nearest, everyone]
     worlds.qvel[:, qvel : qvel + 6] = velocities[nearest, everyone]
-    worlds.embodied[:] = nearest
-    worlds.steps[:] = at
-    places: Floats = coordinates[:, :, :2].transpose(1, 0, 2)
-    return places
+    worlds.embodied[:], worlds.steps[:] = nearest, at
+    course = gremlin_course(worlds.task).positions[at, None, :2]
+    worlds.circles[...] = coordinates[:, :, :2].transpose(1, 0, 2) - course
 
 
 def _static_places(meta: dict[str, Any], episode: dict[str, Any], kind: str) -> Floats:

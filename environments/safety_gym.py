@@ -80,43 +80,32 @@ def _action_space() -> Box:
     return Box(-1.0, 1.0, (2,), np.float32)
 
 
-def _checked(
-    task: SafetyTask, actions: npt.NDArray[Any], shape: tuple[int, ...], options: SafetyGymOptions
-) -> npt.NDArray[Any]:
-    """The actions, or a sentence on what is wrong with them."""
+def _order(
+    worlds: SafetyWorlds, actions: npt.NDArray[Any], shape: tuple[int, ...], options: SafetyGymOptions
+) -> None:
+    """Give the worlds their actions, or say in a sentence what is wrong with them."""
+    name = worlds.task.name
     actions = np.asarray(actions)
     if actions.shape != shape or actions.dtype.kind not in "fiu":
         raise ValueError(
-            f"{task.name}: actions must be numbers of shape {shape}, "
-            f"got {actions.dtype} of shape {actions.shape}"
+            f"{name}: actions must be numbers of shape {shape}, got {actions.dtype} of shape {actions.shape}"
         )
-    if np.maximum.reduce(np.abs(actions), axis=None) <= 1.0:
-        return actions
+    if worlds.order(actions):
+        return
     if not np.isfinite(actions).all():
-        raise ValueError(f"{task.name}: actions must be finite, got {actions.tolist()}")
+        raise ValueError(f"{name}: actions must be finite, got {actions.tolist()}")
     if options.out_of_range == "error":
         raise ValueError(
-            f"{task.name}: actions must be in [-1, 1], got {actions.tolist()} "
+            f"{name}: actions must be in [-1, 1], got {actions.tolist()} "
             "(option out_of_range: clip clips them)"
         )
-    clipped: npt.NDArray[Any] = np.clip(actions, -1.0, 1.0)
-    return clipped
-
-
-def _costs(outcome: Outcome, options: SafetyGymOptions) -> Floats:
-    """The k costs of each world, [B, k]."""
-    if options.cost == "per_hazard":
-        return outcome.terms
-    if not outcome.terms.shape[1]:
-        return np.zeros((len(outcome.terms), 1))
-    costs: Floats = np.maximum.reduce(outcome.terms, axis=1, keepdims=True)
-    return costs
+    worlds.order(np.clip(actions, -1.0, 1.0))
 
 
 def _info(terms: tuple[str, ...], outcome: Outcome, options: SafetyGymOptions) -> dict[str, Any]:
-    info: dict[str, Any] = {"cost": _costs(outcome, options), "goal_met": outcome.goal_met}
-    for key, indicator in zip(terms, outcome.terms.T, strict=True):
-        info[key] = indicator
+    info: dict[str, Any] = dict(zip(terms, outcome.terms, strict=True))
+    info["cost"] = outcome.terms.T if options.cost == "per_hazard" else outcome.costs[:, None]
+    info["goal_met"] = outcome.goal_met
     if outcome.broken is not None:
         info["cost_exception"] = outcome.broken.astype(np.float64)
     return info
@@ -215,8 +204,8 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
         worlds = self.worlds
         if not worlds.generators:
             raise ValueError(f"{self.cmdp.name}: call reset before the first step")
-        checked = _checked(worlds.task, actions, (self.num_envs, 2), self.options)
-        outcome = worlds.advance(checked)
+        _order(worlds, actions, (self.num_envs, 2), self.options)
+        outcome = worlds.advance()
         observations = worlds.observations()
         info = _info(self._terms, outcome, self.options)
         if len(outcome.finished):
@@ -288,8 +277,8 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
         worlds = self.worlds
         if not worlds.generators:
             raise ValueError(f"{worlds.task.name}: call reset before the first step")
-        checked = _checked(worlds.task, action, (2,), self.options)
-        outcome = worlds.advance(checked[None])
+        _order(worlds, action, (2,), self.options)
+        outcome = worlds.advance()
         info = {name: values[0] for name, values in _info(self._terms, outcome, self.options).items()}
         return (
             worlds.observations()[0],

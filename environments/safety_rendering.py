@@ -22,10 +22,9 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.gremlins import gremlin_course
-from recrl.environments.robot_sensors import rotation_matrices
-from recrl.environments.safety_tasks import LIDAR_BINS
-from recrl.environments.safety_worlds import GOAL_HEIGHT, SafetyWorlds
-from recrl.environments.scene import scene_xml, upright
+from recrl.environments.safety_tasks import GOAL_HEIGHT, LIDAR_BINS
+from recrl.environments.safety_worlds import SafetyWorlds
+from recrl.environments.scene import rotation_matrices, scene_xml, upright
 
 Frame = npt.NDArray[np.uint8]
 Colour = tuple[float, float, float]

@@ -24,6 +24,12 @@ LIDAR_BINS = 16
 LIDAR_RANGE = 3.0
 ROBOT_KEEPOUT = 0.4
 ROBOT_HEIGHT = 0.1
+GOAL_HEIGHT = 0.16
+"""Height of the goal area's middle: in Push, distances to it are three-dimensional."""
+GRAVITY = 9.81
+"""What an accelerometer at rest reads, m/s^2."""
+MAGNETIC_FIELD = -0.5
+"""What a magnetometer reads along the world's y axis."""
 VASE_SPEED = 1e-4
 """Slowest speed of a vase that counts as moving, m/s."""
 GREMLIN_TRAVEL = 0.35

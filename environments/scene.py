@@ -10,7 +10,7 @@ What makes it fast without changing the tasks' statistics:
   moving vase costs (1e-4 m/s), so sleep never hides a cost.
 - Button: of the gremlins only one at a time is a body, the one near the robot
 (``recrl.environments.gremlins``).
-- The sensors of the robots are computed from the state (``recrl.environments.robot_sensors``).
+- The sensors of the robots are computed from the state (``recrl.environments.world_step``).
 
 MuJoCo's newer colliders (``nativeccd``, ``multiccd``) are off: Safety Gym was made with the older ones.
 
@@ -218,6 +218,17 @@ def upright(yaw: npt.ArrayLike) -> Floats:
     half = np.asarray(yaw, np.float64) / 2.0
     zero = np.zeros_like(half)
     return np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
+
+
+def rotation_matrices(quaternions: Floats) -> Floats:
+    """The rotation matrix of each unit quaternion (w, x, y, z): [..., 4] -> [..., 3, 3]."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    entries = (
+        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in entries], axis=-2)
 
 
 def _touchable(task: SafetyTask, model: mujoco.MjModel) -> dict[str, tuple[slice, float]]:

@@ -13,7 +13,6 @@ import ctypes
 import functools
 import weakref
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -21,21 +20,20 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.mujoco_layout import structure
+from recrl.environments.machine_code import mujoco_library
 
 Integers = npt.NDArray[np.int32]
 Ids = Sequence[int] | npt.NDArray[np.intp] | None
 
 _BatchFunction = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 _NUM_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
-_BAD_STATES = [
+BAD_STATES = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]
 _EVERYTHING, _NOTHING = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_NONE)
-_ROW = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_CONTACT_SIZE, _CONTACT_GEOM = ctypes.sizeof(structure("mjContact")), structure("mjContact").geom.offset
+ROW = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class _Config(ctypes.Structure):
@@ -47,11 +45,7 @@ class _Config(ctypes.Structure):
 @functools.cache
 def _library() -> Any:
     """MuJoCo's shared library, with the types of the functions that are used here."""
-    folder = Path(mujoco.__file__).parent
-    found = [path for pattern in ("libmujoco*", "mujoco.dll") for path in sorted(folder.glob(pattern))]
-    if not found:
-        raise ImportError(f"MuJoCo's shared library must lie in {folder.name}, found none")
-    library = ctypes.CDLL(str(found[0]))
+    library = mujoco_library()
     pointer, integer = ctypes.c_void_p, ctypes.c_int
     signatures: dict[str, tuple[Any, tuple[Any, ...]]] = {
         "mjb_makeBatch": (
@@ -63,21 +57,13 @@ def _library() -> Any:
         "mjb_state": (pointer, (pointer,)),
         "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
         "mjb_warning": (pointer, (pointer,)),
-        "mjb_output": (
-            pointer,
-            (pointer, ctypes.c_char_p, ctypes.POINTER(integer), ctypes.POINTER(integer)),
-        ),
         "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
         "mjb_forward": (integer, (pointer, pointer, integer, integer)),
         "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
-        "mjb_rollout": (
-            integer,
-            (pointer, pointer, integer, integer, pointer, integer, pointer, integer),
-        ),
         "mjb_status": (pointer, (pointer,)),
         "mjb_error": (ctypes.c_char_p, (pointer, integer)),
         "mjb_getData": (None, (pointer, integer, pointer)),
-        "mjb_apply": (integer, (pointer, pointer, integer, _BatchFunction, pointer, integer)),
+        "mjb_apply": (integer, (pointer, pointer, integer, pointer, pointer, integer)),
         "mj_updateSleep": (None, (pointer, pointer)),
         "mj_copyData": (pointer, (pointer, pointer, pointer)),
     }
@@ -85,15 +71,6 @@ def _library() -> Any:
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
     return library
-
-
-def anything(array: npt.NDArray[Any]) -> bool:
-    """Whether any of some flags or whole numbers is not 0.
-
-    As ``array.any()``, with less code: this is asked right after the physics, when all code is new to the
-    processor's caches, and NumPy's reductions are much of it.
-    """
-    return array.tobytes() != bytes(array.nbytes)
 
 
 class PhysicsError(RuntimeError):
@@ -113,6 +90,8 @@ class Simulations:
         number: B.
         rows: MuJoCo's integration states, a live view, [B, n]; writing to a row sets that simulation's
             state for its next call.
+        stopped: simulations that MuJoCo could not compute since their last reset, [B].
+        any_stopped: whether there are any.
     """
 
     def __init__(self, model: mujoco.MjModel, number: int, *, num_threads: int = 1) -> None:
@@ -128,19 +107,17 @@ class Simulations:
             raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
         self._delete = weakref.finalize(self, self._library.mjb_deleteBatch, self._batch)
         self._data = mujoco.MjData(model)
-        self._fields = self._locate()
-        self._no_contacts: Integers = np.zeros((0, 2), np.int32)
         self._everyone: Integers = np.arange(number, dtype=np.int32)
+        self._everyone_address = self._everyone.ctypes.data
         self.rows: Floats = self._view(
             self._library.mjb_state(self._batch),
             np.float64,
             (number, self._library.mjb_nstate(self._batch)),
         )
         counters = self._view(self._library.mjb_warning(self._batch), np.int32, (number, _NUM_WARNINGS, 2))
-        self._counters: Integers = counters.reshape(-1)
         self._warnings: Integers = counters[:, :, 1]
-        self._stopped = np.zeros(number, np.bool_)
-        self._any_stopped = False
+        self.stopped = np.zeros(number, np.bool_)
+        self.any_stopped = False
 
     def state(self, component: mujoco.mjtState, shape: tuple[int, ...]) -> Floats:
         """A part of ``rows`` as a live view, [B, *shape]."""
@@ -150,23 +127,19 @@ class Simulations:
         view: Floats = self.rows[:, start : start + size.value].reshape(self.number, *shape)
         return view
 
-    def output(self, name: str, shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
-        """A field of ``MjData`` that every call refreshes, as a live view, [B, *shape]."""
-        address = self._library.mjb_output(self._batch, name.encode(), None, None)
-        if not address:
-            raise KeyError(f"MuJoCo has no field {name!r} that can be read from a batch")
-        return self._view(address, dtype, (self.number, *shape))
+    def apply(self, function: Any, argument: int, ids: Ids = None) -> None:
+        """Run a compiled function on simulations, on all threads; it may step them.
 
-    def contacts(self, index: int) -> Integers:
-        """The two geoms of each contact in one simulation, [contacts, 2].
-
-        A view of MuJoCo's own memory: look before the next call.
+        Args:
+            function: from ``machine_code.compiled_for_batch``.
+            argument: an address, which the function is given.
+            ids: which simulations, ascending; None for all.
         """
-        data = self._fields[index]
-        if not data.ncon:
-            return self._no_contacts
-        memory = (ctypes.c_char * (data.ncon * _CONTACT_SIZE)).from_address(data.contact)
-        return np.ndarray((data.ncon, 2), np.int32, memory, _CONTACT_GEOM, (_CONTACT_SIZE, 4))
+        address, count = self._everyone_address, self.number
+        if ids is not None:
+            chosen = self._chosen(ids)
+            address, count = chosen.ctypes.data, len(chosen)
+        self._note(self._library.mjb_apply(self._batch, address, count, function.address, argument, 1))
 
     def step(self, substeps: int, ids: Ids = None) -> None:
         """Advance simulations, then compute everything, accelerations included, at the new state.
@@ -180,25 +153,11 @@ class Simulations:
             self._library.mjb_step(self._batch, chosen.ctypes.data, len(chosen), substeps, _EVERYTHING)
         )
 
-    def step_under(self, controls: Floats, components: int, ids: Ids = None) -> None:
-        """As ``step``, with controls of their own for every substep.
-
-        Args:
-            controls: contiguous, [B or as many as ids, substeps, m].
-            components: bits of ``mjtState`` whose m numbers are given, in MuJoCo's order.
-            ids: which simulations; None for all.
-        """
-        chosen = self._chosen(ids)
-        substeps, numbers = controls.shape[1], controls.ctypes.data
-        library, batch, address, count = self._library, self._batch, chosen.ctypes.data, len(chosen)
-        self._note(library.mjb_rollout(batch, address, count, substeps, numbers, components, None, 0))
-        self._note(library.mjb_forward(batch, address, count, _EVERYTHING))
-
     def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
         chosen = self._chosen(ids)
-        self._stopped[chosen] = False
-        self._any_stopped = bool(self._stopped.any())
+        self.stopped[chosen] = False
+        self.any_stopped = bool(self.stopped.any())
         self._check(self._library.mjb_reset(self._batch, chosen.ctypes.data, len(chosen), None, _NOTHING))
 
     def forward(self, ids: Ids) -> None:
@@ -206,21 +165,17 @@ class Simulations:
         chosen = self._chosen(ids)
         self._check(self._library.mjb_forward(self._batch, chosen.ctypes.data, len(chosen), _EVERYTHING))
 
-    def intact(self) -> bool:
-        """Whether nothing was noted since the last resets: a quick look before ``broken``."""
-        return not (self._any_stopped or anything(self._counters))
-
     def broken(self) -> npt.NDArray[np.bool_]:
         """Whether a simulation has diverged since its last reset, [B].
 
         MuJoCo then warns and silently starts again from the model's defaults, or, where it cannot compute a
         step at all, leaves the simulation where it was.
         """
-        return np.asarray(self._warnings[:, _BAD_STATES].any(axis=1) | self._stopped)
+        return np.asarray(self._warnings[:, BAD_STATES].any(axis=1) | self.stopped)
 
-    def data(self, index: int) -> mujoco.MjData:
-        """A copy of one simulation, for drawing or for any function of MuJoCo."""
-        data = mujoco.MjData(self.model)
+    def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
+        """A copy of one simulation, for drawing or for any function of MuJoCo; a new one, or ``into``."""
+        data = mujoco.MjData(self.model) if into is None else into
         self._library.mjb_getData(self._batch, index, data._address)
         return data
 
@@ -234,7 +189,7 @@ class Simulations:
             "rows": self.rows.copy(),
             "asleep": asleep,
             "warnings": self._warnings.copy(),
-            "stopped": self._stopped.copy(),
+            "stopped": self.stopped.copy(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -253,23 +208,15 @@ class Simulations:
         def put_back(model: int, data: int, index: int, _: Any) -> None:
             copy_data(data, model, sources[index]._address)
 
-        self._check(self._library.mjb_apply(self._batch, None, 0, _BatchFunction(put_back), None, 1))
-        self._warnings[...], self._stopped[...] = state["warnings"], state["stopped"]
-        self._any_stopped = bool(self._stopped.any())
-
-    def _locate(self) -> list[Any]:
-        """The ``mjData`` of each simulation, in MuJoCo's own memory, where it stays."""
-        addresses = [0] * self.number
-
-        def note(_model: int, data: int, index: int, _: Any) -> None:
-            addresses[index] = data
-
-        self._check(self._library.mjb_apply(self._batch, None, 0, _BatchFunction(note), None, 0))
-        return [structure("mjData").from_address(address) for address in addresses]
+        function = _BatchFunction(put_back)
+        address = ctypes.cast(function, ctypes.c_void_p)
+        self._check(self._library.mjb_apply(self._batch, None, 0, address, None, 1))
+        self._warnings[...], self.stopped[...] = state["warnings"], state["stopped"]
+        self.any_stopped = bool(self.stopped.any())
 
     def _restored(self, row: Floats, asleep: Integers) -> mujoco.MjData:
         data = mujoco.MjData(self.model)
-        mujoco.mj_setState(self.model, data, row, _ROW)
+        mujoco.mj_setState(self.model, data, row, ROW)
         mujoco.mj_forward(self.model, data)
         data.tree_asleep[:] = asleep
         self._library.mj_updateSleep(self.model._address, data._address)
@@ -280,7 +227,7 @@ class Simulations:
     def _warm_start(self, row: Floats) -> Floats:
         warm_start = np.empty(self.model.nv)
         component = mujoco.mjtState.mjSTATE_WARMSTART.value
-        mujoco.mj_extractState(self.model, row, _ROW, warm_start, component)
+        mujoco.mj_extractState(self.model, row, ROW, warm_start, component)
         return warm_start
 
     def _view(self, address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
@@ -298,9 +245,8 @@ class Simulations:
 
     def _note(self, failed: int) -> None:
         if failed:
-            self._stopped |= self._status() != 0
-            self._any_stopped = True
-            self._fields = self._locate()  # MuJoCo may have begun anew elsewhere
+            self.stopped |= self._status() != 0
+            self.any_stopped = True
 
     def _check(self, failed: int) -> None:
         if not failed:

@@ -36,6 +36,7 @@ ADAPTERS = {
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\..*",
     "mujoco": r"environments\..*",
+    "numba": r"environments\.machine_code",
     "ray": r"orchestrator\.(ray_executor|ray_nodes|teacher_service)",
     "mlflow": r"orchestrator\.tracking(_reader)?",
     "sqlalchemy": r"orchestrator\.tracking_database",

@@ -13,9 +13,9 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from recrl.environments.robot_sensors import rotation_matrices
 from recrl.environments.safety_gym import SafetyGymEnv, SafetyGymVectorEnv
 from recrl.environments.safety_tasks import SAFETY_TASKS
+from recrl.environments.scene import rotation_matrices
 
 SIZES = {"Goal": (40, 72, 72), "Button": (56, 88, 88), "Push": (56, 88, 88)}
 LEVEL_2 = [name for name in SAFETY_TASKS if name.startswith("Car") and name.endswith("2")]
@@ -271,11 +271,11 @@ def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -
     environment.reset(seed=5)
     worlds, model = environment.worlds, environment.worlds.scene.model
     kinds = [bodies for bodies, _ in worlds.scene.touchable.values()]
-    felt = 0
+    felt, data = 0, worlds.simulations.data(0)
     for action in held_actions(250, 4, seed=2):
         environment.step(action)
         for index in range(4):
-            contact = worlds.simulations.data(index).contact
+            contact = worlds.simulations.data(index, into=data).contact
             roots = model.body_rootid[model.geom_bodyid[contact.geom]]
             others = {int(other) for pair in roots for other in pair if worlds.scene.robot_body in pair}
             for bodies in kinds:
@@ -287,7 +287,7 @@ def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -
 
 def test_robots_cannot_tell_that_gremlins_far_away_are_no_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
     some = SafetyGymVectorEnv("CarButton2", 4)
-    monkeypatch.setattr("recrl.environments.safety_worlds.ALERT", 100.0)  # the nearest is always a body
+    monkeypatch.setattr("recrl.environments.task_record.ALERT", 100.0)  # the nearest is always a body
     always = SafetyGymVectorEnv("CarButton2", 4)
     some.reset(seed=8)
     always.reset(seed=8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import mujoco
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 
 from recrl.environments.gremlins import gremlin_course
-from recrl.environments.robot_sensors import make_sensors, rotation_matrices
 from recrl.environments.safety_tasks import SAFETY_TASKS
-from recrl.environments.scene import make_scene, scene_xml, upright
+from recrl.environments.scene import make_scene, rotation_matrices, scene_xml, upright
+from recrl.environments.task_record import allocate, task_record
+from recrl.environments.world_step import step
 
 SENSORS = """
 <accelerometer name="accelerometer" site="robot_middle"/>
@@ -67,21 +69,17 @@ def test_computed_sensors_are_those_of_mujoco(robot: str) -> None:
     xml = xml.replace("<joint name=", '<site name="robot_middle"/><joint name=', 1)
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    sensors = make_sensors(task.robot, data.qpos[None], data.qvel[None], data.qacc[None])
+    scene = dataclasses.replace(make_scene(task), model=model)
+    memory = allocate(scene, 1)
+    record = task_record(scene, memory, 1000)
     generator = np.random.default_rng(0)
     for _ in range(100):
-        data.ctrl[:] = generator.uniform(-1.0, 1.0, 2)
-        mujoco.mj_step(model, data, 10)
-        mujoco.mj_forward(model, data)
-        sensors.read()
-        rotation, position = sensors.rotation[0], sensors.position[0]
-        body = data.body("robot")
-        np.testing.assert_allclose(rotation.reshape(-1), body.xmat, atol=1e-12)
-        np.testing.assert_allclose(rotation @ position, body.xpos, atol=1e-12)
-        for name, places in sensors.places.items():
-            if "ball" not in name:
-                expected = data.sensor(name).data
-                np.testing.assert_allclose(sensors.readings[places[0]], expected, rtol=1e-5, atol=1e-5)
+        memory.worlds["action"] = generator.uniform(-1.0, 1.0, 2)
+        step.ctypes(model._address, data._address, 0, record.ctypes.data)
+        for name, _ in task.components:
+            if not name.startswith("ball") and not name.endswith("lidar"):
+                felt = memory.observations[0, task.where(name)]
+                np.testing.assert_allclose(felt, data.sensor(name).data, rtol=1e-5, atol=1e-5)
 
 
 def test_rotation_matrices_are_those_of_mujoco() -> None:

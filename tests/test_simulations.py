@@ -11,7 +11,7 @@ import pytest
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_tasks import SAFETY_TASKS
 from recrl.environments.scene import make_scene
-from recrl.environments.simulations import PhysicsError, Simulations, anything
+from recrl.environments.simulations import PhysicsError, Simulations
 
 SCENE = make_scene(SAFETY_TASKS["CarGoal2"])
 NUMBER = 2
@@ -40,18 +40,15 @@ def controls(steps: int) -> Floats:
 
 def run(simulations: Simulations, chosen: Floats) -> list[bytes]:
     control = simulations.state(CONTROL, (2,))
-    awake = simulations.output("tree_awake", (SCENE.model.ntree,), np.int32)
-    acceleration = simulations.output("qacc", (SCENE.model.nv,))
     robot = slice(0, SCENE.robot_qvel)
     past = []
-    for step in chosen:
+    for number, step in enumerate(chosen):
         control[...] = step
         simulations.step(10)
-        past.append(
-            simulations.rows.tobytes()
-            + awake.tobytes()
-            + np.ascontiguousarray(acceleration[:, robot]).tobytes()
-        )
+        past.append(simulations.rows.tobytes())
+        if number % 20 == 19:
+            datas = [simulations.data(index) for index in range(NUMBER)]
+            past += [data.tree_awake.tobytes() + data.qacc[robot].tobytes() for data in datas]
     return past
 
 
@@ -101,17 +98,6 @@ def test_saving_changes_nothing() -> None:
     assert first + run(restored, chosen[200:]) == run(crowd(), chosen)
 
 
-def test_contacts_are_those_of_a_copy_of_the_simulation() -> None:
-    simulations, seen = crowd(), set()
-    for step in range(20):
-        run(simulations, controls(400)[20 * step : 20 * step + 20])
-        for index in range(NUMBER):
-            geoms = simulations.data(index).contact.geom
-            assert simulations.contacts(index).tolist() == geoms.tolist()
-            seen.add(len(geoms))
-    assert len(seen) > 1
-
-
 def test_simulations_stepped_in_parts_move_as_those_stepped_together() -> None:
     together, apart = crowd(), crowd()
     for chosen in controls(50):
@@ -121,12 +107,6 @@ def test_simulations_stepped_in_parts_move_as_those_stepped_together() -> None:
         apart.step(10, [1])
         apart.step(10, [0])
     assert together.rows.tobytes() == apart.rows.tobytes()
-
-
-def test_anything_is_any() -> None:
-    assert not anything(np.zeros((3, 2), np.int32)[:, 1:])
-    assert anything(np.array([False, True]))
-    assert not anything(np.zeros(0, np.bool_))
 
 
 def test_a_state_of_another_batch_is_refused() -> None:

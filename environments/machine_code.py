@@ -1,0 +1,96 @@
+"""Python functions compiled to machine code, which MuJoCo runs on its own threads.
+
+Numba compiles them when they are first imported, which takes some seconds, and keeps the result beside their
+file (where nobody may write there: in the user's cache folder, see Numba's NUMBA_CACHE_DIR) until that file
+changes. A change in another file is not noticed: what is compiled must take from elsewhere nothing but this
+module's few functions, and be told everything else, numbers too.
+
+Floating-point operations are done as written (no ``fastmath``), so that results are the same to the last bit
+wherever and beside whatever a function runs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import mujoco
+import numba
+import numpy as np
+from numba.core import types
+from numba.extending import intrinsic
+from numba.np.numpy_support import carray
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+@functools.cache
+def mujoco_library() -> Any:
+    """MuJoCo's shared library, where compiled functions find MuJoCo's, too."""
+    folder = Path(mujoco.__file__).parent
+    found = [path for pattern in ("libmujoco*", "mujoco.dll") for path in sorted(folder.glob(pattern))]
+    if not found:
+        raise ImportError(f"MuJoCo's shared library must lie in {folder.name}, found none")
+    return ctypes.CDLL(str(found[0]), mode=ctypes.RTLD_GLOBAL)
+
+
+mujoco_library()
+# Pointers are addresses: whole numbers of 64 bits, which are passed alike.
+_ADDRESS = types.int64
+mj_step: Any = types.ExternalFunction("mj_step", types.void(_ADDRESS, _ADDRESS))
+mj_step2: Any = types.ExternalFunction("mj_step2", types.void(_ADDRESS, _ADDRESS))
+mj_forward: Any = types.ExternalFunction("mj_forward", types.void(_ADDRESS, _ADDRESS))
+mj_getState: Any = types.ExternalFunction(  # noqa: N816  # MuJoCo's name
+    "mj_getState", types.void(_ADDRESS, _ADDRESS, _ADDRESS, types.int32)
+)
+
+
+def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function that compiled ones may call, and become part of; Python may, too."""
+    dispatcher: Any = numba.njit(function)
+    call: Callable[Parameters, Result] = dispatcher
+    return call
+
+
+def compiled_for_batch(function: Callable[[int, int, int, int], None]) -> Any:
+    """A function for ``Simulations.apply``: of addresses of model and data, index, address of an argument."""
+    signature = types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
+    return _kept(functools.partial(numba.cfunc, signature), function)
+
+
+def compiled_for_python(function: Callable[[int], bool]) -> Callable[[int], bool]:
+    """A function of an address that Python calls often: Numba takes no time to look at the argument."""
+    signature = types.boolean(_ADDRESS)
+    call: Callable[[int], bool] = _kept(functools.partial(numba.cfunc, signature), function).ctypes
+    return call
+
+
+def array_at(kind: Any) -> Any:
+    """A compiled function (address, size) -> an array of so many numbers or records in memory there."""
+    element = numba.from_dtype(np.dtype(kind))
+
+    @intrinsic
+    def pointer(_context: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+        signature: Any = types.CPointer(element)  # type: ignore[no-untyped-call]
+        return signature(address), generate
+
+    @numba.njit
+    def view(address: int, size: int) -> Any:
+        return carray(pointer(address), size)  # type: ignore[call-arg]
+
+    return view
+
+
+def _kept(compiler: Any, function: Any) -> Any:
+    """Compile, and keep the result where one may write."""
+    try:
+        return compiler(cache=True)(function)
+    except RuntimeError:  # there is no such place
+        return compiler()(function)
