@@ -2,9 +2,9 @@
 
 The only importer of fsspec, and so the one place that knows what S3, Google, Azure and the others are
 called. Assumes what they promise: an object is there whole or not at all, and whoever reads or lists after a
-write sees it. (A folder behind ``file://`` does not promise the first; whoever reads has sums to check.)
-Leaves out credentials: every machine has its own, where its fsspec package looks for them (environment,
-files, the machine's role). None is passed on, stored or printed, and an address that holds one is refused.
+write sees it. (In a folder behind ``file://`` objects are written beside and renamed.) Leaves out
+credentials: every machine has its own, where its fsspec package looks for them (environment, files, the
+machine's role). None is passed on, stored or printed, and an address that holds one is refused.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class ObjectStore:
         self.uri = _checked(uri)
         protocol = self.uri.partition("://")[0]
         _require_package(self.uri, protocol)
-        options: dict[str, Any] = {"auto_mkdir": True} if protocol in FOLDERS else {}
+        self._in_folder = protocol in FOLDERS
+        options: dict[str, Any] = {"auto_mkdir": True} if self._in_folder else {}
         with self._speaking("cannot be used"):
             self._system, path = fsspec.url_to_fs(self.uri, skip_instance_cache=True, **options)
         self._root = path.rstrip("/")
@@ -69,8 +70,14 @@ class ObjectStore:
         Raises:
             StorageError: the store does not answer, or refuses.
         """
+        path = self._path(key)
         with self._speaking("cannot be written"):
-            self._system.pipe_file(self._path(key), data)
+            if not self._in_folder:
+                self._system.pipe_file(path, data)
+                return
+            beside = f"{path}.{secrets.token_hex(4)}"
+            self._system.pipe_file(beside, data)
+            self._system.mv(beside, path)
 
     def create(self, key: str, data: bytes) -> bool:
         """Write an object unless there is one, and say whether there was none.

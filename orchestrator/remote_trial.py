@@ -46,7 +46,7 @@ LONGEST_PAUSE_SECONDS = 60.0
 PATIENCE_SECONDS = 900.0  # for a store that is down when a trial begins or has ended
 STOPPING_SECONDS = 60.0  # the same, once the sweep is to stop
 KEPT_MANIFESTS = 2  # a reader may still be at the one before the last
-RETRIES = 3  # of a reader whose manifest was cleared away meanwhile
+RETRIES = 3  # looks for a newer manifest, before one that is not intact is called damaged
 
 APPENDED = ("episodes.csv", "updates.csv", "events.jsonl", "log.txt")
 WHOLE = ("spec.json", "provenance.json", "error.txt", "evaluation.csv", "policy.csv")
@@ -202,72 +202,113 @@ class RemoteTrial:
                 write_json(trial.state_path, asdict(record))
 
     def _pull(self, trial: TrialStore, keys: Sequence[str], *, checkpoints: bool) -> Manifest | None:
-        """Bring the files of the newest intact manifest; None if there is none."""
-        for _ in range(RETRIES):
-            found = False
-            for attempt, names in sorted(_attempts(keys).items(), reverse=True):
-                for name in sorted(filter(_MANIFEST.fullmatch, names), reverse=True):
-                    found = True
-                    manifest = self._pull_manifest(trial, attempt, name, checkpoints=checkpoints)
-                    if manifest is not None:
-                        return manifest
-            if not found:
+        """Bring the files of the newest intact manifest; None if there is none.
+
+        One that is not intact may have been cleared away meanwhile, because there is a newer one: only
+        where that is not so, it is passed over for the one before it.
+        """
+        for tries_left in range(RETRIES - 1, -1, -1):
+            manifests = _manifests(keys)
+            for place in manifests if tries_left == 0 else manifests[:1]:
+                try:
+                    return self._pull_manifest(trial, place, checkpoints=checkpoints)
+                except ValueError as error:
+                    if tries_left == 0:
+                        logger.warning("%s/%s: passed over: %s", self.objects.uri, place, error)
+            if not manifests:
                 return None
-            keys = self.objects.keys_in()  # a newer one took their place, and cleared them away
-        logger.warning("%s: no intact manifest of it is there", self.objects.uri)
+            keys = self.objects.keys_in()
         return None
 
-    def _pull_manifest(
-        self, trial: TrialStore, attempt: str, name: str, *, checkpoints: bool
-    ) -> Manifest | None:
-        """Bring the files of one manifest, all or none; None if it is not intact."""
-        before = _pulled(trial)
-        try:
-            if before.get("place") == f"{attempt}/{name}":
-                manifest = Manifest.from_bytes(before["manifest"].encode())
-            else:
-                manifest = Manifest.from_bytes(self.objects.read(f"{attempt}/{name}") or b"")
-        except ValueError as error:
-            logger.warning("%s/%s/%s: passed over: %s", self.objects.uri, attempt, name, error)
-            return None
-        old: Mapping[str, tuple[Part, ...]] = {}
-        if str(before.get("place", "")).startswith(f"{attempt}/"):
-            old = Manifest.from_bytes(before["manifest"].encode()).files
+    def _pull_manifest(self, trial: TrialStore, place: str, *, checkpoints: bool) -> Manifest:
+        """Bring the files of one manifest, all or none; ValueError if it is not intact."""
+        before, attempt = _Pulled.of(trial), place.partition("/")[0]
+        manifest = before.manifest if before.place == place else self._manifest(place)
+        have = before.manifest.files if before.place.startswith(f"{attempt}/") else {}
         wants_checkpoint = checkpoints or manifest.record.status.is_finished
-        news: dict[str, tuple[int, bytes]] = {}
-        for file, parts in manifest.files.items():
-            if _CHECKPOINT.fullmatch(file) and not wants_checkpoint:
-                continue
-            size = _size(trial, file)
-            if parts == old.get(file) and size >= sum(part.length for part in parts):
-                continue
-            have = sum(part.length for part in old.get(file, ())) if file in APPENDED else 0
-            missing = [part for part in parts if part.end > (have if size >= have else 0)]
-            data = [self._part(attempt, part) for part in missing]
-            if None in data:
-                logger.warning(
-                    "%s/%s/%s: passed over: %s is not intact", self.objects.uri, attempt, name, file
-                )
-                return None
-            if missing:
-                news[file] = (missing[0].start, b"".join(piece for piece in data if piece is not None))
-        for file, (start, piece) in news.items():
-            _place(trial, file, start, piece)
-        for path in trial.checkpoints()[1:] if any(map(_CHECKPOINT.fullmatch, news)) else ():
-            path.unlink()
-        if news or before.get("place") != f"{attempt}/{name}":
-            trial.folder.mkdir(parents=True, exist_ok=True)
-            write_json(
-                trial.folder / PULLED,
-                {"place": f"{attempt}/{name}", "manifest": manifest.to_bytes().decode()},
-            )
+        news = {
+            file: self._news(trial, attempt, file, parts, have.get(file))
+            for file, parts in manifest.files.items()
+            if wants_checkpoint or not _CHECKPOINT.fullmatch(file)
+        }
+        for file, new in news.items():
+            if new is not None:
+                _place(trial, file, *new)
+        if any(_CHECKPOINT.fullmatch(file) for file in news):
+            for path in trial.checkpoints()[1:]:
+                path.unlink()
+        if before.place != place:
+            _Pulled(place, manifest).write(trial)
         return manifest
 
-    def _part(self, attempt: str, part: Part) -> bytes | None:
-        """A part's bytes, or None if they are not what the manifest says."""
-        data = self.objects.read(f"{attempt}/{part.key}")
-        intact = data is not None and hashlib.sha256(data).hexdigest() == part.sha256
-        return data if intact else None
+    def _manifest(self, key: str) -> Manifest:
+        """A manifest that is there; ValueError if it is not intact."""
+        return Manifest.from_bytes(self.objects.read(key) or b"")
+
+    def _news(
+        self,
+        trial: TrialStore,
+        attempt: str,
+        file: str,
+        parts: tuple[Part, ...],
+        have: tuple[Part, ...] | None,
+    ) -> tuple[int, bytes] | None:
+        """The bytes of a file that a folder lacks, and where they begin; None if it lacks none.
+
+        Args:
+            trial: the folder.
+            attempt: whose the file is.
+            file: its path in the folder.
+            parts: of which it is to be made.
+            have: of which it is made, as the same attempt left it; None if it is not of that attempt.
+
+        Raises:
+            ValueError: a part is not what the manifest says.
+        """
+        size, length = _size(trial, file), _length(parts)
+        if parts == have and size >= length and (trial.folder / file).exists():
+            return None
+        known = _length(have) if have and file in APPENDED else 0
+        missing = [part for part in parts if part.end > (known if size >= known else 0)]
+        if parts and not missing:
+            return None
+        data = b"".join(self._part(attempt, part) for part in missing)
+        return (missing[0].start if missing else 0, data)
+
+    def _part(self, attempt: str, part: Part) -> bytes:
+        """A part's bytes; ValueError if they are not what the manifest says."""
+        data = self.objects.read(f"{attempt}/{part.key}") or b""
+        if hashlib.sha256(data).hexdigest() != part.sha256:
+            raise ValueError(f"{part.key} is not intact")
+        return data
+
+
+@dataclass(frozen=True)
+class _Pulled:
+    """What was last brought into a folder.
+
+    Attributes:
+        place: the manifest's key; empty if there was none.
+        manifest: itself.
+    """
+
+    place: str
+    manifest: Manifest
+
+    @classmethod
+    def of(cls, trial: TrialStore) -> Self:
+        """As the folder remembers it."""
+        try:
+            value = json.loads((trial.folder / PULLED).read_text())
+            return cls(value["place"], Manifest.from_bytes(value["manifest"].encode()))
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            return cls("", Manifest(TrialRecord(), {}))
+
+    def write(self, trial: TrialStore) -> None:
+        """Remember it."""
+        trial.folder.mkdir(parents=True, exist_ok=True)
+        value = {"place": self.place, "manifest": self.manifest.to_bytes().decode()}
+        write_json(trial.folder / PULLED, value)
 
 
 class Upload:
@@ -366,8 +407,9 @@ class Upload:
                 content = path.read_bytes() if path.exists() else b""
                 part = Part.of(name, 0, content)
                 parts[name] = (part,) if content else ()
-                data[part.key] = content
-        return record, {name: found for name, found in parts.items() if found}, data
+                data.update({part.key: content} if content else {})
+        present = {name: found for name, found in parts.items() if (self._trial.folder / name).exists()}
+        return record, present, data
 
     def _appended(self, name: str, length: int, data: dict[str, bytes]) -> tuple[Part, ...]:
         """The parts of a row file; its new bytes go into ``data``.
@@ -515,6 +557,16 @@ def _attempts(keys: Sequence[str]) -> dict[str, list[str]]:
     return found
 
 
+def _manifests(keys: Sequence[str]) -> list[str]:
+    """The keys of all manifests, those of the newest attempt first, and its newest first."""
+    found = [
+        f"{attempt}/{name}"
+        for attempt, names in _attempts(keys).items()
+        for name in filter(_MANIFEST.fullmatch, names)
+    ]
+    return sorted(found, reverse=True)
+
+
 def _attempt_of(record: TrialRecord) -> str:
     return f"{record.attempt:06d}-{record.token}"
 
@@ -535,16 +587,6 @@ def _with_life(record: TrialRecord, sign: bytes | None) -> TrialRecord:
     return replace(alive, committed=record.committed)
 
 
-def _pulled(trial: TrialStore) -> dict[str, Any]:
-    """What was last brought into a folder: the manifest's place, and its text."""
-    try:
-        value = json.loads((trial.folder / PULLED).read_text())
-        Manifest.from_bytes(value["manifest"].encode())
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
-        return {}
-    return dict(value)
-
-
 def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
     """Put bytes into a file: behind those that are there, or in place of the whole file."""
     path = trial.folder / name
@@ -555,6 +597,10 @@ def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
     with path.open("r+b") as file:
         file.seek(start)
         file.write(data)
+
+
+def _length(parts: Sequence[Part]) -> int:
+    return parts[-1].end if parts else 0
 
 
 def _size(trial: TrialStore, name: str) -> int:

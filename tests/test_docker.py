@@ -1,6 +1,7 @@
 """What is in docker/ is valid, complete, pinned, unprivileged and not exposed, as far as one sees it here."""
 
 import json
+import os
 import re
 import shutil
 import stat
@@ -316,6 +317,34 @@ def test_the_ray_job_has_only_fields_that_kuberay_knows() -> None:
     for wrong in ({"backofLimit": 3}, {"submissionMode": "K8sJob"}):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate({**JOB, "spec": {**JOB["spec"], **wrong}}, RAY_JOB)
+
+
+@pytest.mark.skipif(
+    "KUBERAY_CRD" not in os.environ, reason="KUBERAY_CRD does not name KubeRay's ray.io_rayjobs.yaml"
+)
+def test_the_ray_job_fits_kuberays_own_definition() -> None:
+    definition = yaml.load(Path(os.environ["KUBERAY_CRD"]).read_text(), Loader=yaml.CSafeLoader)
+    [version] = [
+        each for each in definition["spec"]["versions"] if f"ray.io/{each['name']}" == JOB["apiVersion"]
+    ]
+    schema = closed(version["schema"]["openAPIV3Schema"])
+    schema["properties"]["metadata"] = {}  # Kubernetes' own
+    jsonschema.validate(JOB, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**JOB, "spec": {**JOB["spec"], "backofLimit": 3}}, schema)
+
+
+def closed(schema: Any) -> Any:
+    """A definition of Kubernetes' as a JSON schema that forbids what it does not name."""
+    if isinstance(schema, list):
+        return [closed(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if schema.get("x-kubernetes-int-or-string"):
+        return {}
+    found = {key: closed(value) for key, value in schema.items()}
+    open_ended = found.get("x-kubernetes-preserve-unknown-fields") or "additionalProperties" in found
+    return found if open_ended or "properties" not in found else {**found, "additionalProperties": False}
 
 
 def test_the_ray_job_is_of_this_version_and_wants_a_token() -> None:

@@ -21,6 +21,7 @@ from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.ray_executor import RayExecutor, StopFile, existing_cluster, local_cluster
 from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
+from recrl.orchestrator.remote_sweep import RemoteSweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.teacher_service import RayTeacher, start_teacher_service
@@ -151,6 +152,30 @@ def test_a_killed_worker_and_a_killed_teacher_leave_no_trace(tmp_path: Path, inl
     assert store.trial(LONG).record().attempt == 2
     assert store.trial(LONG).record().pid not in killed
     assert_equal_bytes([LONG], store, inline)
+
+
+@pytest.mark.usefixtures("cluster")
+def test_trials_in_an_object_store_outlive_their_workers_and_their_folders(
+    tmp_path: Path, inline: SweepStore
+) -> None:
+    mirror = SweepStore(tmp_path / "mirror", "sweep")
+    storage = RemoteSweep((tmp_path / "bucket").as_uri(), "sweep")
+    never, killed = threading.Event(), []
+
+    def kill() -> None:
+        killed.append(mirror.trial(LONG).record().pid)
+        os.kill(killed[0], signal.SIGKILL)
+
+    def is_halfway() -> bool:
+        record = mirror.trial(LONG).record()
+        return record.status is TrialState.RUNNING and bool(record.committed.get("updates.csv"))
+
+    with storage.mirrored(mirror, never, every=0.1), once(is_halfway, kill):
+        RayExecutor(commit_seconds=0.05, storage=storage).run([LONG], mirror, never)
+    assert killed
+    assert mirror.trial(LONG).record().attempt == 2
+    assert "resumed after update " in mirror.trial(LONG).log_path.read_text()
+    assert_equal_bytes([LONG], mirror, inline)
 
 
 def process_of(actor: Any) -> int:
