@@ -27,7 +27,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri, stdtrit  # scipy.stats takes a second and a half to be imported
 
 from recrl.environments.cmdp import Floats
 
@@ -84,7 +84,7 @@ def mean_interval(values: Floats, *, confidence: float = CONFIDENCE) -> Interval
     count = len(values)
     if count < 2:
         return Interval(mean, math.nan, math.nan, count, True)
-    reach = float(stats.t.ppf(0.5 + confidence / 2.0, count - 1)) * error
+    reach = float(stdtrit(count - 1, 0.5 + confidence / 2.0)) * error
     return Interval(mean, mean - reach, mean + reach, count, False)
 
 
@@ -207,7 +207,7 @@ def wilson_interval(successes: int, runs: int, *, confidence: float = CONFIDENCE
     if runs == 0:
         return Interval(math.nan, math.nan, math.nan, 0, True)
     p, n = successes / runs, runs
-    z = float(stats.norm.ppf(0.5 + confidence / 2.0))
+    z = float(ndtri(0.5 + confidence / 2.0))
     centre = p + z**2 / (2 * n)
     reach = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     scale = 1 + z**2 / n

@@ -17,11 +17,15 @@
     outcomes.tex                the first table for LaTeX (booktabs)
     outcomes.parquet            outcomes.csv with its types, for programs
 
+Of a sweep that runs, ``sketch`` draws SKETCHED, as PNGs, and all tables and pages: that takes a fraction of
+the time of the whole, and trials want the rest.
+
 Equal sweeps give equal bytes: no time is written, and the bootstrap's generator is seeded here.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from collections import Counter
@@ -61,6 +65,10 @@ CAPTIONS = {
 }
 
 
+SKETCHED = re.compile(r"learning-curves_.*|curricula")
+UNFINISHED = "Drawn while the sweep runs: the other figures come at its end, or by recrl-sweep figures"
+
+
 class NothingToDrawError(RecrlError):
     """The sweep has no policy update on disk yet."""
 
@@ -79,15 +87,30 @@ def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Pat
     Raises:
         NothingToDrawError: no trial has committed a policy update yet.
     """
-    if not len(sweep.updates):
-        raise NothingToDrawError(
-            f"{sweep.name}: nothing to draw yet, because none of its {len(sweep.trials)} trials has "
-            f"committed a policy update"
-        )
     drawn = []
     for stem, make in drawings(sweep, averaging=averaging).items():
         if (figure := make()) is not None:
             drawn += styles.save(figure, folder, stem)
+    return _with_pages(sweep, folder, drawn)
+
+
+def sketch(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
+    """Draw what is cheap to draw, for a look at a sweep that runs; otherwise like ``draw``.
+
+    Args:
+        sweep: its frames.
+        folder: where the files go.
+        averaging: of the learning curves.
+    """
+    drawn = []
+    for stem, make in drawings(sweep, averaging=averaging).items():
+        if SKETCHED.fullmatch(stem) and (figure := make()) is not None:
+            drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
+    return _with_pages(dataclasses.replace(sweep, notes=(*sweep.notes, UNFINISHED)), folder, drawn)
+
+
+def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
+    """Write the tables and the two reports that show the figures drawn; all files, the reports first."""
     written, shown = write_tables(sweep, folder)
     pictures = [path for path in drawn if path.suffix == ".png"]
     text = [f"![{path.stem}]({path.name})" for path in pictures]
@@ -107,9 +130,17 @@ def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable
     """The figures of a sweep by the stems of their files, made when called; None where there is nothing.
 
     Args:
-        sweep: with at least one update.
+        sweep: its frames.
         averaging: of the learning curves.
+
+    Raises:
+        NothingToDrawError: no trial has committed a policy update yet.
     """
+    if not len(sweep.updates):
+        raise NothingToDrawError(
+            f"{sweep.name}: nothing to draw yet, because none of its {len(sweep.trials)} trials has "
+            f"committed a policy update"
+        )
     agents = ordered(list(sweep.updates["agent"]), list(sweep.trials["agent"].cat.categories))
     cells = sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist()
     made: dict[str, Callable[[], Figure | None]] = {}

@@ -280,6 +280,11 @@ def _add_figures(commands: Commands) -> None:
         help="of learning curves: mean and standard error (default), or interquartile mean and 95%% "
         "bootstrap band",
     )
+    figures.add_argument(
+        "--sketch",
+        action="store_true",
+        help="only learning curves, limits and tables, no PDF: quick, as launch does while it runs",
+    )
 
 
 def _add_export(commands: Commands) -> None:

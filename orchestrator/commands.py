@@ -269,7 +269,7 @@ def _tell_mlflow(store: SweepStore, arguments: argparse.Namespace, console: Cons
 def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Draw the figures and tables of what is on disk, in a compact file or in MLflow."""
     sweep, folder = _source(arguments)
-    _draw(sweep, arguments.to or folder, console, band=arguments.band)
+    _draw(sweep, arguments.to or folder, console, band=arguments.band, whole=not arguments.sketch)
     return ExitCode.OK
 
 
@@ -504,10 +504,12 @@ def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
     return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
 
 
-def _draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean") -> None:
-    from recrl.analysis.report import averagings, draw  # noqa: PLC0415  (imports matplotlib)
+def _draw(
+    sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True
+) -> None:
+    from recrl.analysis.report import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
 
-    draw(sweep, folder, averaging=averagings()[band])
+    (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])
     _say(console, f"Figures    {_short(folder)}")
 
 

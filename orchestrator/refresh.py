@@ -1,9 +1,9 @@
 """The report of a sweep, drawn again now and then while the sweep runs.
 
-Drawing takes seconds of a core that trials want: it is done in a process of its own, of the lowest priority,
-and seldom enough to take at most about a thirtieth of a core. What it draws lies in the sweep's figures
-folder, from which the mirror sends it to MLflow. A report that cannot be drawn is no failure: the launch
-draws the last one itself.
+Drawing takes seconds of a core that trials want. So it is a sketch (``recrl-sweep figures --sketch``), made
+in a process of its own, of the lowest priority, and seldom enough to take at most about a thirtieth of a
+core. What it draws lies in the sweep's figures folder, from which the mirror sends it to MLflow. A report
+that cannot be drawn is no failure: the launch draws the last and whole one itself.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ def refreshing(
         thread.join()
 
 
-def figures_command(store: SweepStore) -> list[str]:
-    """The command that draws the sweep's figures and report."""
+def sketch_command(store: SweepStore) -> list[str]:
+    """The command that sketches the sweep's report."""
     root = ["--root", str(store.folder.parent)]
-    return [sys.executable, "-m", "recrl.orchestrator.cli", "figures", store.name, *root]
+    return [sys.executable, "-m", "recrl.orchestrator.cli", "figures", store.name, "--sketch", *root]
 
 
 def _refresh(store: SweepStore, over: threading.Event, wait: float, interval: float) -> None:
     while not over.wait(wait):
         began = time.monotonic()
         process = subprocess.Popen(
-            figures_command(store),
+            sketch_command(store),
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

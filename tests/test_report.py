@@ -69,6 +69,22 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
     assert "No trial is complete yet: no table." in (tmp_path / "report.md").read_text()
 
 
+def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=1, tasks=["a"], agents=["cpo"], methods=["none", "step"], unfinished=["a cpo step seed 0"]
+    )
+    sweep = frames.load(store)
+    sketched = report.sketch(sweep, tmp_path / "sketch")
+    pictures = {path.name for path in sketched if path.suffix == ".png"}
+    assert pictures == {"learning-curves_cpo.png", "curricula.png"}
+    assert not any(path.suffix == ".pdf" for path in sketched)
+    tables = {path.name for path in sketched if path.suffix in (".csv", ".tex", ".parquet")}
+    assert tables == {path.name for path in report.write_tables(sweep, tmp_path / "tables")[0]}
+    assert f"- {report.UNFINISHED}" in sketched[1].read_text().splitlines()
+
+
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "empty")
     with pytest.raises(NothingToDrawError) as caught:
@@ -122,7 +138,7 @@ def test_the_page_holds_everything_and_fetches_nothing(
     trial.provenance_path.write_text('{"torch": "9.9"}')
     store.specs_path.write_text(json.dumps(trial.spec.to_json()) + "\n")
     store.grid_path.write_text("name: made-up  # <script>alert(1)</script>\n")
-    report.draw(frames.load(store), tmp_path / "figures")
+    report.sketch(frames.load(store), tmp_path / "figures")  # the page is made as by draw
     reader = Strict()
     reader.feed((tmp_path / "figures" / "report.html").read_text())
     assert reader.open == []
