@@ -12,6 +12,6 @@ class ExitCode(IntEnum):
     TRIALS_FAILED = 1  # the sweep went through, but some trials failed or could not be finished
     WRONG_INPUT = 2  # the grid or the arguments are wrong; nothing was started
     BUSY = 3  # another process is running this sweep
-    CANNOT_RUN = 4  # Ray or MLflow could not be started or reached
+    CANNOT_RUN = 4  # Ray, MLflow or the storage could not be started or reached
     TRIALS_LEFT = 5  # plan --check: a launch would have something to do
     STOPPED = 130  # Ctrl-C or SIGTERM; the same command goes on

@@ -83,15 +83,21 @@ class ObjectStore:
         """Write an object unless there is one, and say whether there was none.
 
         That only one of several at the same moment hears yes is the store's promise, not fsspec's: S3, Google
-        and Azure keep it by conditional writes, other kinds may look first and write then.
+        and Azure keep it by conditional writes. Where a store has none, this looks first and writes then.
 
         Raises:
             StorageError: the store does not answer, or refuses.
         """
-        with self._speaking("cannot be written", unless=FileExistsError):
-            self._system.pipe_file(self._path(key), data, mode="create")
-            return True
-        return False
+        path = self._path(key)
+        try:
+            self._system.pipe_file(path, data, mode="create")
+        except FileExistsError:
+            return False
+        except Exception:  # no such writes, or worse: whatever it is, the plain way will say it
+            if self.read(key) is not None:
+                return False
+            self.write(key, data)
+        return True
 
     def keys_in(self, folder: str = "") -> list[str]:
         """The keys of all objects in a folder and the folders below it, relative to it, in their order.

@@ -36,7 +36,7 @@ from typing import Any
 
 from recrl.orchestrator.errors import RecrlError, StorageError, SweepBusyError
 from recrl.orchestrator.object_store import ObjectStore
-from recrl.orchestrator.remote_trial import RemoteTrial, Upload, patiently, working_copy
+from recrl.orchestrator.remote_trial import ALIVE, RemoteTrial, Upload, patiently, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialStore, write_atomically, write_json
 
@@ -73,6 +73,7 @@ class RemoteSweep:
         self.uri = root.uri
         self.name = name
         self.objects = root.below(name)
+        self._mirrored: dict[Path, dict[str, list[str]]] = {}
         self._in_touch_at = time.monotonic()
 
     @classmethod
@@ -152,8 +153,11 @@ class RemoteSweep:
                 trial = store.trial_named(name)
                 self.trial(name).mirror(trial, keys[name], checkpoints=checkpoints)
 
+            before = {} if checkpoints else self._mirrored.get(store.folder, {})
+            news = [name for name in keys if _is_new(keys[name], before.get(name))]
             with ThreadPoolExecutor(PULLS_AT_ONCE) as pool:
-                list(pool.map(pull_trial, keys))
+                list(pool.map(pull_trial, news))
+            self._mirrored[store.folder] = keys
         self._in_touch_at = time.monotonic()
 
     def pull_trial(self, store: SweepStore, spec: TrialSpec) -> None:
@@ -293,6 +297,8 @@ class RemoteSweep:
         if self.objects.create(LAUNCH, _beat(own)):
             return
         holder = self._holder()
+        if holder.get("token") == own["token"]:
+            return  # it was written, though the answer was lost
         if _is_alive(holder):
             silent = max(0.0, time.time() - holder["at"])
             raise SweepBusyError(
@@ -402,6 +408,14 @@ def sweeps_at(uri: str) -> list[str]:
     """
     root = ObjectStore(uri)
     return [name for name in root.names("directory") if root.read(f"{name}/sweep.json") is not None]
+
+
+def _is_new(keys: list[str], before: list[str] | None) -> bool:
+    """Whether a trial of these keys may have changed since it had those before.
+
+    An attempt at work changes its sign of life in place; all else has a key of its own.
+    """
+    return keys != before or any(key.endswith(f"/{ALIVE}") for key in keys)
 
 
 def _sweep_files(store: SweepStore) -> tuple[Path, ...]:

@@ -286,12 +286,12 @@ def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp
 
 
 STEPS = st.lists(
-    st.sampled_from(["work", "push", "push", "take over", "refused", "cut", "ok"]), min_size=1, max_size=30
+    st.sampled_from(["work", "push", "push", "take over", "refused", "cut", "ok"]), min_size=1, max_size=20
 )
 
 
 @given(steps=STEPS)
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_fails_readers_see_one_commit_and_the_end_is_complete(
     steps: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -374,6 +374,14 @@ def test_only_one_creates_an_object(remote: RemoteTrial) -> None:
     assert remote.objects.read("launch.json") == b"first"
     remote.objects.delete(["launch.json", "launch.json"])
     assert remote.objects.read("launch.json") is None
+
+
+def test_a_store_without_exclusive_writes_is_looked_at_first(bucket: RemoteTrial) -> None:
+    Unreliable.plan.append("refused")
+    assert bucket.objects.create("launch.json", b"first")
+    Unreliable.plan.append("refused")
+    assert not bucket.objects.create("launch.json", b"second")
+    assert bucket.objects.read("launch.json") == b"first"
 
 
 def test_names_are_those_right_below(remote: RemoteTrial) -> None:
