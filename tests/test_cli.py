@@ -127,7 +127,7 @@ def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert main(["status", "--brief", *sweep]) == ExitCode.OK
         assert capsys.readouterr().out == "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
 
-    assert main(["figures", "small"]) == ExitCode.OK
+    assert main(["figures", "small", "--sketch"]) == ExitCode.OK
 
 
 def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -221,7 +221,7 @@ def test_commands_take_mlflow_or_a_compact_file_for_the_files(
     assert main(["export", "made-up", "--tracking-uri", uri, "--to", str(file)]) == ExitCode.OK
     assert "6 trials" in capsys.readouterr().out
     assert len(compact.load(file).updates) == len(from_files.updates)
-    assert main(["figures", str(file), "--band", "iqm"]) == ExitCode.OK
+    assert main(["figures", str(file), "--band", "iqm", "--sketch"]) == ExitCode.OK
     assert (tmp_path / "figures" / "report.html").exists()
     assert main(["bound", str(file)]) == ExitCode.OK
 
