@@ -4,7 +4,8 @@ Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), f
 Action: Discrete(3), MiniGrid's first three: 0 turn left, 1 turn right, 2 forward (into a wall: stay).
 Reward: -0.1 a step; +10 instead on the step that reaches a goal.
 Cost: ``river`` 1 for every time step that ends on a river tile, turning and bumping there included; on demand
-    ``turns`` 1 for every turn, which makes a task with two constraints whose optimum is still exact.
+    ``turns`` 1 for every turn, and ``mud`` 1 for every time step that ends on a muddy tile, which make tasks with
+    two and three constraints whose optimum is still exact.
 Termination: at a goal; truncated after ``horizon`` steps (200).
 Source: the paper's section 5 for the idea, the limits and the cost (time steps in the water). It gives
     neither maps (its figure is not in its text) nor rewards nor a horizon: those are ours, such that every
@@ -31,6 +32,7 @@ from recrl.environments.plugins import load_attribute
 from recrl.environments.river_maps import (
     GOAL,
     MAPS,
+    MUD,
     RIVER,
     STEPS,
     WALL,
@@ -46,7 +48,7 @@ GOAL_REWARD = 10.0
 HORIZON = 200
 HEADINGS = 4
 LEFT, RIGHT, FORWARD = 0, 1, 2
-CostName = Literal["river", "turns"]
+CostName = Literal["river", "turns", "mud"]
 
 
 class RiverGridOptions(BaseModel):
@@ -60,7 +62,7 @@ class RiverGridOptions(BaseModel):
     costs: tuple[CostName, ...] = Field(
         default=("river",),
         min_length=1,
-        description="The cost functions in order, river (the paper's) and turns (ours), 1 a step each.",
+        description="The cost functions in order, river (the paper's), turns and mud (ours), 1 a step each.",
     )
 
     @field_validator("costs")
@@ -124,22 +126,24 @@ def river_cmdp(river_map: RiverMap, *, costs: Sequence[CostName], horizon: int) 
     """The tables of RiverGrid: S = 4 width height states, walls included though nobody gets there."""
     num_states = river_map.width * river_map.height * HEADINGS
     successors: Integers = np.zeros((num_states, 3), np.int64)
-    river, terminal = np.zeros(num_states, np.bool_), np.zeros(num_states, np.bool_)
+    tiles = np.full(num_states, WALL)
     for x in range(river_map.width):
         for y in range(river_map.height):
             tile = river_map.tile((x, y))
             for heading in range(HEADINGS):
                 state = state_index(river_map, x, y, heading)
-                river[state], terminal[state] = tile == RIVER, tile == GOAL
+                tiles[state] = tile
                 successors[state, LEFT] = state_index(river_map, x, y, (heading - 1) % HEADINGS)
                 successors[state, RIGHT] = state_index(river_map, x, y, (heading + 1) % HEADINGS)
                 successors[state, FORWARD] = state
                 ahead = (x + STEPS[heading][0], y + STEPS[heading][1])
                 if tile != WALL and river_map.tile(ahead) != WALL:
                     successors[state, FORWARD] = state_index(river_map, *ahead, heading)
+    reached, terminal = tiles[successors], tiles == GOAL
     cost_tables = {
-        "river": river[successors].astype(np.float64),
+        "river": (reached == RIVER).astype(np.float64),
         "turns": np.tile([1.0, 1.0, 0.0], (num_states, 1)),
+        "mud": (reached == MUD).astype(np.float64),
     }
     start = np.zeros(num_states)
     start[state_index(river_map, *river_map.start, river_map.heading)] = 1.0

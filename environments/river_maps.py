@@ -2,7 +2,7 @@
 
 A map is a rectangle of characters, enclosed by walls:
 
-    ``#`` wall, ``.`` dry ground, ``~`` river, ``G`` goal (at least one),
+    ``#`` wall, ``.`` dry ground, ``~`` river, ``%`` mud, ``G`` goal (at least one),
     ``>`` ``v`` ``<`` ``^`` the start (exactly one, on dry ground), heading east, south, west or north.
 
 Cells are addressed (x, y) with x the column and y the row, both from 0 at the top left; error messages count
@@ -21,9 +21,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Cell = tuple[int, int]
 
-WALL, DRY, RIVER, GOAL = "#", ".", "~", "G"
+WALL, DRY, RIVER, MUD, GOAL = "#", ".", "~", "%", "G"
+GROUND = DRY + RIVER + MUD  # what can be crossed
 STARTS = ">v<^"  # in the order of MiniGrid's headings: 0 east, 1 south, 2 west, 3 north
-TILES = WALL + DRY + RIVER + GOAL + STARTS
+TILES = WALL + GROUND + GOAL + STARTS
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # forward, by heading; y grows downwards
 
 GENERATION_ATTEMPTS = 2_000
@@ -144,7 +145,7 @@ def parse_map(text: str, *, source: str = "map") -> RiverMap:
     rows = tuple(line.rstrip() for line in "\n".join(lines[first:]).rstrip().split("\n"))
     _check_drawing(rows, source, first + 1)
     river_map = RiverMap(rows)
-    if river_map.shortest_route(through=DRY + RIVER) is None:
+    if river_map.shortest_route(through=GROUND) is None:
         raise MapError(f"{source}: no goal can be reached from the start, open a way through the walls")
     return river_map
 

@@ -12,6 +12,7 @@ Importing this module registers ``recrl/RiverGrid-1a-v0``, ``recrl/RiverGrid-1b-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -34,10 +35,15 @@ from recrl.environments.river_grid import (
     RiverGridOptions,
     task_map,
 )
-from recrl.environments.river_maps import GOAL, MAPS, RIVER, WALL, Cell, RiverMap, parse_map
+from recrl.environments.river_maps import GOAL, MAPS, MUD, RIVER, WALL, Cell, RiverMap, parse_map
 
 TILE_PIXELS = 32
-OBJECTS: dict[str, Callable[[], WorldObj]] = {WALL: Wall, RIVER: Floor, GOAL: Goal}  # a Floor is blue
+OBJECTS: dict[str, Callable[[], WorldObj]] = {
+    WALL: Wall,
+    RIVER: Floor,  # a Floor is blue
+    MUD: partial(Floor, "yellow"),
+    GOAL: Goal,
+}
 
 
 def mission() -> str:
@@ -114,10 +120,8 @@ class RiverGridEnv(MiniGridEnv):
         self.agent_pos, self.agent_dir = self.river_map.start, self.river_map.heading
 
     def _costs(self, action: int) -> Floats:
-        costs = {
-            "river": self.river_map.tile((int(self.agent_pos[0]), int(self.agent_pos[1]))) == RIVER,
-            "turns": action != FORWARD,
-        }
+        tile = self.river_map.tile((int(self.agent_pos[0]), int(self.agent_pos[1])))
+        costs = {"river": tile == RIVER, "turns": action != FORWARD, "mud": tile == MUD}
         return np.array([costs[name] for name in self.cost_names], np.float64)
 
 

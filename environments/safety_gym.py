@@ -14,7 +14,7 @@ The part before the colon is imported first, which registers all eighteen tasks,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -26,8 +26,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.cmdp import CMDPSpec, Floats
 from recrl.environments.safety_tasks import HORIZON, SAFETY_TASKS, SUBSTEPS, SafetyTask
-from recrl.environments.safety_worlds import Booleans, Observations, Outcome, SafetyWorlds
 from recrl.environments.vector import CMDPVectorEnv
+
+if TYPE_CHECKING:
+    from recrl.environments.safety_worlds import Booleans, Observations, Outcome, SafetyWorlds
 
 
 class SafetyGymOptions(BaseModel):
@@ -64,6 +66,13 @@ def cost_names(task: SafetyTask, options: SafetyGymOptions) -> tuple[str, ...]:
             f"{task.name}: cost must be 'indicator', as nothing costs at level 0, got 'per_hazard'"
         )
     return task.cost_terms
+
+
+def _make_worlds(task: SafetyTask, number: int, options: SafetyGymOptions) -> SafetyWorlds:
+    """Worlds to be stepped; who only asks what there is to be set does not wait for MuJoCo and Numba."""
+    from recrl.environments.safety_worlds import SafetyWorlds  # noqa: PLC0415
+
+    return SafetyWorlds(task, number, horizon=options.horizon, num_threads=options.num_threads)
 
 
 def _find(task: str) -> SafetyTask:
@@ -103,8 +112,8 @@ def _order(
 
 
 def _info(terms: tuple[str, ...], outcome: Outcome, options: SafetyGymOptions) -> dict[str, Any]:
-    info: dict[str, Any] = dict(zip(terms, outcome.terms, strict=True))
-    info["cost"] = outcome.terms.T if options.cost == "per_hazard" else outcome.costs[:, None]
+    info: dict[str, Any] = {term: outcome.terms[row] for row, term in enumerate(terms)}
+    info["cost"] = (outcome.terms if options.cost == "per_hazard" else outcome.costs).T
     info["goal_met"] = outcome.goal_met
     if outcome.broken is not None:
         info["cost_exception"] = outcome.broken.astype(np.float64)
@@ -183,9 +192,7 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
             cost_names(found, self.options),
             self.options.horizon,
         )
-        self.worlds = SafetyWorlds(
-            found, num_envs, horizon=self.options.horizon, num_threads=self.options.num_threads
-        )
+        self.worlds = _make_worlds(found, num_envs, self.options)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -258,9 +265,7 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
         self.cost_names = cost_names(found, self.options)
         self.observation_space = _observation_space(found)
         self.action_space = _action_space()
-        self.worlds = SafetyWorlds(
-            found, 1, horizon=self.options.horizon, num_threads=self.options.num_threads
-        )
+        self.worlds = _make_worlds(found, 1, self.options)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

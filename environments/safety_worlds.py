@@ -45,7 +45,7 @@ class Outcome(NamedTuple):
 
     Attributes:
         rewards: [B].
-        costs: whether any term costs, 0 or 1, [B].
+        costs: whether any term costs, 0 or 1, [1, B].
         terms: the indicator of each cost term, in the order of ``SafetyTask.cost_terms``, [terms, B].
         goal_met: [B].
         terminated: [B].
@@ -153,14 +153,13 @@ class SafetyWorlds:
         """Take one step in every world, as ordered."""
         self.simulations.apply(step, self._address)
         results, flags = self._memory.results.copy(), self._memory.flags.copy()
-        rewards, costs, terms = results[0], results[1], results[2:]
-        eventful, goal_met, broken, truncated = flags
-        terminated = broken.copy()
-        if not (self.simulations.any_stopped or any(eventful.tolist())):
+        rewards, costs, terms = results[0], results[1:2], results[2:]
+        goal_met, broken, terminated, truncated = flags[0], flags[1], flags[2], flags[3]
+        if not (self.simulations.any_stopped or 1 in flags.tobytes()):
             return Outcome(rewards, costs, terms, goal_met, terminated, truncated, None, _NOBODY)
         broken |= self.simulations.stopped
         rewards[broken] = EXCEPTION_REWARD
-        costs[broken] = terms[:, broken] = 0.0
+        results[1:, broken] = 0.0
         goal_met &= ~broken
         terminated |= broken
         if goal_met.any():

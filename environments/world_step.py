@@ -39,9 +39,9 @@ TERMS = ("hazards", "vases_contact", "vases_velocity", "pillars", "buttons", "gr
 SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer", "ballquat_rear", "ballangvel_rear")
 """What a robot may feel, in the order of ``TASK``'s field of it."""
 ACCELEROMETER, VELOCIMETER, GYRO, MAGNETOMETER, BALL, SPIN = range(6)
-FLAGS = ("eventful", "goal_met", "broken", "truncated")
+FLAGS = ("goal_met", "broken", "terminated", "truncated")
 """What a step brings besides rewards, costs and the indicators of the cost terms, for all worlds side by
-side; a step is eventful if any of the others is true."""
+side."""
 MAX_POINTS, MAX_BODIES, MAX_GEOMS, MAX_GREMLINS, MAX_TERMS = 24, 24, 64, 6, 3
 """Room for P objects, for bodies and shapes of a model, and so on."""
 NO_GREMLIN = -1
@@ -530,11 +530,10 @@ def report(task: Any, world: Any, index: int) -> None:
         cost = max(cost, world.terms[column])
     results[index] = min(max(progress, -task.reward_bound), task.reward_bound)
     results[number + index] = cost
-    truncated = world.steps >= task.horizon
-    flags[index] = world.goal_met or world.broken or truncated
-    flags[number + index] = world.goal_met
+    flags[index] = world.goal_met
+    flags[number + index] = world.broken
     flags[2 * number + index] = world.broken
-    flags[3 * number + index] = truncated
+    flags[3 * number + index] = world.steps >= task.horizon
 
 
 @compiled_for_batch
