@@ -3,11 +3,12 @@
 # make test      install, run the tests
 # make lint      install, check style and types
 # make chaos     install, kill whatever a sweep is made of for ten minutes: SECONDS=600 SEED=0
+# make storage-test   install, run a sweep on a cluster that shares an S3 server and no folder, and harm it: needs root, says so
 # make cluster-test   install, run docker/compose.yaml's cluster in network namespaces and harm it: needs root, says so
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test lint chaos cluster-test clean
+.PHONY: install demo test lint chaos cluster-test storage-test clean
 .DEFAULT_GOAL := install
 
 install: .venv/installed
@@ -36,6 +37,13 @@ chaos: install
 cluster-test: install
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt 'psycopg[binary]'
 	$(BIN)/python -m tests.cluster --log results/cluster/log.txt
+
+# moto wants a newer graphql-core than MLflow: it stays beside the environment
+storage-test: install
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt s3fs
+	$(BIN)/pip install --quiet --disable-pip-version-check --target .venv/moto 'moto[server]'
+	PYTHONPATH=.venv/moto $(BIN)/python -m pytest -q tests/test_s3.py
+	PYTHONPATH=.venv/moto $(BIN)/python -m tests.cluster_storage --log results/cluster/storage.txt
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

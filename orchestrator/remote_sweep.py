@@ -42,7 +42,7 @@ from recrl.orchestrator.store import SweepStore, TrialStore, write_atomically, w
 
 PULL_SECONDS = 10.0  # between two looks at the trials that run
 LONGEST_PAUSE_SECONDS = 60.0  # between two looks while the store is down
-LOOK_SECONDS = 2.0  # between two looks whether somebody asks to stop
+LOOK_SECONDS = 5.0  # between two looks whether somebody asks to stop
 BEAT_SECONDS = 15.0  # between two signs of life of a launch
 SILENT_SECONDS = 90.0  # without one, after which its sweep is free
 STOP_QUESTION_SECONDS = 5.0  # between two questions of a worker whether to stop
@@ -143,6 +143,10 @@ class RemoteSweep:
                 data = self.objects.read(path.name)
                 if data is not None and not (path.exists() and path.read_bytes() == data):
                     write_atomically(path, data)
+        self._pull_trials(store, checkpoints=checkpoints)
+
+    def _pull_trials(self, store: SweepStore, *, checkpoints: bool = False) -> None:
+        with _alone(store):
             keys: dict[str, list[str]] = {}
             for key in self.objects.keys_in("trials"):
                 name, _, rest = key.partition("/")
@@ -178,7 +182,7 @@ class RemoteSweep:
     def mirrored(
         self, store: SweepStore, stop: threading.Event, *, every: float = PULL_SECONDS
     ) -> Iterator[None]:
-        """Pull again and again, from a thread beside the body, and once more after it.
+        """Pull the trials again and again, from a thread beside the body, and once more after it.
 
         Args:
             store: the mirror.
@@ -193,7 +197,7 @@ class RemoteSweep:
             pause = every
             while not over.wait(pause):
                 try:
-                    self.pull(store)
+                    self._pull_trials(store)
                 except (StorageError, OSError) as error:
                     if pause == every:
                         logger.warning("%s; the trials go on", error)
@@ -209,7 +213,7 @@ class RemoteSweep:
         finally:
             over.set()
             thread.join()
-        patiently(lambda: self.pull(store), stop.is_set)
+        patiently(lambda: self._pull_trials(store), stop.is_set)
 
     def publish(self, store: SweepStore) -> None:
         """Say there what the sweep is, as the folder does.

@@ -32,7 +32,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
-from recrl.orchestrator.errors import LostLeaseError, StorageError
+from recrl.orchestrator import checkpoint
+from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.scratch import scratch_folder
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -324,7 +325,7 @@ class Upload:
         self._remote = remote
         self._trial = trial
         self._before = trial.record().token
-        self._parts: dict[str, tuple[Part, ...]] = {}
+        self._parts: Mapping[str, tuple[Part, ...]] = {}
         self._manifests: list[tuple[str, Manifest]] = []
         self._written: set[str] = set()
         self._number = 0
@@ -367,18 +368,17 @@ class Upload:
             StorageError: the store cannot be written; the manifest before stands.
             LostLeaseError: a newer attempt runs the trial.
         """
-        record, parts, data = self._capture()
+        record, manifest, data = self._capture()
         attempt = _attempt_of(record)
         others = self._other_attempts(attempt)
         for key, piece in data.items():
             if key not in self._written:
                 self._remote.objects.write(f"{attempt}/{key}", piece)
                 self._written.add(key)
-        manifest = Manifest(record, parts)
         name = f"manifest-{self._number + 1:08d}.json"
         self._remote.objects.write(f"{attempt}/{name}", manifest.to_bytes())
         self._number += 1
-        self._parts, self._shown = parts, _commit_of(record)
+        self._parts, self._shown = manifest.files, _commit_of(record)
         self._manifests.append((name, manifest))
         self._clear(attempt, others)
 
@@ -392,24 +392,29 @@ class Upload:
         self._remote.objects.write(f"{_attempt_of(record)}/{ALIVE}", _json(asdict(said)))
         self._spoke_at = time.monotonic()
 
-    def _capture(self) -> tuple[TrialRecord, dict[str, tuple[Part, ...]], dict[str, bytes]]:
-        """The record, all parts and the bytes of the new ones, while nobody commits."""
+    def _capture(self) -> tuple[TrialRecord, Manifest, dict[str, bytes]]:
+        """The record, what belongs to it, and the bytes of the new parts, while nobody commits.
+
+        The rows are those of the newest checkpoint: of a commit that a full disk broke off, the record may
+        not know yet.
+        """
         data: dict[str, bytes] = {}
         parts: dict[str, tuple[Part, ...]] = {}
         with self._trial.locked():
             record = self._trial.record()
-            lengths = {**record.committed, "log.txt": _size(self._trial, "log.txt")}
+            saved, rows = _newest_checkpoint(self._trial)
+            committed = {**dict.fromkeys(record.committed, 0), **rows}
+            lengths = {**committed, "log.txt": _size(self._trial, "log.txt")}
             for name in APPENDED:
                 parts[name] = self._appended(name, lengths.get(name, 0), data)
-            newest = [f"checkpoints/{path.name}" for path in self._trial.checkpoints()[:1]]
-            for name in (*WHOLE, *newest):
+            for name in (*WHOLE, *saved):
                 path = self._trial.folder / name
                 content = path.read_bytes() if path.exists() else b""
                 part = Part.of(name, 0, content)
                 parts[name] = (part,) if content else ()
                 data.update({part.key: content} if content else {})
         present = {name: found for name, found in parts.items() if (self._trial.folder / name).exists()}
-        return record, present, data
+        return record, Manifest(replace(record, committed=committed), present), data
 
     def _appended(self, name: str, length: int, data: dict[str, bytes]) -> tuple[Part, ...]:
         """The parts of a row file; its new bytes go into ``data``.
@@ -585,6 +590,16 @@ def _with_life(record: TrialRecord, sign: bytes | None) -> TrialRecord:
     if alive.token == record.token and alive.heartbeat < record.heartbeat:
         return record
     return replace(alive, committed=record.committed)
+
+
+def _newest_checkpoint(trial: TrialStore) -> tuple[list[str], dict[str, int]]:
+    """The newest intact checkpoint, as a path in the trial's folder, if there is one; its rows' lengths."""
+    for path in trial.checkpoints():
+        try:
+            return [f"checkpoints/{path.name}"], checkpoint.load(path)["files"]
+        except CheckpointError:
+            continue
+    return [], {}
 
 
 def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:

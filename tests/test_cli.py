@@ -110,7 +110,11 @@ def test_a_wrong_grid_starts_nothing(
 def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Plan, launch, plan again, status, figures: what a first user does."""
     assert main(["plan", "grid.yaml", "--check"]) == ExitCode.TRIALS_LEFT
-    assert "small: 2 trials: 2 new" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "small: 2 trials: 2 new" in out
+    assert " at once on this machine, " in out
+    assert main(["plan", "grid.yaml", "--cores", "64"]) == ExitCode.OK
+    assert "; 2 trials at once on 64 cores, about " in capsys.readouterr().out
     assert not (folder / "runs").exists()
 
     assert main(["launch", "grid.yaml", "--executor", "inline", "--no-mlflow"]) == ExitCode.OK
@@ -210,6 +214,13 @@ def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureF
         "recrl-sweep: runs: holds 2 sweeps; say which one: large, small",
         "recrl-sweep: runs: holds no sweep 'smal'; did you mean 'small'? (there: large, small)",
     ]
+
+
+def test_a_plan_for_a_cluster_that_is_not_there_is_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plan", "grid.yaml", "--address", "127.0.0.1:1"]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err.startswith("recrl-sweep: cannot use the Ray cluster at 127.0.0.1:1: ")
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,19 @@ def test_many_commits_leave_few_objects(bucket: RemoteTrial, tmp_path: Path) -> 
     assert updates(mirror(bucket, tmp_path / "mirror")) == list(range(1, 65))
 
 
+def test_a_commit_that_broke_off_behind_its_checkpoint_takes_its_rows_along(
+    bucket: RemoteTrial, tmp_path: Path
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    record = machine.trial.state_path.read_bytes()
+    machine.work(2)
+    machine.trial.state_path.write_bytes(record)  # the disk was full
+    machine.upload.push()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2]
+    np.testing.assert_equal(Machine(bucket, tmp_path / "next").restored, tree(2))
+
+
 def test_signs_of_life_say_how_far_a_trial_is_and_commit_nothing(bucket: RemoteTrial, tmp_path: Path) -> None:
     machine = Machine(bucket, tmp_path / "machine")
     machine.work(1)
