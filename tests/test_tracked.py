@@ -151,6 +151,22 @@ def test_every_way_to_a_database_gives_the_same(sweep: SweepStore) -> None:
         assert bool(found) == (metric in metrics)
 
 
+def test_a_sweep_alone_in_its_database_is_read_as_among_others(sweep: SweepStore, tmp_path: Path) -> None:
+    database = tmp_path / "alone.db"
+    shutil.copy(sweep.mlflow_database, database)
+    both, alone = Database(tracking_uri(sweep, None)), Database(f"sqlite:///{database}")
+    experiment = both.experiments()["recrl/made-up"]
+    connection = sqlite3.connect(database)
+    others = "SELECT run_uuid FROM runs WHERE experiment_id <> ?"
+    for table in ("metrics", "latest_metrics", "tags", "params", "runs"):
+        connection.execute(f"DELETE FROM {table} WHERE run_uuid IN ({others})", (experiment,))
+    connection.commit()
+    connection.close()
+    found = rows(alone.points("train/return", experiment))
+    assert found == rows(both.points("train/return", experiment))
+    assert len(found) == 6 * 38
+
+
 def rows(points: Points) -> list[tuple[str, int, float, int]]:
     runs = [points.run_ids[run] for run in points.runs]
     numbers = (array.tolist() for array in (points.steps, points.values, points.milliseconds))
