@@ -59,13 +59,13 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 def compiled_for_batch(function: Callable[[int, int, int, int], None]) -> Any:
     """A function for ``Simulations.apply``: of addresses of model and data, index, address of an argument."""
     signature = types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
-    return _kept(functools.partial(numba.cfunc, signature), function)
+    return kept(functools.partial(numba.cfunc, signature), function)
 
 
 def compiled_for_python(function: Callable[[int], bool]) -> Callable[[int], bool]:
     """A function of an address that Python calls often: Numba takes no time to look at the argument."""
     signature = types.boolean(_ADDRESS)
-    call: Callable[[int], bool] = _kept(functools.partial(numba.cfunc, signature), function).ctypes
+    call: Callable[[int], bool] = kept(functools.partial(numba.cfunc, signature), function).ctypes
     return call
 
 
@@ -88,7 +88,7 @@ def array_at(kind: Any) -> Any:
     return view
 
 
-def _kept(compiler: Any, function: Any) -> Any:
+def kept(compiler: Any, function: Any) -> Any:
     """Compile, and keep the result where one may write."""
     try:
         return compiler(cache=True)(function)

@@ -6,8 +6,8 @@ For every task, 16 environments under random actions, against the same 16 simula
 ``mj_step(model, data, 10)`` alone in a Python loop ("bare"); and one environment of ``gymnasium.make``. They
 take turns of a few steps, in one run on one core, so that a noisy machine hurts all alike. Times are CPU
 seconds of this process, lower quartiles over the turns; a share is the median over the turns of neighbouring
-times. With --threads: wall seconds, several threads against one. Resets are timed apart: an episode is 1,000
-steps and one reset.
+times. With --threads: wall seconds, several threads against one, for us and for MuJoCo's batch alone. Resets
+are timed apart: an episode is 1,000 steps and one reset.
 
 In Button a gremlin is led: what it is tied to must move before every physics step, which ``mj_step`` with a
 count cannot do. So there are two bare speeds: "bare", the same call as elsewhere, in which the gremlin hangs
@@ -37,8 +37,9 @@ from recrl.environments.scene import PARKED
 NUM_ENVS = 16
 STEPS = 5
 """Steps of every environment in one repeat."""
-# safety-gymnasium 1.0.0 on mujoco 2.3.7, environment steps/s on one core without and with resets.
-PEER = {"CarGoal2": (357, 243), "CarButton2": (320, 207), "CarPush2": (623, 337)}
+# safety-gymnasium 1.0.0 on mujoco 2.3.7, environment steps/s on one core without and with resets, and bare
+# MuJoCo's in the same run: what the machine gives changes by the hour, so that its speed then counts.
+PEER = {"CarGoal2": (357, 243, 4961), "CarButton2": (320, 207, 3862), "CarPush2": (623, 337, 5450)}
 TASKS = [name for name in SAFETY_TASKS if name.startswith("Car") or name.endswith("2")]
 
 
@@ -146,21 +147,35 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
     return np.append(np.quantile(times, 0.25, axis=1), np.quantile(reset, 0.25)), shares
 
 
-def thread_gain(name: str, repeats: int, num_threads: int) -> float:
-    """Wall seconds of a step on one thread over those on several, best of the repeats."""
+def thread_gains(name: str, repeats: int, num_threads: int) -> tuple[float, float]:
+    """Wall seconds of a step on one thread over those on several, medians over neighbouring turns.
+
+    Returns:
+        our gain, and that of MuJoCo's batch, which steps the same model and computes nothing of ours: what
+        the machine's cores have to give.
+    """
     batches = [SafetyGymVectorEnv(name, NUM_ENVS, num_threads=number) for number in (1, num_threads)]
+    alone = [SafetyGymVectorEnv(name, NUM_ENVS, num_threads=number) for number in (1, num_threads)]
     generator = np.random.default_rng(0)
-    for batch in batches:
+    for batch in (*batches, *alone):
         batch.reset(seed=0)
-    times: list[list[float]] = [[], []]
-    for _ in range(repeats):
+    controls = mujoco.mjtState.mjSTATE_CTRL
+    times = np.zeros((4, repeats))
+    for repeat in range(repeats):
         drawn = generator.uniform(-1.0, 1.0, (STEPS, NUM_ENVS, 2))
-        for batch, series in zip(batches, times, strict=True):
+        for row, batch in enumerate((*batches, *alone)):
+            simulations = batch.worlds.simulations
+            control = simulations.state(controls, (2,))
             start = time.perf_counter()
             for actions in drawn:
-                batch.step(actions)
-            series.append(time.perf_counter() - start)
-    return min(times[0]) / min(times[1])
+                if row < 2:
+                    batch.step(actions)
+                else:
+                    control[...] = actions
+                    simulations.step(SUBSTEPS)
+            times[row, repeat] = time.perf_counter() - start
+    ours, theirs = np.median([times[0] / times[1], times[2] / times[3]], axis=1)
+    return float(ours), float(theirs)
 
 
 def main() -> None:
@@ -173,24 +188,28 @@ def main() -> None:
     arguments = parser.parse_args()
     print("environment steps per CPU second; N = 16 unless said otherwise\n")
     print(
-        "| task | bare | ours | with resets | share of bare | one env | share of bare | x peer, with resets |"
+        "| task | bare | ours | with resets | share of bare | one env | share of bare "
+        "| x peer, with resets | the same at bare's speed beside the peer |"
     )
-    print("|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|")
     for name in arguments.tasks:
         (batch, single, bare, led, reset), shares = measure(name, arguments.repeats)
         whole = HORIZON / (HORIZON * batch + reset)
         peer = PEER.get(name)
-        versus = f"{1 / batch / peer[0]:.1f}, {whole / peer[1]:.1f}" if peer else ""
+        versus = " |"
+        if peer:
+            times, then = (1.0 / batch / peer[0], whole / peer[1]), peer[2] * bare
+            versus = f"{times[0]:.1f}, {times[1]:.1f} | {times[0] * then:.1f}, {times[1] * then:.1f}"
         print(
             f"| {name} | {1 / bare:,.0f} | {1 / batch:,.0f} | {whole:,.0f} | {shares[0]:.2f} "
             f"| {1 / single:,.0f} | {shares[1]:.2f} | {versus} |",
             flush=True,
         )
         if SAFETY_TASKS[name].gremlins.number:
-            print(f"| {name}, led | {1 / led:,.0f} | | | {shares[2]:.2f} | | | |")
+            print(f"| {name}, led | {1 / led:,.0f} | | | {shares[2]:.2f} | | | | |")
         if arguments.threads:
-            gain = thread_gain(name, arguments.repeats, arguments.threads)
-            print(f"  {name}: {arguments.threads} threads, wall time: {gain:.2f}x")
+            ours, theirs = thread_gains(name, arguments.repeats, arguments.threads)
+            print(f"  {name}: {arguments.threads} threads: {ours:.2f}x; MuJoCo alone: {theirs:.2f}x")
 
 
 if __name__ == "__main__":
