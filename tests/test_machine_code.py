@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from recrl.environments.machine_code import kept, array_at, compiled_for_batch, mj_forward, mj_step
+from recrl.environments.machine_code import array_at, compiled_for_batch, kept, mj_forward, mj_step
 from recrl.environments.safety_tasks import SAFETY_TASKS
 from recrl.environments.scene import make_scene
 from recrl.environments.simulations import Simulations
