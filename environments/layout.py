@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.machine_code import compiled_for_arrays
 from recrl.environments.safety_tasks import ROBOT_KEEPOUT, SafetyTask
 
 TRIES = 100
@@ -73,8 +74,9 @@ def sample_goal(
     apart = np.square(other_keepouts + task.target.keepout)
     for _ in range(GOAL_TRIES // TRIES):
         drawn = generator.uniform(-bound, bound, (TRIES, 2))
-        found = _first_free(drawn, others, apart)
-        if found is not None:
+        first = _first_free(drawn, others, apart)
+        if first < TRIES:
+            found: Floats = drawn[first]
             return found
     return None
 
@@ -85,19 +87,26 @@ def _attempt(extent: float, radii: Floats, generator: np.random.Generator) -> Fl
         bound = extent - radius
         drawn = generator.uniform(-bound, bound, (TRIES, 2))
         apart = np.square(radii[:index] + radius)
-        found = _first_free(drawn, places[:index], apart)
-        if found is None:
+        first = _first_free(drawn, places[:index], apart)
+        if first == TRIES:
             return None
-        places[index] = found
+        places[index] = drawn[first]
     return places
 
 
-def _first_free(drawn: Floats, others: Floats, apart: Floats) -> Floats | None:
-    """The first of the points drawn, [n, 2], whose squared distance to each other point is large enough."""
-    squares = np.square(drawn[:, None, 0] - others[:, 0]) + np.square(drawn[:, None, 1] - others[:, 1])
-    free = np.asarray((squares >= apart).all(axis=1))
-    first = int(free.argmax())
-    if not free[first]:
-        return None
-    found: Floats = drawn[first]
-    return found
+@compiled_for_arrays
+def _first_free(drawn: Floats, others: Floats, apart: Floats) -> int:
+    """The first of the points drawn, [n, 2], whose squared distance to each other point is large enough.
+
+    Where there is none: n.
+    """
+    for place in range(len(drawn)):
+        free = True
+        for other in range(len(others)):
+            x, y = drawn[place, 0] - others[other, 0], drawn[place, 1] - others[other, 1]
+            if x * x + y * y < apart[other]:
+                free = False
+                break
+        if free:
+            return place
+    return len(drawn)

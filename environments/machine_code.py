@@ -62,6 +62,12 @@ def compiled_for_batch(function: Callable[[int, int, int, int], None]) -> Any:
     return kept(functools.partial(numba.cfunc, signature), function)
 
 
+def compiled_for_arrays(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function of arrays for Python."""
+    call: Callable[Parameters, Result] = kept(numba.njit, function)
+    return call
+
+
 def compiled_for_python(function: Callable[[int], bool]) -> Callable[[int], bool]:
     """A function of an address that Python calls often: Numba takes no time to look at the argument."""
     signature = types.boolean(_ADDRESS)
