@@ -83,7 +83,8 @@ class SafetyWorlds:
         qpos, qvel: coordinates and velocities, live views, [B, ...].
         group: for each kind of object that the lidar sees, its slice of P.
 
-    The rest are live views of the worlds' records; whoever writes there or to ``qpos`` calls ``refresh``:
+    The rest are live views of the worlds' records. Whoever writes there calls ``refresh``, and before it, if
+    ``qpos`` or ``qvel`` were written, ``simulations.forward``.
         points: (x, y) of everything that the lidar sees, metres, [B, P, 2]; ``group`` tells which is which.
         steps: taken in this episode, [B].
         distances: those that the reward compares with, metres, [B, 1 or 2].

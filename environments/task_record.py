@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.gremlins import ALERT, IDLE_PLACE, ON_COURSE, gremlin_course
+from recrl.environments.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
 from recrl.environments.layout import keepouts
 from recrl.environments.mujoco_layout import structure
 from recrl.environments.safety_tasks import (
@@ -77,6 +77,7 @@ class Memory:
         flags: ``FLAGS``, [len(FLAGS), B].
         observations: [B, size].
         rows: room for two states of each world, [B, 2, row].
+        course: how gremlins move, if there are any.
     """
 
     worlds: npt.NDArray[Any]
@@ -84,6 +85,7 @@ class Memory:
     flags: npt.NDArray[np.bool_]
     observations: npt.NDArray[np.float32]
     rows: Floats
+    course: Course | None
 
 
 def allocate(scene: Scene, number: int) -> Memory:
@@ -95,11 +97,12 @@ def allocate(scene: Scene, number: int) -> Memory:
         flags=np.zeros((len(FLAGS), number), np.bool_),
         observations=np.zeros((number, scene.task.observation_size), np.float32),
         rows=np.full((number, 2, row), np.nan),
+        course=gremlin_course(scene.task) if scene.task.gremlins.number else None,
     )
 
 
 def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
-    """The record ``TASK`` of a scene, an array [1]; it is of use as long as the memory and the scene live."""
+    """The record ``TASK`` of a scene, an array [1]; it is of use as long as the memory lives."""
     record = np.zeros(1, TASK)
     one = record[0]
     for name in ("worlds", "results", "flags", "observations", "rows"):
@@ -109,8 +112,8 @@ def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
     _describe_memory(one)
     _describe_model(one, scene)
     _describe_task(one, scene)
-    if scene.task.gremlins.number:
-        _describe_gremlins(one, scene)
+    if memory.course is not None:
+        _describe_gremlins(one, scene, memory.course)
     return record
 
 
@@ -158,8 +161,8 @@ def _describe_task(one: Any, scene: Scene) -> None:
     one["gravity"], one["magnetic_field"] = GRAVITY, MAGNETIC_FIELD
 
 
-def _describe_gremlins(one: Any, scene: Scene) -> None:
-    model, course = scene.model, gremlin_course(scene.task)
+def _describe_gremlins(one: Any, scene: Scene, course: Course) -> None:
+    model = scene.model
     one["gremlin_qpos"], one["gremlin_qvel"] = scene.gremlin_qpos, scene.gremlin_qvel
     one["gremlin_lead"], one["gremlin_travel"] = scene.gremlin_mocap, GREMLIN_TRAVEL
     one["gremlin_weight"] = -model.body("gremlin").mass[0] * model.opt.gravity[2]

@@ -202,13 +202,13 @@ def show(x: float, y: float, lidar_range: float, bins: Any) -> None:
     that times the rest ("aliasing").
 
     Args:
-        x: how far before the robot, metres.
-        y: how far to its left, metres.
+        x: the object's place in the robot's frame, metres.
+        y: likewise.
         lidar_range: metres.
         bins: readings so far, [sectors].
     """
     reading = 1.0 - math.hypot(x, y) / lidar_range
-    if reading <= 0.0:
+    if not reading > 0.0:
         return
     sectors = len(bins)
     sector = math.atan2(y, x) * (sectors / (2.0 * math.pi))
@@ -259,17 +259,23 @@ def look(task: Any, world: Any, data: int) -> None:
 
 
 @compiled
+def course_step(task: Any, world: Any) -> int:
+    """The t of f(t); somebody may go on after the end of an episode."""
+    at: int = min(world.steps, task.course_steps - 1)
+    return at
+
+
+@compiled
 def place_gremlins(task: Any, world: Any, qpos: Any) -> None:
     """Gremlins are f(t) away from the middle of their circle; the one that is a body is where that is."""
-    step = min(world.steps, task.course_steps - 1)
-    course = _doubles(task.course_positions, 3 * task.course_steps)
+    course, at = _doubles(task.course_positions, 3 * task.course_steps), 3 * course_step(task, world)
     for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
         point = world.points[task.start[GREMLINS] + gremlin]
         if gremlin == world.embodied:
             point[0], point[1] = qpos[task.gremlin_qpos], qpos[task.gremlin_qpos + 1]
         else:
-            point[0] = world.circles[gremlin, 0] + course[3 * step]
-            point[1] = world.circles[gremlin, 1] + course[3 * step + 1]
+            point[0] = world.circles[gremlin, 0] + course[at]
+            point[1] = world.circles[gremlin, 1] + course[at + 1]
 
 
 @compiled
@@ -432,7 +438,7 @@ def replaceable(task: Any, world: Any, data: int) -> bool:
         return True
     if world.touching[task.first_body[GREMLINS]]:
         return False
-    course = _doubles(task.course_positions, 3 * task.course_steps)[3 * world.steps :]
+    course = _doubles(task.course_positions, 3 * task.course_steps)[3 * course_step(task, world) :]
     circle = world.circles[world.embodied]
     place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
     x, y = place[0] - course[0] - circle[0], place[1] - course[1] - circle[1]
@@ -459,10 +465,11 @@ def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
     lift[2] = 0.0
     positions = _doubles(task.course_positions, 3 * task.course_steps)
     velocities = _doubles(task.course_velocities, 6 * task.course_steps)
+    at = course_step(task, world)
     for axis in range(3):
-        place[axis] = positions[3 * world.steps + axis]
+        place[axis] = positions[3 * at + axis]
     for axis in range(6):
-        velocity[axis] = velocities[6 * world.steps + axis]
+        velocity[axis] = velocities[6 * at + axis]
     place[0] += world.circles[gremlin, 0]
     place[1] += world.circles[gremlin, 1]
     half = world.gremlin_yaws[gremlin] / 2.0
@@ -532,7 +539,7 @@ def report(task: Any, world: Any, index: int) -> None:
     results[number + index] = cost
     flags[index] = world.goal_met
     flags[number + index] = world.broken
-    flags[2 * number + index] = world.broken
+    flags[2 * number + index] = world.broken  # what else ends an episode is not known here
     flags[3 * number + index] = world.steps >= task.horizon
 
 

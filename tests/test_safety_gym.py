@@ -225,6 +225,15 @@ def test_an_episode_is_truncated_after_a_thousand_steps() -> None:
         assert (terminated, truncated) == (False, step == 1000)
 
 
+def test_who_goes_on_after_the_end_of_an_episode_meets_gremlins_where_they_were() -> None:
+    environment = SafetyGymVectorEnv("CarButton2", 2)
+    environment.reset(seed=0)
+    environment.worlds.steps[:] = 5000
+    environment.worlds.embodied[0] = 0
+    environment.worlds.advance()
+    assert np.isfinite(environment.worlds.observations()).all()
+
+
 @pytest.mark.parametrize("name", LEVEL_2)
 def test_broken_physics_ends_the_episode_with_a_penalty(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
