@@ -2,11 +2,10 @@
 
 The other half of ``tracking``. Three kinds of queries, whatever the number of runs:
 
-* Runs, with their tags: a database is asked by one SELECT a table, a server by ``search_runs``, a page of
-  1,000 runs a request.
+* Runs, with their tags: a database is asked by one SELECT a table, a server by ``search_runs``, page by page.
 * Histories of metrics: a database is asked by one SELECT a metric (``tracking_database``). A server, whose
   client has no request for many runs at once (mlflow#7365), by ``metrics/get-history-bulk-interval`` of its
-  REST API, for 100 runs and one metric a request; beyond 2,500 points of a run it thins them evenly.
+  REST API, for some runs and one metric a request; beyond 2,500 points of a run it thins them evenly.
 * Small files: artifacts, from this machine's disk where the store says they are there, else a few requests
   at once.
 
@@ -35,9 +34,11 @@ from recrl.orchestrator.tracking import ENVIRONMENT, PHASES_TAG, PROGRESS_TAG, S
 from recrl.orchestrator.tracking_database import Database, Ints, Points, ShownRun, points_of, unreadable
 
 EXPERIMENTS = "recrl/"  # what the names of a sweep's experiment begin with
-RUNS_A_REQUEST = 100  # of metric histories; a server takes no more
-POINTS_A_RUN = 2_500  # likewise
+RUNS_A_PAGE = 200
+RUNS_A_REQUEST = 25  # of metric histories; a server takes 100, which can keep it busy for long
+POINTS_A_RUN = 2_500  # a server takes no more
 REQUESTS_AT_ONCE = 4
+PATIENCE = 60  # seconds that a server may think about histories
 HISTORY = "/api/2.0/mlflow/metrics/get-history-bulk-interval"
 
 
@@ -157,6 +158,7 @@ class Server:
             self._client.search_experiments(max_results=1)
         except MlflowException as error:
             raise unreadable(uri, error) from error
+        self._uri = uri
         self._runs: list[ShownRun] = []
 
     def experiments(self) -> dict[str, str]:
@@ -166,10 +168,15 @@ class Server:
 
     def runs(self, experiment_id: str) -> list[ShownRun]:
         """The runs of an experiment."""
+        from mlflow.exceptions import MlflowException  # noqa: PLC0415
+
         found: list[ShownRun] = []
         token: str | None = None
         while True:
-            page = self._client.search_runs([experiment_id], max_results=1_000, page_token=token)
+            try:
+                page = self._client.search_runs([experiment_id], max_results=RUNS_A_PAGE, page_token=token)
+            except MlflowException as error:
+                raise unreadable(self._uri, error) from error
             found += [
                 ShownRun(
                     run_id=str(run.info.run_id),
@@ -182,8 +189,9 @@ class Server:
             ]
             token = page.token
             if not token:
-                self._runs = found
-                return found
+                break
+        self._runs = found
+        return found
 
     def points(self, metric: str, experiment_id: str) -> Points:
         """Every point of a metric in the experiment whose runs were asked for last."""
@@ -197,13 +205,17 @@ class Server:
         return points_of(rows)
 
     def _ask(self, metric: str, runs: Sequence[str]) -> list[dict[str, Any]]:
+        from mlflow.exceptions import MlflowException  # noqa: PLC0415
         from mlflow.utils.rest_utils import http_request_safe  # noqa: PLC0415
 
         store: Any = self._client._tracking_client.store  # it knows the credentials
         asked = [("run_ids", run) for run in runs]
         asked += [("metric_key", metric), ("max_results", str(POINTS_A_RUN))]
         request: Any = http_request_safe  # not annotated
-        reply = request(store.get_host_creds(), HISTORY, "GET", params=asked)
+        try:
+            reply = request(store.get_host_creds(), HISTORY, "GET", params=asked, timeout=PATIENCE)
+        except MlflowException as error:
+            raise unreadable(self._uri, error) from error
         points: list[dict[str, Any]] = reply.json().get("metrics", [])
         return points
 

@@ -185,6 +185,11 @@ def test_reading_waits_for_whoever_writes(sweep: SweepStore, tmp_path: Path) -> 
     writer.close()
 
 
+def test_a_server_that_is_away_is_named() -> None:
+    with pytest.raises(TrackingError, match=r"MLflow at http://127\.0\.0\.1:9 cannot be read: .*refused"):
+        tracked.load("http://127.0.0.1:9")
+
+
 def test_a_file_that_is_no_database_of_mlflows_is_named(tmp_path: Path) -> None:
     (tmp_path / "other.db").write_text("no database")
     with pytest.raises(TrackingError, match=r"other\.db cannot be read: .*file is not a database"):
