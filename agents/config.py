@@ -316,12 +316,18 @@ class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):
         **STARTER_AGENTS_TRUST_REGION,
         **STARTER_AGENTS_MULTIPLIERS,
         "cost_advantages": "centred",
+        "temperature": 0.0,
     }
 
     cost_advantages: Literal["reward-scaled", "centred"] = Field(
         default="reward-scaled",
         description="Unit of the cost advantages: divided by the reward advantages' standard deviation, so "
         "that the multiplier is that of the CMDP (ours), or as they are beside standardised rewards (paper).",
+    )
+    temperature: NonNegative = Field(
+        default=1.0,
+        description="lambda, standard deviations of the reward advantages that a nat of KL must be worth, so "
+        "that steps get shorter towards a saddle of the Lagrangian (ours; paper 0: all of one length).",
     )
 
 

@@ -30,8 +30,13 @@ def step_up(
     objective: Floats,
     config: TrustRegionConfig,
     generator: np.random.Generator,
+    *,
+    temperature: float = 0.0,
 ) -> dict[str, float]:
     """Take one trust-region step up the surrogate of some advantages, or none where they are all equal.
+
+    With a temperature lambda it solves max over x of g.x - lambda x.H x / 2 within x.H x / 2 <= delta, so it
+    is min(sqrt(2 delta / q), 1 / lambda) H^-1 g: shorter than the trust region where little is to be gained.
 
     Args:
         policy: changed in place.
@@ -39,6 +44,7 @@ def step_up(
         objective: the advantages to climb, [N].
         config: the trust region, conjugate gradients and line search.
         generator: of the samples that the metric is evaluated on.
+        temperature: lambda, what a nat must be worth, in the advantages' unit, at least 0.
 
     Returns:
         The step's metrics.
@@ -51,7 +57,7 @@ def step_up(
     require_finite("the squared length of the trust region's direction", squared)
     if squared <= 0.0:
         return {"policy_steps": 0.0, "line_search_steps": float(config.backtrack_tries), "step_norm": 0.0}
-    direction.mul_((2.0 * config.target_kl / squared) ** 0.5)
+    direction.mul_(step_size(squared, config.target_kl, temperature))
     before = model.start()
 
     def is_acceptable() -> bool:
@@ -71,6 +77,21 @@ def step_up(
         "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
         "step_norm": taken * float(direction.norm()),
     }
+
+
+def step_size(squared: float, target_kl: float, temperature: float) -> float:
+    """The factor on H^-1 g: min(sqrt(2 delta / q), 1 / lambda).
+
+    Args:
+        squared: q, above 0.
+        target_kl: delta, nats.
+        temperature: lambda, at least 0.
+
+    >>> step_size(8.0, 0.01, 0.0), step_size(8.0, 0.01, 10.0), step_size(8.0, 0.01, 40.0)
+    (0.05, 0.05, 0.025)
+    """
+    longest: float = (2.0 * target_kl / squared) ** 0.5
+    return longest if temperature * longest <= 1.0 else 1.0 / temperature
 
 
 class TrustRegionPolicyOptimisation:

@@ -3,6 +3,10 @@
 Multipliers first answer the gaps; then the policy takes one trust-region step up the surrogate of
 (A_r - sum_i p_i A_i) / (1 + sum_i p_i), p the multipliers. If no episode finished, the multipliers stay.
 
+At a saddle of the Lagrangian that surrogate has no gradient, but a step that always reaches the edge of the
+trust region is as long there as anywhere, and the policy swings about the limit for ever. So, ours, a nat of
+KL must be worth ``temperature`` standard deviations of the reward's advantages, and steps end with the gain.
+
 Letters: N samples, k costs.
 """
 
@@ -35,7 +39,9 @@ class TRPOLagrangian:
         multipliers = self._multipliers.answer(experience.constraints)
         rewards, costs = scaled_advantages(experience.advantages, self._config.cost_advantages)
         objective = penalised_advantages(rewards, costs, multipliers)
-        metrics = step_up(policy, experience, objective, self._config, generator)
+        metrics = step_up(
+            policy, experience, objective, self._config, generator, temperature=self._config.temperature
+        )
         return {**metrics, **indexed("multiplier", multipliers)}
 
 

@@ -35,9 +35,9 @@ from recrl.environments.river_grid import (
     river_cmdp,
     task_map,
 )
-from recrl.environments.river_maps import GOAL, RIVER, STEPS, WALL, RiverMap
+from recrl.environments.river_maps import GOAL, MUD, RIVER, STEPS, WALL, RiverMap
 
-TILE_COLOURS = {WALL: "#4a4a4a", RIVER: "#b9dcf2", GOAL: "#a8dba8"}
+TILE_COLOURS = {WALL: "#4a4a4a", RIVER: "#b9dcf2", MUD: "#d9c29a", GOAL: "#a8dba8"}
 DRY_COLOUR = "#f6f1e4"
 VISIT_COLOURS = "Oranges"
 LEAST_VISITS = 0.01  # squares and headings seen less often an episode are left as they are

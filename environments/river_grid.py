@@ -4,8 +4,8 @@ Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), f
 Action: Discrete(3), MiniGrid's first three: 0 turn left, 1 turn right, 2 forward (into a wall: stay).
 Reward: -0.1 a step; +10 instead on the step that reaches a goal.
 Cost: ``river`` 1 for every time step that ends on a river tile, turning and bumping there included; on demand
-    ``turns`` 1 for every turn, and ``mud`` 1 for every time step that ends on a muddy tile, which make tasks with
-    two and three constraints whose optimum is still exact.
+    ``turns`` 1 for every turn, and ``mud`` 1 for every time step that ends on a muddy tile, which make tasks
+    with two and three constraints whose optimum is still exact.
 Termination: at a goal; truncated after ``horizon`` steps (200).
 Source: the paper's section 5 for the idea, the limits and the cost (time steps in the water). It gives
     neither maps (its figure is not in its text) nor rewards nor a horizon: those are ours, such that every

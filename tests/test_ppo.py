@@ -18,7 +18,7 @@ from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import Adam, NetworkForm, orthogonal
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.ppo import ProximalPolicyOptimisation
-from recrl.agents.trpo import TrustRegionPolicyOptimisation
+from recrl.agents.trpo import TrustRegionPolicyOptimisation, step_up
 from recrl.environments.cmdp import Floats
 
 SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
@@ -78,6 +78,27 @@ def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object])
     np.testing.assert_allclose(after, after_cpo, atol=1e-5)
     assert found["surrogate_reward"] == pytest.approx(expected["surrogate_reward"], rel=1e-3)
     assert found["step_norm"] == pytest.approx(expected["step_norm"], rel=1e-3)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_with_a_temperature_a_step_is_as_long_as_the_gain_is_large_up_to_the_trust_region(
+    space: Space[object],
+) -> None:
+    def stepped(size: float, temperature: float) -> float:
+        policy, batch, advantages = sampled(space)
+        experience = Experience.of(policy, batch, advantages, UNKNOWN)
+        objective = size * (advantages[:, 0] - advantages[:, 0].mean())
+        generator = np.random.default_rng(0)
+        config = TRPOConfig(target_kl=DELTA)
+        return step_up(policy, experience, objective, config, generator, temperature=temperature)["step_norm"]
+
+    edge = stepped(1.0, temperature=0.0)
+    assert stepped(1e-3, temperature=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
+    assert stepped(1e3, temperature=1.0) == pytest.approx(edge, rel=1e-3)
+    small = stepped(1e-3, temperature=1.0)
+    assert small < 0.1 * edge
+    assert stepped(2e-3, temperature=1.0) == pytest.approx(2.0 * small, rel=1e-3)
+    assert stepped(1e-3, temperature=2.0) == pytest.approx(0.5 * small, rel=1e-3)
 
 
 def test_where_no_action_is_better_trpo_stays() -> None:

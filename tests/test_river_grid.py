@@ -13,7 +13,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from minigrid.minigrid_env import MiniGridEnv
 
-from recrl.environments.registry import make_vector
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.registry import make_vector, optimal_return
 from recrl.environments.river_grid import (
     FORWARD,
     LEFT,
@@ -68,6 +69,25 @@ def test_turns_are_a_second_cost_in_the_order_asked_for() -> None:
     assert costs == [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
 
 
+def test_mud_is_a_cost_of_its_own_and_no_river() -> None:
+    drawing = "######\n#>%~G#\n######"
+    _, costs, terminated = episode(
+        "rivergrid", [FORWARD, RIGHT, LEFT, FORWARD, FORWARD], map=drawing, costs=("river", "mud")
+    )
+    assert costs == [[0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]
+    assert terminated
+
+
+def test_with_river_and_mud_limited_the_optimum_mixes_all_three_ways() -> None:
+    # Straight on: 3 steps, 2 in the river. North: 4 steps, 2 in the mud. South: 6 steps, dry.
+    way = "#G#####|#%#####|#%#####|#>~~G##|#.#####|#.#####|#.#####|#.#####|#G#####"
+    drawing = "\n".join(["#######", *way.split("|"), "#######"])
+    options = {"map": drawing, "horizon": 30, "costs": ["river", "mud"]}
+    assert optimal_return("rivergrid", options, CostLimits((0.0, 0.0))) == pytest.approx(9.5)
+    # Half straight on at 9.8, a quarter north at 9.7, a quarter south at 9.5.
+    assert optimal_return("rivergrid", options, CostLimits((1.0, 0.5))) == pytest.approx(9.7)
+
+
 def test_staying_is_truncated_after_two_hundred_steps_at_minus_twenty() -> None:
     environment = make_vector("rivergrid-1a", 1)
     environment.reset(seed=0)
@@ -91,15 +111,16 @@ def test_the_observation_is_one_hot_x_y_and_heading() -> None:
     assert observation.tolist() == [*(0, 1, 0, 0), *(0, 0, 0, 1, 0), *(0, 0, 0, 1)]
 
 
-@pytest.mark.parametrize("costs", [("river",), ("turns", "river")])
+@pytest.mark.parametrize("costs", [("river",), ("mud", "turns", "river")])
 @pytest.mark.parametrize(
     "drawing",
     [
         MAPS["1a"],
         MAPS["1b"],
+        "######\n#.%~G#\n#>~%.#\n#.%~.#\n######",
         *(str(generate_map(MapGenerator(seed=seed, width=7, height=6))) for seed in range(4)),
     ],
-    ids=["1a", "1b", "random-0", "random-1", "random-2", "random-3"],
+    ids=["1a", "1b", "mud", "random-0", "random-1", "random-2", "random-3"],
 )
 def test_the_fast_environment_equals_minigrids_step_for_step(
     drawing: str, costs: tuple[CostName, ...]

@@ -78,7 +78,7 @@ def test_indentation_empty_lines_and_trailing_blanks_do_not_matter() -> None:
         ("", "map: must be at least 3 columns by 3 rows, got 0 by 1"),
         ("####\n#>G#", "map: must be at least 3 columns by 3 rows, got 4 by 2"),
         ("####\n#>G##\n####", "map: line 2: must have 4 columns like the first row, got 5"),
-        ("\n####\n#>w#\n####", "map: line 3, column 3: unknown tile 'w', allowed are # . ~ G > v < ^"),
+        ("\n####\n#>w#\n####", "map: line 3, column 3: unknown tile 'w', allowed are # . ~ % G > v < ^"),
         ("####\n#>G#\n##.#", "map: line 3, column 3: the border must be wall '#', got '.'"),
         ("#####\n#>v.#\n#G..#\n#####", "map: line 2, column 3: there must be one start, the first is at "
          "map: line 2, column 2"),

@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python tests/benchmarks/preset_curves.py --folder results/learning
 
-The task is the fork of ``learning.py``, a RiverGrid of which the optimum J*(d) is known. The
-budget is small: it shows that both learn, and what an update of each costs, not which is better.
+The task is the two-state CMDP of ``learning.py``, of which the optimum J*(d) is known. It shows that both
+learn, and what an update of each costs, not which is better.
 
 Writes ``presets.csv`` (a row an update: student, preset, seed, env_steps, episode_return, cost) and
 ``presets.png``.
@@ -29,7 +29,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 LEARNING = runpy.run_path(str(Path(__file__).parent / "learning.py"))
-TASK = "fork"
+TASK = "two-state"
 STUDENTS = ("ppo-lag", "cpo")
 PRESETS = ("recommended", "paper")
 
@@ -38,7 +38,7 @@ def learn(student: str, preset: str, seed: int, updates: int) -> pd.DataFrame:
     """The exact value of the policy after each update, and the CPU seconds of all updates so far."""
     exercise = LEARNING["EXERCISES"][TASK]
     environment_seed, agent_seed, policy_seed = np.random.SeedSequence(seed).spawn(3)
-    environments = make_vector(exercise.task, LEARNING["NUM_ENVS"], options=exercise.options)
+    environments = make_vector(exercise.task, exercise.num_envs, options=exercise.options)
     agent = make_agent(student, environments.cmdp, {"preset": preset}, agent_seed)
     collector = Collector(environments, num_steps=exercise.num_steps)
     collector.reset(seed=int(environment_seed.generate_state(1)[0]))
