@@ -187,7 +187,7 @@ class SafetyWorlds:
 
     def pressed(self) -> Booleans:
         """Whether the robot touches each button, [B, buttons]."""
-        return self.touching[:, self.scene.touchable["buttons"][0]].copy()
+        return self.touching[:, self.scene.touchable["buttons"]].copy()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future depends on: physics, layout, goals, counters, generators."""

@@ -120,9 +120,10 @@ class Scene:
             -1 where there is none.
         button_mocap, pillar_mocap: mocap index of each, [buttons] and [pillars].
         gremlin_mocap: mocap index of what leads the gremlin, or -1.
-        touchable: for each kind of object of which it matters whether the robot touches it, the bodies (they
-            have consecutive numbers) and the distance between the robot's and the object's middle, metres,
-            beyond which they cannot touch.
+        gremlin_reach: the distance between the robot's and a gremlin's middle, metres, beyond which they
+            cannot touch; 0 where there is none.
+        touchable: for each kind of object of which it matters whether the robot touches it, the bodies, which
+            have consecutive numbers.
     """
 
     task: SafetyTask
@@ -138,7 +139,8 @@ class Scene:
     button_mocap: tuple[int, ...]
     pillar_mocap: tuple[int, ...]
     gremlin_mocap: int
-    touchable: dict[str, tuple[slice, float]]
+    gremlin_reach: float
+    touchable: dict[str, slice]
 
 
 def scene_xml(task: SafetyTask) -> str:
@@ -209,6 +211,7 @@ def make_scene(task: SafetyTask) -> Scene:
             int(model.body(f"pillar{index}").mocapid[0]) for index in range(task.pillars.number)
         ),
         gremlin_mocap=int(model.body("gremlin_lead").mocapid[0]) if has_gremlin else -1,
+        gremlin_reach=_gremlin_reach(model) if has_gremlin else 0.0,
         touchable=_touchable(task, model),
     )
 
@@ -231,28 +234,25 @@ def rotation_matrices(quaternions: Floats) -> Floats:
     return np.stack([np.stack(row, axis=-1) for row in entries], axis=-2)
 
 
-def _touchable(task: SafetyTask, model: mujoco.MjModel) -> dict[str, tuple[slice, float]]:
+def _touchable(task: SafetyTask, model: mujoco.MjModel) -> dict[str, slice]:
     kinds = {
         "vases": ("vase0", task.vases.number if "vases_contact" in task.cost_terms else 0),
         "pillars": ("pillar0", task.pillars.number if "pillars" in task.cost_terms else 0),
         "buttons": ("button0", task.buttons.number),
         "gremlins": ("gremlin", min(task.gremlins.number, 1)),
     }
+    first = {kind: model.body(name).id for kind, (name, number) in kinds.items() if number}
+    return {kind: slice(start, start + kinds[kind][1]) for kind, start in first.items()}
+
+
+def _gremlin_reach(model: mujoco.MjModel) -> float:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    robot = model.body("robot").id
+    robot, gremlin = model.body("robot").id, model.body("gremlin").id
     limbs = np.flatnonzero(model.body_rootid[model.geom_bodyid] == robot)
     offsets = np.linalg.norm(data.geom_xpos[limbs] - data.xpos[robot], axis=1)
     reach = float((offsets + model.geom_rbound[limbs]).max())
-    touchable = {}
-    for kind, (name, number) in kinds.items():
-        if number:
-            first = model.body(name).id
-            geom = model.body_geomadr[first]
-            # A pillar stands upright: what counts is its radius.
-            size = model.geom_size[geom, 0] if kind == "pillars" else model.geom_rbound[geom]
-            touchable[kind] = (slice(first, first + number), reach + float(size) + 0.01)
-    return touchable
+    return reach + float(model.geom_rbound[model.body_geomadr[gremlin]]) + 0.01
 
 
 def _vase(index: int, size: float) -> str:

@@ -43,6 +43,7 @@ from recrl.environments.world_step import (
     WORLD,
 )
 
+_NONE = slice(0, 0)
 _FIELDS = (
     "qpos",
     "qvel",
@@ -146,7 +147,7 @@ def _describe_task(one: Any, scene: Scene) -> None:
         raise ValueError(f"{task.name}: at most {MAX_POINTS} objects have room")
     starts = {name: task.where(name).start for name, _ in task.components}
     for index, kind in enumerate(KINDS):
-        place, bodies = places.get(kind, slice(0, 0)), scene.touchable.get(kind, (slice(0, 0), 0.0))[0]
+        place, bodies = places.get(kind, _NONE), scene.touchable.get(kind, _NONE)
         one["start"][index], one["stop"][index] = place.start, place.stop
         one["first_body"][index], one["last_body"][index] = bodies.start, bodies.stop
         one["lidar"][index] = starts.get(f"{kind}_lidar", -1)
@@ -166,7 +167,7 @@ def _describe_gremlins(one: Any, scene: Scene, course: Course) -> None:
     one["gremlin_qpos"], one["gremlin_qvel"] = scene.gremlin_qpos, scene.gremlin_qvel
     one["gremlin_lead"], one["gremlin_travel"] = scene.gremlin_mocap, GREMLIN_TRAVEL
     one["gremlin_weight"] = -model.body("gremlin").mass[0] * model.opt.gravity[2]
-    one["gremlin_alert"] = scene.touchable["gremlins"][1] + ALERT
+    one["gremlin_alert"] = scene.gremlin_reach + ALERT
     one["gremlin_on_course"], one["gremlin_idle_place"] = ON_COURSE, IDLE_PLACE
     one["course_steps"] = len(course.positions)
     one["course_positions"] = course.positions.ctypes.data

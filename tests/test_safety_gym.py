@@ -279,7 +279,7 @@ def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -
     environment = SafetyGymVectorEnv(name, 4)
     environment.reset(seed=5)
     worlds, model = environment.worlds, environment.worlds.scene.model
-    kinds = [bodies for bodies, _ in worlds.scene.touchable.values()]
+    kinds = list(worlds.scene.touchable.values())
     felt, data = 0, worlds.simulations.data(0)
     for action in held_actions(250, 4, seed=2):
         environment.step(action)
