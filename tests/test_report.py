@@ -63,10 +63,13 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
     store = made_up_sweep(
         seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 0"]
     )
-    names = [path.name for path in report.draw(frames.load(store), tmp_path)]
+    sweep = frames.load(store)
+    names = [path.name for path in report.sketch(sweep, tmp_path)]
     assert "curricula.png" in names
     assert "outcomes.csv" not in names
     assert "No trial is complete yet: no table." in (tmp_path / "report.md").read_text()
+    for stem in ("bounds_cpo", "return-against-cost", "performance-profiles"):
+        assert report.drawings(sweep)[stem]() is None
 
 
 def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
