@@ -171,7 +171,7 @@ def test_trials_in_an_object_store_outlive_their_workers_and_their_folders(
         return record.status is TrialState.RUNNING and bool(record.committed.get("updates.csv"))
 
     with storage.mirrored(mirror, never, every=0.1), once(is_halfway, kill):
-        RayExecutor(commit_seconds=0.05, storage=storage).run([LONG], mirror, never)
+        RayExecutor(commit_seconds=0.2, storage=storage).run([LONG], mirror, never)
     assert killed
     assert mirror.trial(LONG).record().attempt == 2
     assert "resumed after update " in mirror.trial(LONG).log_path.read_text()

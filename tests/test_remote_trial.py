@@ -117,40 +117,40 @@ def test_a_trial_goes_on_elsewhere_with_what_was_sent_last(remote: RemoteTrial, 
         assert getattr(there, path).read_bytes() == getattr(second.trial, path).read_bytes()
 
 
-def test_a_mirror_follows_commit_by_commit(remote: RemoteTrial, tmp_path: Path) -> None:
-    machine = Machine(remote, tmp_path / "machine")
-    for update in range(1, 12):
+def test_a_mirror_follows_commit_by_commit(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    for update in range(1, 8):
         machine.work(update)
         machine.upload.push()
-        there = mirror(remote, tmp_path / "mirror")
+        there = mirror(bucket, tmp_path / "mirror")
         assert updates(there) == list(range(1, update + 1))
         assert there.episodes_path.read_bytes() == machine.trial.episodes_path.read_bytes()
 
 
 def test_a_mirror_leaves_checkpoints_of_running_trials_where_they_are(
-    remote: RemoteTrial, tmp_path: Path
+    bucket: RemoteTrial, tmp_path: Path
 ) -> None:
-    machine = Machine(remote, tmp_path / "machine")
+    machine = Machine(bucket, tmp_path / "machine")
     machine.work(1)
     machine.upload.push()
-    assert mirror(remote, tmp_path / "mirror", checkpoints=False).checkpoints() == []
-    assert len(mirror(remote, tmp_path / "mirror", checkpoints=True).checkpoints()) == 1
+    assert mirror(bucket, tmp_path / "mirror", checkpoints=False).checkpoints() == []
+    assert len(mirror(bucket, tmp_path / "mirror", checkpoints=True).checkpoints()) == 1
     machine.work(2)
     machine.writer.close(TrialState.COMPLETE)
     machine.upload.finish()
-    there = mirror(remote, tmp_path / "mirror", checkpoints=False)
+    there = mirror(bucket, tmp_path / "mirror", checkpoints=False)
     assert [path.name for path in there.checkpoints()] == ["checkpoint-00000002.recrl"]
 
 
 def test_many_commits_leave_few_objects(bucket: RemoteTrial, tmp_path: Path) -> None:
     machine = Machine(bucket, tmp_path / "machine")
-    for update in range(1, 65):
+    for update in range(1, 33):
         machine.work(update)
         machine.upload.push()
     assert len(bucket.objects.keys_in()) < 2 * (
         2 * 7 + 3
     )  # two manifests; two row files of log2(64) + 1 parts
-    assert updates(mirror(bucket, tmp_path / "mirror")) == list(range(1, 65))
+    assert updates(mirror(bucket, tmp_path / "mirror")) == list(range(1, 33))
 
 
 def test_a_commit_that_broke_off_behind_its_checkpoint_takes_its_rows_along(
