@@ -504,9 +504,7 @@ def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
     return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
 
 
-def _draw(
-    sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True
-) -> None:
+def _draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True) -> None:
     from recrl.analysis.report import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
 
     (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])
