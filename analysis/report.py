@@ -13,6 +13,7 @@
     summary.csv                 averaged over seeds, with interquartile means
     comparisons.csv             paired differences to the student without a curriculum
     training.csv                what relaxed training cost, a row a trial
+    claims.csv                  the paper's claims about RiverGrid's maps, counted, where a grid has these
     bounds.csv                  the same beside Proposition 1, a row a trial and cost
     outcomes.tex                the first table for LaTeX (booktabs)
     outcomes.parquet            outcomes.csv with its types, for programs
@@ -37,7 +38,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from recrl.analysis import figures, metrics, page, styles, tables
+from recrl.analysis import claims, figures, metrics, page, styles, tables
 from recrl.analysis.bound_figure import cumulative_bounds
 from recrl.analysis.cumulative import bound_table, cumulative_costs
 from recrl.analysis.diagnostics import curriculum_diagnostics
@@ -242,6 +243,10 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str
     if len(compared):
         against = tables.comparison_table(compared, Measure.DEPLOYMENT)
         shown.append(("Deployment phase against `none`, seed by seed [95% interval]", against))
+    weighed = claims.weigh(rows)
+    if len(weighed):
+        written.append(tables.write_csv(weighed, folder / "claims.csv"))
+        shown.append(("What the paper says of these maps, in deployment", claims.claims_table(weighed)))
     for i, costs in enumerate(bounds):
         which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
         shown.append((f"Cumulative cost of training beside its bounds{which}", bound_table(costs)))

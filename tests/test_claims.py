@@ -22,7 +22,8 @@ def outcome(task: str, method: str, episode_return: float, cost: float) -> dict[
 
 def held(*outcomes: dict[str, object]) -> dict[str, tuple[int, int]]:
     weighed = weigh(pd.DataFrame(outcomes))
-    return {row.claim: (row.held, row.trials) for row in weighed.itertuples()}
+    counts = zip(weighed["held"].astype(int), weighed["trials"].astype(int), strict=True)
+    return dict(zip(weighed["claim"].astype(str), counts, strict=True))
 
 
 def test_a_plain_student_that_does_not_arrive_stays() -> None:
