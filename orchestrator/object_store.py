@@ -169,8 +169,8 @@ def _checked(uri: str) -> str:
     protocol, separator, path = uri.partition("://")
     if not protocol or not separator or not path.strip("/") or "::" in uri:
         raise RecrlError(f"the storage must be an address such as {EXAMPLE}, got {uri!r}")
-    if re.match(r"[^/@]*:[^/@]*@", path) or "?" in uri:
-        hidden = re.sub(r"(://)[^/@]*@|\?.*", r"\1", uri)
+    if re.match(r"[^/@]*:[^@]*@", path) or "?" in uri:  # there are slashes in Amazon's secrets
+        hidden = re.sub(r"(://)[^@]*@|\?.*", r"\1", uri)
         raise RecrlError(
             f"{hidden}: credentials do not belong into the address; give them as {protocol}:// wants "
             "them, in the environment or its own files, on every machine"
@@ -209,5 +209,5 @@ def _kinds() -> list[str]:
 def _reason(error: BaseException) -> str:
     """The first line of an error, without what an address has behind a question mark: a signature, maybe."""
     text = next(iter(str(error).splitlines()), "")
-    text = re.sub(r"\?[^\s'\")]*", "", re.sub(r"(://)[^\s/@]*@", r"\1", text))
+    text = re.sub(r"\?[^\s'\")]*", "", re.sub(r"(://)[^\s@]*@", r"\1", text))
     return f"{type(error).__name__}: {text[:REASON_LENGTH]}" if text else type(error).__name__

@@ -236,8 +236,9 @@ class RemoteTrial:
             if new is not None:
                 _place(trial, file, *new)
         if any(_CHECKPOINT.fullmatch(file) for file in news):
-            for path in trial.checkpoints()[1:]:
-                path.unlink()
+            for path in trial.checkpoints():
+                if f"checkpoints/{path.name}" not in news:  # of another manifest: its rows are not here
+                    path.unlink()
         if before.place != place:
             _Pulled(place, manifest).write(trial)
         return manifest
@@ -375,9 +376,10 @@ class Upload:
             if key not in self._written:
                 self._remote.objects.write(f"{attempt}/{key}", piece)
                 self._written.add(key)
-        name = f"manifest-{self._number + 1:08d}.json"
+        self._number += 1  # also if this fails: a reader may have it, and looks at no name a second time
+        name = f"manifest-{self._number:08d}.json"
+        self._written.add(name)
         self._remote.objects.write(f"{attempt}/{name}", manifest.to_bytes())
-        self._number += 1
         self._parts, self._shown = manifest.files, _commit_of(record)
         self._manifests.append((name, manifest))
         self._clear(attempt, others)
@@ -446,11 +448,10 @@ class Upload:
 
     def _clear(self, attempt: str, others: Sequence[str]) -> None:
         """Delete what no manifest of the last ones names, and the attempts before this one."""
-        old, new = self._manifests[:-KEPT_MANIFESTS], self._manifests[-KEPT_MANIFESTS:]
-        spare = self._written.difference(*(manifest.keys for _, manifest in new))
-        names = [*(name for name, _ in old), *sorted(spare)]
-        self._remote.objects.delete([*(f"{attempt}/{name}" for name in names), *others])
-        self._manifests = new
+        self._manifests = self._manifests[-KEPT_MANIFESTS:]
+        spare = self._written.difference(*({name, *manifest.keys} for name, manifest in self._manifests))
+        keys = sorted(spare)  # manifests before their parts
+        self._remote.objects.delete([*(f"{attempt}/{key}" for key in keys), *others])
         self._written -= spare
 
 

@@ -298,8 +298,26 @@ def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp
     assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2, 3]
 
 
+def test_a_manifest_whose_answer_was_lost_is_not_taken_for_the_next(
+    bucket: RemoteTrial, tmp_path: Path
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    Unreliable.plan += ["ok"] * 4 + ["lost"]  # two row files, the spec and a checkpoint; the manifest
+    with pytest.raises(StorageError):
+        machine.upload.push()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    machine.writer.close(TrialState.COMPLETE)
+    machine.upload.finish()
+    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.COMPLETE
+    manifests = [key for key in bucket.objects.keys_in() if "/manifest-" in key]
+    assert [key.rpartition("/")[2] for key in manifests] == ["manifest-00000002.json"]
+
+
 STEPS = st.lists(
-    st.sampled_from(["work", "push", "push", "take over", "refused", "cut", "ok"]), min_size=1, max_size=20
+    st.sampled_from(["work", "push", "push", "take over", "refused", "cut", "lost", "ok"]),
+    min_size=1,
+    max_size=20,
 )
 
 
@@ -319,7 +337,7 @@ def test_whatever_fails_readers_see_one_commit_and_the_end_is_complete(
             machine.work(update + 1)
         elif step == "take over":
             machine = Machine(remote, folder / str(number + 1))
-        elif step in ("refused", "cut", "ok"):
+        elif step in ("refused", "cut", "lost", "ok"):
             Unreliable.plan.append(step)
         elif step == "end":
             Unreliable.plan.clear()
@@ -352,6 +370,7 @@ def test_addresses_that_are_none_are_a_sentence() -> None:
 def test_credentials_are_neither_taken_nor_shown() -> None:
     for uri, shown in (
         ("ftp://me:hunter2@host/folder", "ftp://host/folder"),
+        ("s3://AKIA:hunter2/+x@bucket/folder", "s3://bucket/folder"),
         ("s3://bucket/x?key=hunter2", "s3://bucket/x"),
     ):
         with pytest.raises(RecrlError) as error:

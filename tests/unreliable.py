@@ -10,8 +10,8 @@ class Unreliable(LocalFileSystem):  # type: ignore[misc]  # fsspec has no types
     """A folder as a kind of storage of its own, whose writes fail when they are told to.
 
     Attributes:
-        plan: what becomes of the next writes: ``ok``, ``refused``, or ``cut`` short and refused.
-            After the plan all is well.
+        plan: what becomes of the next writes: ``ok``, ``refused``, ``cut`` short and refused, or
+            ``lost``: done, though it seems refused. After the plan all is well.
     """
 
     protocol = ("unreliable",)
@@ -23,7 +23,7 @@ class Unreliable(LocalFileSystem):  # type: ignore[misc]  # fsspec has no types
     def pipe_file(self, path: str, value: bytes, mode: str = "overwrite", **options: Any) -> None:
         fate = self.plan.pop(0) if self.plan else "ok"
         if fate != "refused":
-            super().pipe_file(path, value if fate == "ok" else value[: len(value) // 2], mode, **options)
+            super().pipe_file(path, value[: len(value) // 2] if fate == "cut" else value, mode, **options)
         if fate != "ok":
             raise OSError("the network is down")
 
