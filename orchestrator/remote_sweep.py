@@ -34,7 +34,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from recrl.orchestrator.errors import RecrlError, StorageError, SweepBusyError
+from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.remote_trial import ALIVE, RemoteTrial, Upload, patiently, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -75,6 +75,7 @@ class RemoteSweep:
         self.objects = root.below(name)
         self._mirrored: dict[Path, dict[str, list[str]]] = {}
         self._in_touch_at = time.monotonic()
+        self._token = ""  # of the launch that this is, if it is one
 
     @classmethod
     def of(cls, store: SweepStore) -> RemoteSweep | None:
@@ -227,6 +228,8 @@ class RemoteSweep:
     def settle(self, specs: Sequence[TrialSpec], store: SweepStore) -> None:
         """Say there what only this machine knows of trials: that their process died without a word.
 
+        Nothing is said once another launch has taken the sweep over: its attempts may be at work on them.
+
         Args:
             specs: the trials.
             store: the mirror, where that was said by ``TrialStore.set_status``; nobody works on them now.
@@ -234,6 +237,9 @@ class RemoteSweep:
         Raises:
             StorageError: the store cannot be read or written.
         """
+        holder = self._holder()
+        if _is_alive(holder) and holder.get("token") != self._token:
+            return
         for spec in specs:
             trial = store.trial(spec)
             record = trial.record()
@@ -248,7 +254,10 @@ class RemoteSweep:
             upload = Upload(remote, trial)
             writer = trial.begin(spec)
             writer.close(record.status, error=record.error)
-            upload.finish()
+            try:
+                upload.finish()
+            except LostLeaseError as error:
+                logger.warning("%s", error)
 
     @contextmanager
     def held(self, stop: threading.Event) -> Iterator[None]:
@@ -265,6 +274,7 @@ class RemoteSweep:
             "boot": _boot(),
         }
         self._take(own)
+        self._token = str(own["token"])
         self.objects.delete([STOP_REQUEST])
         over = threading.Event()
         thread = threading.Thread(target=self._hold, args=(own, stop, over), name="launch", daemon=True)

@@ -24,6 +24,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, parse_grid
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.remote_sweep import SILENT_SECONDS, RemoteSweep, StopObject
+from recrl.orchestrator.remote_trial import Upload
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore, TrialStore
 from recrl.orchestrator.sweep import SweepResult, launch, request_stop
@@ -307,6 +308,23 @@ def test_what_only_the_launch_knows_of_a_trial_is_seen_elsewhere(tmp_path: Path)
     record = there.store.trial(crashed).record()
     assert (record.status, record.error) == (TrialState.FAILED, "failures of its process: 4")
     assert there.store.trial(silent).record().status is TrialState.WAITING
+
+
+def test_a_launch_that_was_taken_over_leaves_the_trials_of_the_other_alone(tmp_path: Path) -> None:
+    here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
+    spec = grid().trials()[0]
+    trial = TrialStore(tmp_path / spec.folder_name)
+    upload = Upload(there.storage.trial(spec.folder_name), trial)
+    with there.storage.held(threading.Event()):
+        trial.begin(spec)
+        upload.push()
+        here.storage.pull(here.store)
+        here.store.trial(spec).set_status(TrialState.WAITING)
+        here.storage.settle([spec], here.store)
+        upload.push()
+    here.storage.settle([spec], here.store)
+    with pytest.raises(LostLeaseError):  # of a launch that is over
+        upload.push()
 
 
 def test_the_command_line_takes_the_address_once(
