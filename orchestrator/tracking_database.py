@@ -11,6 +11,7 @@ quarter of the time of Python's tuples. Other databases are read through SQLAlch
 from __future__ import annotations
 
 import gc
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -81,7 +82,17 @@ class Points:
 
 def unreadable(uri: str, error: Exception) -> TrackingError:
     """What is said where MLflow's store cannot be read."""
-    return TrackingError(f"MLflow at {uri} cannot be read: {str(error).splitlines()[0]}")
+    reason = next(iter(str(error).splitlines()), type(error).__name__)
+    return TrackingError(f"MLflow at {without_password(uri)} cannot be read: {reason}")
+
+
+def without_password(uri: str) -> str:
+    """The address as it may be shown.
+
+    >>> without_password("postgresql://me:secret@host/mlflow")
+    'postgresql://me:***@host/mlflow'
+    """
+    return re.sub(r"(://[^/:@]*):[^@]*@", r"\1:***@", uri)
 
 
 class Tables(Protocol):

@@ -31,7 +31,15 @@ from recrl.environments.cmdp import Floats
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.tracking import ENVIRONMENT, PHASES_TAG, PROGRESS_TAG, SPEC_TAG, is_server
-from recrl.orchestrator.tracking_database import Database, Ints, Points, ShownRun, points_of, unreadable
+from recrl.orchestrator.tracking_database import (
+    Database,
+    Ints,
+    Points,
+    ShownRun,
+    points_of,
+    unreadable,
+    without_password,
+)
 
 EXPERIMENTS = "recrl/"  # what the names of a sweep's experiment begin with
 RUNS_A_PAGE = 200
@@ -241,7 +249,7 @@ def find_sweep(uri: str, name: str | None) -> TrackedSweep:
     if name not in names:
         listed = f"it shows {', '.join(sorted(names))}" if names else "it shows none"
         which = f"no sweep {name!r}" if name else f"{len(names)} sweeps; say which one"
-        raise TrackingError(f"MLflow at {uri} shows {which}; {listed}")
+        raise TrackingError(f"MLflow at {without_password(uri)} shows {which}; {listed}")
     runs = source.runs(names[name])
     parents = [run for run in runs if run.tags.get("recrl.kind") == "sweep"]
     newest = max(parents, key=lambda run: run.start_time, default=None)

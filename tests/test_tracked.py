@@ -20,7 +20,14 @@ from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.store import SweepStore, write_json
 from recrl.orchestrator.tracking import sync, tracking_uri
-from recrl.orchestrator.tracking_database import Database, OtherTables, Points, ShownRun, SqliteTables
+from recrl.orchestrator.tracking_database import (
+    Database,
+    OtherTables,
+    Points,
+    ShownRun,
+    SqliteTables,
+    unreadable,
+)
 from recrl.orchestrator.tracking_reader import find_sweep
 from recrl.orchestrator.tracking_ui import UI, open_ui
 
@@ -188,6 +195,13 @@ def test_reading_waits_for_whoever_writes(sweep: SweepStore, tmp_path: Path) -> 
 def test_a_server_that_is_away_is_named() -> None:
     with pytest.raises(TrackingError, match=r"MLflow at http://127\.0\.0\.1:9 cannot be read: .*refused"):
         tracked.load("http://127.0.0.1:9")
+
+
+def test_a_databases_password_is_not_shown() -> None:
+    uri = "postgresql://me:hunter2@host/mlflow"
+    assert (
+        str(unreadable(uri, OSError())) == "MLflow at postgresql://me:***@host/mlflow cannot be read: OSError"
+    )
 
 
 def test_a_file_that_is_no_database_of_mlflows_is_named(tmp_path: Path) -> None:
