@@ -187,10 +187,9 @@ class RemoteTrial:
             return
         manifest = self._pull(trial, keys, checkpoints=checkpoints)
         record = manifest.record if manifest else TrialRecord()
-        newest = max(attempts)
-        if ALIVE in attempts[newest] and (
-            record.status is TrialState.RUNNING or _attempt_of(record) != newest
-        ):
+        newest, told = max(attempts), _attempt_of(record)  # the keys may be older than the manifest
+        works = newest > told or (newest == told and record.status is TrialState.RUNNING)
+        if ALIVE in attempts[newest] and works:
             record = _with_life(record, self.objects.read(f"{newest}/{ALIVE}"))
         if record.attempt == 0:
             return

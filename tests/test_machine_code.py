@@ -43,7 +43,7 @@ def test_a_compiled_function_steps_each_simulation_and_writes_to_its_record() ->
     assert np.array_equal(qpos[0], alone.qpos)
 
 
-def test_where_nothing_can_bekept_functions_are_compiled_all_the_same() -> None:
+def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same() -> None:
     def compiler(*, cache: bool = False) -> Callable[[Any], str]:
         if cache:
             raise RuntimeError("cannot cache function: no locator available")

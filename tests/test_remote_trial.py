@@ -214,6 +214,25 @@ def test_not_even_what_was_under_way_when_it_was_declared_dead(bucket: RemoteTri
     assert not [key for key in bucket.objects.keys_in() if key.startswith(("000001-", "000002-"))]
 
 
+def test_a_sign_of_life_of_an_attempt_before_the_manifests_is_passed_over(
+    bucket: RemoteTrial, tmp_path: Path
+) -> None:
+    first = Machine(bucket, tmp_path / "first")
+    first.work(1)
+    first.upload.follow()
+    keys = bucket.objects.keys_in()
+    [alive] = [key for key in keys if key.endswith("/alive.json")]
+    sign = bucket.objects.read(alive)
+    second = Machine(bucket, tmp_path / "second")
+    second.writer.close(TrialState.COMPLETE)
+    second.upload.finish()
+    assert sign is not None
+    bucket.objects.write(alive, sign)
+    trial = TrialStore(tmp_path / "mirror" / SPEC.folder_name)
+    bucket.mirror(trial, keys, checkpoints=True)
+    assert (trial.record().attempt, trial.record().status) == (2, TrialState.COMPLETE)
+
+
 def test_of_two_attempts_at_once_all_agree_on_one(bucket: RemoteTrial, tmp_path: Path) -> None:
     machines = [Machine(bucket, tmp_path / name) for name in ("one", "other")]
     assert [machine.trial.record().attempt for machine in machines] == [1, 1]
