@@ -358,7 +358,7 @@ class _Silence:
         if now < self._looked_at + look_seconds(self._seconds):
             return
         self._looked_at = now
-        if self._storage is not None and self._storage.is_out_of_touch:
+        if self._storage is not None and self._storage.is_out_of_touch(self._seconds):
             self._heard.clear()  # it is this machine that hears nothing
             return
         for trial in trials:

@@ -174,10 +174,13 @@ class RemoteSweep:
         with _alone(store):
             self.trial(spec.folder_name).mirror(store.trial(spec), checkpoints=False)
 
-    @property
-    def is_out_of_touch(self) -> bool:
-        """Whether the mirror is so old that the silence of a trial in it says nothing."""
-        return time.monotonic() - self._in_touch_at > 3.0 * PULL_SECONDS
+    def is_out_of_touch(self, silence_seconds: float) -> bool:
+        """Whether the mirror is so old that a silence of so many seconds in it says nothing.
+
+        A third of them: after that long an outage, nodes may pause as long before they speak again. One look
+        at a thousand running trials takes longer than the pause between two.
+        """
+        return time.monotonic() - self._in_touch_at > max(3.0 * PULL_SECONDS, silence_seconds / 3.0)
 
     @contextmanager
     def mirrored(

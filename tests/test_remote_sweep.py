@@ -274,6 +274,15 @@ def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: p
     assert here.storage.objects.keys_in() == []
 
 
+def test_a_mirror_is_too_old_to_judge_a_silence_by_a_third_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.remote_sweep.PULL_SECONDS", 0.0)
+    here = machine(tmp_path, "here")
+    assert here.storage.is_out_of_touch(0.0)
+    assert not here.storage.is_out_of_touch(300.0)
+
+
 def test_workers_hear_of_the_end_of_their_own_run_and_of_all_earlier_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
