@@ -67,7 +67,7 @@ CAPTIONS = {
 
 
 SKETCHED = re.compile(r"learning-curves_.*|curricula")
-UNFINISHED = "Drawn while the sweep runs: the other figures come at its end, or by recrl-sweep figures"
+UNFINISHED = "A sketch: the other figures come at the end of the launch, or by recrl-sweep figures"
 
 
 class NothingToDrawError(RecrlError):

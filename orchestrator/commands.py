@@ -76,7 +76,7 @@ def run_validate(arguments: argparse.Namespace, console: Console) -> ExitCode:
 
 
 def run_plan(arguments: argparse.Namespace, console: Console) -> ExitCode:
-    """Say what a launch would do; nothing is started or written."""
+    """Say what a launch would do; nothing is started, and nothing written but a mirror of what is kept."""
     grid, store = _grid_and_store(arguments)
     storage = _storage(store, arguments.storage)
     if storage is not None:

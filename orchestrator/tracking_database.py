@@ -185,7 +185,7 @@ class SqliteTables:
                 cursor.execute(f"PRAGMA busy_timeout = {PATIENCE}")  # a mirror may be writing
                 cursor.execute(query, tuple(parameters.values()))
                 return cursor.fetch_arrow_table()
-        except Error as error:
+        except (Error, OSError) as error:  # Arrow's own errors, while rows are fetched, are OSErrors
             raise unreadable(self._uri, error) from error
 
 

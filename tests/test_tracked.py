@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
@@ -195,6 +196,15 @@ def test_reading_waits_for_whoever_writes(sweep: SweepStore, tmp_path: Path) -> 
 def test_a_server_that_is_away_is_named() -> None:
     with pytest.raises(TrackingError, match=r"MLflow at http://127\.0\.0\.1:9 cannot be read: .*refused"):
         tracked.load("http://127.0.0.1:9")
+
+
+def test_what_goes_wrong_behind_the_first_rows_is_a_sentence(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "odd.db")) as connection, connection:
+        connection.execute("CREATE TABLE experiments (name, experiment_id, lifecycle_stage)")
+        rows = [(1, number, "active") for number in range(65_536)]  # a batch whose names seem to be numbers
+        connection.executemany("INSERT INTO experiments VALUES (?, ?, ?)", [*rows, ("a", 0, "active")])
+    with pytest.raises(TrackingError, match=r"odd\.db cannot be read: .*Type mismatch"):
+        Database(f"sqlite:///{tmp_path / 'odd.db'}").experiments()
 
 
 def test_a_databases_password_is_not_shown() -> None:
