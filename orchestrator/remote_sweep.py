@@ -278,15 +278,16 @@ class RemoteSweep:
         }
         self._take(own)
         self._token = str(own["token"])
-        self.objects.delete([STOP_REQUEST])
         over = threading.Event()
         thread = threading.Thread(target=self._hold, args=(own, stop, over), name="launch", daemon=True)
-        thread.start()
         try:
+            self.objects.delete([STOP_REQUEST])
+            thread.start()
             yield
         finally:
             over.set()
-            thread.join()
+            if thread.is_alive():
+                thread.join()
             try:
                 if self._holder().get("token") == own["token"]:
                     self.objects.delete([STOP_REQUEST, LAUNCH])
