@@ -326,8 +326,8 @@ class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):
     )
     temperature: NonNegative = Field(
         default=1.0,
-        description="lambda, standard deviations of the reward advantages that a nat of KL must be worth, so "
-        "that steps get shorter towards a saddle of the Lagrangian (ours; paper 0: all of one length).",
+        description="lambda, what a nat of KL must be worth in the surrogate, that is 1 + the multipliers "
+        "standard deviations of the reward advantages, so that steps end with the gain (ours; paper 0).",
     )
 
 

@@ -137,6 +137,9 @@ def _describe_model(one: Any, scene: Scene) -> None:
     one["timestep"], one["substeps"] = model.opt.timestep, SUBSTEPS
     one["robot"], one["is_car"] = scene.robot_body, scene.task.robot == "Car"
     one["root"][: model.ngeom] = model.body_rootid[model.geom_bodyid]
+    vases = len(scene.vase_qpos)  # one after the other, behind the robot
+    assert scene.vase_qpos == tuple(range(scene.robot_qpos, scene.robot_qpos + 7 * vases, 7))
+    assert scene.vase_qvel == tuple(range(scene.robot_qvel, scene.robot_qvel + 6 * vases, 6))
     one["vase_qpos"], one["vase_qvel"] = scene.robot_qpos, scene.robot_qvel
     one["box_qpos"] = scene.box_qpos
 

@@ -24,7 +24,7 @@ from rich.console import Console
 
 from recrl.environments.plugins import UnknownNameError
 from recrl.orchestrator import display
-from recrl.orchestrator.errors import RecrlError, StorageError, TrackingError
+from recrl.orchestrator.errors import RecrlError, StorageError, TrackingError, without_password
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid
@@ -573,8 +573,8 @@ def _say_mirrored(store: SweepStore, uri: str, arguments: argparse.Namespace, co
     if arguments.root != DEFAULT_ROOT:
         place += ["--root", str(arguments.root)]
     if arguments.tracking_uri:
-        place += ["--tracking-uri", arguments.tracking_uri]
-    where = uri if arguments.tracking_uri else _short(store.mlflow_database)
+        place += ["--tracking-uri", without_password(arguments.tracking_uri)]
+    where = without_password(uri) if arguments.tracking_uri else _short(store.mlflow_database)
     _say(console, f"MLflow     {where}")
     _say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
     report = last_report(store, uri)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 
 class RecrlError(Exception):
     """Anything that a user can understand and mend; its text is one clear sentence."""
@@ -41,3 +43,12 @@ class ClusterError(RecrlError):
 
 class TrackingError(RecrlError):
     """MLflow cannot be used in the way that was asked for; training does not depend on it."""
+
+
+def without_password(uri: str) -> str:
+    """The address as it may be shown.
+
+    >>> without_password("postgresql://me:secret@host/mlflow")
+    'postgresql://me:***@host/mlflow'
+    """
+    return re.sub(r"(://[^/:@]*):[^@]*@", r"\1:***@", uri)

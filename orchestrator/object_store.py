@@ -89,14 +89,15 @@ class ObjectStore:
             StorageError: the store does not answer, or refuses.
         """
         path = self._path(key)
-        try:
-            self._system.pipe_file(path, data, mode="create")
-        except FileExistsError:
-            return False
-        except Exception:  # no such writes, or worse: whatever it is, the plain way will say it
-            if self.read(key) is not None:
+        with self._speaking("cannot be written"):
+            try:
+                self._system.pipe_file(path, data, mode="create")
+            except FileExistsError:
                 return False
-            self.write(key, data)
+            except (NotImplementedError, TypeError, ValueError):  # the store has no such writes
+                if self.read(key) is not None:
+                    return False
+                self.write(key, data)
         return True
 
     def keys_in(self, folder: str = "") -> list[str]:

@@ -44,6 +44,7 @@ PULL_SECONDS = 10.0  # between two looks at the trials that run
 LONGEST_PAUSE_SECONDS = 60.0  # between two looks while the store is down
 LOOK_SECONDS = 5.0  # between two looks whether somebody asks to stop
 BEAT_SECONDS = 15.0  # between two signs of life of a launch
+EMPTY_SECONDS = 1.0  # after which what is being written is there
 SILENT_SECONDS = 90.0  # without one, after which its sweep is free
 STOP_QUESTION_SECONDS = 5.0  # between two questions of a worker whether to stop
 PULLS_AT_ONCE = 8
@@ -312,9 +313,12 @@ class RemoteSweep:
 
     def _take(self, own: dict[str, Any]) -> None:
         """Create ``launch.json``, in place of that of a dead launch if need be."""
-        if self.objects.create(LAUNCH, _beat(own)):
+        if self._is_created(own):
             return
         holder = self._holder()
+        if not holder:  # somebody is just about to write what it holds, or nobody ever will
+            time.sleep(EMPTY_SECONDS)
+            holder = self._holder()
         if holder.get("token") == own["token"]:
             return  # it was written, though the answer was lost
         if _is_alive(holder):
@@ -325,8 +329,13 @@ class RemoteSweep:
                 f"was killed, the sweep is free after {SILENT_SECONDS:.0f} seconds of silence)"
             )
         self.objects.delete([LAUNCH])
-        if not self.objects.create(LAUNCH, _beat(own)):
+        if not self._is_created(own):
             raise SweepBusyError(f"{self.objects.uri}: another process has begun to run this sweep just now")
+
+    def _is_created(self, own: dict[str, Any]) -> bool:
+        """Create ``launch.json`` and look whether it is ours: not every store can create exclusively."""
+        created = self.objects.create(LAUNCH, _beat(own))
+        return created and self._holder().get("token") == own["token"]
 
     def _hold(self, own: dict[str, Any], stop: threading.Event, over: threading.Event) -> None:
         """Go on saying that this launch lives, and listen."""

@@ -11,7 +11,6 @@ quarter of the time of Python's tuples. Other databases are read through SQLAlch
 from __future__ import annotations
 
 import gc
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from recrl.environments.cmdp import Floats
-from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.errors import TrackingError, without_password
 
 Ints = npt.NDArray[np.int64]
 
@@ -84,15 +83,6 @@ def unreadable(uri: str, error: Exception) -> TrackingError:
     """What is said where MLflow's store cannot be read."""
     reason = next(iter(str(error).splitlines()), type(error).__name__)
     return TrackingError(f"MLflow at {without_password(uri)} cannot be read: {reason}")
-
-
-def without_password(uri: str) -> str:
-    """The address as it may be shown.
-
-    >>> without_password("postgresql://me:secret@host/mlflow")
-    'postgresql://me:***@host/mlflow'
-    """
-    return re.sub(r"(://[^/:@]*):[^@]*@", r"\1:***@", uri)
 
 
 class Tables(Protocol):

@@ -28,7 +28,7 @@ from urllib.parse import unquote, urlparse
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.errors import TrackingError, without_password
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.tracking import ENVIRONMENT, PHASES_TAG, PROGRESS_TAG, SPEC_TAG, is_server
 from recrl.orchestrator.tracking_database import (
@@ -38,7 +38,6 @@ from recrl.orchestrator.tracking_database import (
     ShownRun,
     points_of,
     unreadable,
-    without_password,
 )
 
 EXPERIMENTS = "recrl/"  # what the names of a sweep's experiment begin with
