@@ -428,11 +428,18 @@ def test_only_one_creates_an_object(remote: RemoteTrial) -> None:
 
 
 def test_a_store_without_exclusive_writes_is_looked_at_first(bucket: RemoteTrial) -> None:
-    Unreliable.plan.append("refused")
+    Unreliable.plan.append("unsupported")
     assert bucket.objects.create("launch.json", b"first")
-    Unreliable.plan.append("refused")
+    Unreliable.plan.append("unsupported")
     assert not bucket.objects.create("launch.json", b"second")
     assert bucket.objects.read("launch.json") == b"first"
+
+
+def test_who_cannot_create_exclusively_for_once_does_not_write_all_the_same(bucket: RemoteTrial) -> None:
+    Unreliable.plan.append("refused")
+    with pytest.raises(StorageError, match=r"launch|cannot be written"):
+        bucket.objects.create("launch.json", b"first")
+    assert bucket.objects.read("launch.json") is None
 
 
 def test_names_are_those_right_below(remote: RemoteTrial) -> None:

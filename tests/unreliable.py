@@ -11,7 +11,8 @@ class Unreliable(LocalFileSystem):  # type: ignore[misc]  # fsspec has no types
 
     Attributes:
         plan: what becomes of the next writes: ``ok``, ``refused``, ``cut`` short and refused, or
-            ``lost``: done, though it seems refused. After the plan all is well.
+            ``lost``: done, though it seems refused, or ``unsupported`` by the store. After the plan all is
+            well.
     """
 
     protocol = ("unreliable",)
@@ -22,6 +23,8 @@ class Unreliable(LocalFileSystem):  # type: ignore[misc]  # fsspec has no types
 
     def pipe_file(self, path: str, value: bytes, mode: str = "overwrite", **options: Any) -> None:
         fate = self.plan.pop(0) if self.plan else "ok"
+        if fate == "unsupported":
+            raise NotImplementedError(mode)
         if fate != "refused":
             super().pipe_file(path, value[: len(value) // 2] if fate == "cut" else value, mode, **options)
         if fate != "ok":
