@@ -149,17 +149,17 @@ class MultiplierConfig(StudentConfig):
     multiplier_initial: NonNegative = Field(
         default=0.0, description="First value of every multiplier (ours; paper 1)."
     )
+    multiplier_unit: Literal["limit", "cost"] = Field(
+        default="limit",
+        description="What the steps and gains of PID and projected ascent are per: max(d, 1) of episode "
+        "cost, so that limits of 1 and of 25 are answered alike (ours), or 1 of episode cost (paper).",
+    )
     multiplier_step: Positive = Field(
-        default=0.02,
-        description="Step of the dual ascent, Adam's learning rate, or K_I; per unit of episode cost (ours; "
-        "paper 0.05).",
+        default=0.1,
+        description="Step of the dual ascent, K_I, or Adam's learning rate, without unit (ours; paper 0.05).",
     )
-    multiplier_proportional: NonNegative = Field(
-        default=0.2, description="K_P of the PID rule, per unit of episode cost (ours)."
-    )
-    multiplier_derivative: NonNegative = Field(
-        default=0.0, description="K_D of the PID rule, per unit of episode cost (ours)."
-    )
+    multiplier_proportional: NonNegative = Field(default=1.0, description="K_P of the PID rule (ours).")
+    multiplier_derivative: NonNegative = Field(default=0.0, description="K_D of the PID rule (ours).")
     multiplier_maximum: Positive = Field(
         default=1000.0,
         description="The largest multiplier that projected ascent and PID give (ours; anti-wind-up).",
@@ -247,6 +247,7 @@ class FOCOPSConfig(AscentConfig, MultiplierConfig):
         "target_kl": 0.02,
         "stop_kl_factor": 1.0,
         "multiplier_rule": "projected",
+        "multiplier_unit": "cost",
         "multiplier_step": 0.01,
         "multiplier_maximum": 2.0,
         "temperature": 1.5,
@@ -334,6 +335,17 @@ class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):
 class CRPOConfig(TrustRegionConfig):
     """Settings of ``crpo``, constraint-rectified policy optimisation."""
 
+    paper: ClassVar[Mapping[str, Any]] = {
+        **STARTER_AGENTS_SETTING,
+        **STARTER_AGENTS_TRUST_REGION,
+        "steps": "full",
+    }
+
+    steps: Literal["predicted", "full"] = Field(
+        default="predicted",
+        description="How long steps are: predicted to end at the limit (ours), or as the trust region allows, "
+        "to and fro (Xu et al. 2021).",
+    )
     tolerance: NonNegative = Field(
         default=0.0,
         description="eta, the violation that is borne, in episode cost (ours; Xu et al. 2021: 0.5).",

@@ -34,14 +34,14 @@ def start_projected_ascent(num_costs: int, initial: float) -> dict[str, Floats]:
 
 
 def projected_ascent(
-    state: MultiplierState, gaps: Floats, *, step_size: float, maximum: float
+    state: MultiplierState, gaps: Floats, *, step_size: float | Floats, maximum: float
 ) -> dict[str, Floats]:
     """Projected dual ascent: lambda <- clip(lambda + step_size (J - d), 0, maximum).
 
     Args:
         state: ``multipliers``.
         gaps: J - d, [k]; -inf where there is no constraint.
-        step_size: multiplier units per unit of episode cost, above 0.
+        step_size: multiplier units per unit of episode cost, above 0, one number or [k].
         maximum: the largest multiplier, possibly infinite.
     """
     return {"multipliers": np.clip(state["multipliers"] + step_size * gaps, 0.0, maximum)}
@@ -109,9 +109,9 @@ def pid(
     gaps: Floats,
     limits: Floats,
     *,
-    proportional: float,
-    integral: float,
-    derivative: float,
+    proportional: float | Floats,
+    integral: float | Floats,
+    derivative: float | Floats,
     maximum: float,
 ) -> dict[str, Floats]:
     """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
@@ -132,7 +132,8 @@ def pid(
         state: ``multipliers``, ``integral``, ``last_gap``.
         gaps: J - d, [k]; -inf where there is no constraint.
         limits: d, [k], each at least 0, possibly infinite.
-        proportional: K_P, at least 0, multiplier units per unit of episode cost; so are the next two.
+        proportional: K_P, at least 0, multiplier units per unit of episode cost, one number or [k]; so are
+            the next two.
         integral: K_I.
         derivative: K_D.
         maximum: the largest multiplier, possibly infinite.
@@ -140,13 +141,22 @@ def pid(
     active = np.isfinite(gaps)
     gap = np.where(active, gaps, 0.0)
     rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
-    summed = np.clip(state["integral"] + integral * np.minimum(gap, np.maximum(limits, 1.0)), 0.0, maximum)
+    summed = np.clip(state["integral"] + integral * np.minimum(gap, limit_units(limits)), 0.0, maximum)
     output = np.clip(proportional * gap + summed + derivative * rise, 0.0, maximum)
     return {
         "multipliers": np.where(active, output, 0.0),
         "integral": np.where(active, summed, state["integral"]),
         "last_gap": np.where(active, gap, np.nan),
     }
+
+
+def limit_units(limits: Floats) -> Floats:
+    """What a gap is large or small against: max(d, 1) of each limit, [k]; 1 where there is no limit.
+
+    A gap of 1 is nothing under a limit of 25 and everything under one of 1. Limits below 1 count as 1, so
+    that a limit of 0 has a unit, too.
+    """
+    return np.where(np.isfinite(limits), np.maximum(limits, 1.0), 1.0)
 
 
 def restarted(

@@ -7,7 +7,6 @@ infinite has the multiplier 0. Letters: k costs.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from recrl.agents.experience import Constraints
 from recrl.agents.lagrange import (
     STARTS,
     MultiplierState,
+    limit_units,
     pid,
     projected_ascent,
     restarted,
@@ -68,15 +68,20 @@ class Multipliers:
 
 def multiplier_step(config: MultiplierConfig) -> MultiplierRule:
     """The multiplier rule that the options name, as a function of state, gaps and limits."""
-    step, maximum = config.multiplier_step, config.multiplier_maximum
-    if config.multiplier_rule == "projected":
-        return lambda state, gaps, _: projected_ascent(state, gaps, step_size=step, maximum=maximum)
+    units = limit_units if config.multiplier_unit == "limit" else np.ones_like
+    maximum = config.multiplier_maximum
     if config.multiplier_rule == "softplus-adam":
-        return lambda state, gaps, _: softplus_adam(state, gaps, learning_rate=step)
-    return partial(
-        pid,
-        proportional=config.multiplier_proportional,
-        integral=step,
-        derivative=config.multiplier_derivative,
+        return lambda state, gaps, _: softplus_adam(state, gaps, learning_rate=config.multiplier_step)
+    if config.multiplier_rule == "projected":
+        return lambda state, gaps, limits: projected_ascent(
+            state, gaps, step_size=config.multiplier_step / units(limits), maximum=maximum
+        )
+    return lambda state, gaps, limits: pid(
+        state,
+        gaps,
+        limits,
+        proportional=config.multiplier_proportional / units(limits),
+        integral=config.multiplier_step / units(limits),
+        derivative=config.multiplier_derivative / units(limits),
         maximum=maximum,
     )

@@ -8,6 +8,7 @@ import torch
 
 from recrl.agents.lagrange import (
     STARTS,
+    limit_units,
     pid,
     projected_ascent,
     restarted,
@@ -81,6 +82,10 @@ def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates
     assert state["integral"].tolist() == pytest.approx([1.5, 1.1, 1.1])
     state = pid(state, -limits, limits, **gains)
     assert state["integral"].tolist() == pytest.approx([1.0, 0.9, 1.1])
+
+
+def test_a_gap_is_measured_against_its_limit_and_limits_below_1_count_as_1() -> None:
+    assert limit_units(np.array([25.0, 1.0, 0.0, 0.5, math.inf])).tolist() == [25.0, 1.0, 1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("rule", STARTS)

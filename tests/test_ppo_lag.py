@@ -46,7 +46,19 @@ def improved(gap: float, limit: float = 5.0, **options: object) -> dict[str, flo
 
 
 def test_the_multiplier_answers_before_the_policy_moves() -> None:
-    assert improved(10.0, multiplier_rule="projected", multiplier_step=0.02)["multiplier_0"] == 0.2
+    options = {"multiplier_rule": "projected", "multiplier_step": 0.02, "multiplier_unit": "cost"}
+    assert improved(10.0, **options)["multiplier_0"] == 0.2
+
+
+@pytest.mark.parametrize("rule", ["projected", "pid"])
+def test_equal_shares_of_the_limit_have_equal_multipliers_whatever_the_limit(rule: str) -> None:
+    options = {"multiplier_rule": rule, "multiplier_step": 0.02, "multiplier_proportional": 0.0}
+    found = [improved(share * 2.0, share, **options)["multiplier_0"] for share in (1.0, 5.0, 25.0)]
+    assert found == pytest.approx([0.04] * 3 if rule == "projected" else [0.02] * 3)  # PID sums up one limit
+
+
+def test_a_pid_answers_half_a_limit_too_much_with_half_its_gain() -> None:
+    assert improved(2.5, 5.0)["multiplier_0"] == pytest.approx(0.5 * 1.0 + 0.5 * 0.1)
 
 
 def test_without_a_finished_episode_the_multiplier_stays() -> None:
@@ -62,7 +74,10 @@ def test_no_limit_is_no_penalty(rule: str) -> None:
 
 
 def test_a_reset_begins_the_multiplier_anew_only_when_the_limit_changes() -> None:
-    options = {"multiplier_reset": True, "multiplier_rule": "projected", "multiplier_step": 0.1}
+    options = {
+        **{"multiplier_rule": "projected", "multiplier_unit": "cost", "multiplier_step": 0.1},
+        "multiplier_reset": True,
+    }
     policy, rule, batch = fresh(**options)
     found = [
         improvement(rule, policy, batch, measured(1.0, limit))["multiplier_0"]
