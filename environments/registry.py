@@ -104,6 +104,14 @@ TASKS: dict[str, Task] = {
         drawn="recrl.environments.river_minigrid:draw_river_grid",
         sample_options={"horizon": 20, "generate": {"seed": 3}},
     ),
+    "rivergrid-generated": Task(
+        summary="RiverGrid on an instance like the paper's two that a seed draws.",
+        options="recrl.environments.river_grid:RiverGridGeneratedOptions",
+        make="recrl.environments.river_grid:make_river_grid",
+        optimum="recrl.environments.river_grid:river_grid_optimum",
+        drawn="recrl.environments.river_minigrid:draw_river_grid",
+        sample_options={"horizon": 20, "map_seed": 0},
+    ),
     "gymnasium": Task(
         summary="Any environment that is registered with Gymnasium, by its id.",
         options="recrl.environments.vectorize:GymnasiumOptions",

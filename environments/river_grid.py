@@ -29,6 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError, Integers
 from recrl.environments.plugins import load_attribute
+from recrl.environments.river_instances import InstanceSettings, draw_instance
 from recrl.environments.river_maps import (
     GOAL,
     MAPS,
@@ -52,7 +53,7 @@ CostName = Literal["river", "turns", "mud"]
 
 
 class RiverGridOptions(BaseModel):
-    """Settings of ``rivergrid-1a`` and ``rivergrid-1b``."""
+    """Settings of ``rivergrid-1a`` and ``rivergrid-1b``, and of the other maps besides their own."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -106,6 +107,19 @@ class RiverGridMapOptions(RiverGridOptions):
     def river_map(self) -> RiverMap:
         """The map that the settings stand for."""
         return generate_map(self.generate) if self.generate is not None else parse_map(self.map or "")
+
+
+class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):
+    """Settings of ``rivergrid-generated``: an instance like the paper's two, drawn at random."""
+
+    @model_validator(mode="after")
+    def _can_be_drawn(self) -> Self:
+        self.river_map()
+        return self
+
+    def river_map(self) -> RiverMap:
+        """The map that the settings stand for."""
+        return draw_instance(self)
 
 
 def state_index(river_map: RiverMap, x: int, y: int, heading: int) -> int:
@@ -189,8 +203,8 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
 
 def task_map(name: str, options: RiverGridOptions) -> RiverMap:
-    """The map of ``rivergrid`` (from its options), ``rivergrid-1a`` or ``rivergrid-1b``."""
-    if isinstance(options, RiverGridMapOptions):
+    """The map of ``rivergrid`` and ``rivergrid-generated`` (from their options) or of one of the paper's."""
+    if isinstance(options, RiverGridMapOptions | RiverGridGeneratedOptions):
         return options.river_map()
     return parse_map(MAPS[name.removeprefix("rivergrid-")])
 

@@ -229,7 +229,7 @@ def generate_map(settings: MapGenerator) -> RiverMap:
         start, goal = generator.choice(tiles.size, size=2, replace=False)
         tiles.flat[start] = STARTS[int(generator.integers(len(STARTS)))]
         tiles.flat[goal] = GOAL
-        river_map = _enclosed("".join(row) for row in tiles)
+        river_map = enclosed("".join(row) for row in tiles)
         dry = river_map.shortest_route(through=DRY)
         if settings.dry_route is not None and settings.dry_route != (dry is not None):
             continue
@@ -242,7 +242,8 @@ def generate_map(settings: MapGenerator) -> RiverMap:
     )
 
 
-def _enclosed(rows: Iterable[str]) -> RiverMap:
+def enclosed(rows: Iterable[str]) -> RiverMap:
+    """The map of the inner tiles with a border of wall around them; nothing is checked."""
     inner = [WALL + row + WALL for row in rows]
     border = WALL * len(inner[0])
     return RiverMap((border, *inner, border))
