@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from recrl.environments import river_instances
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import make_vector, optimal_return, task_options
-from recrl.environments.river_grid import RiverGridVectorEnv
+from recrl.environments.river_grid import RiverGridGeneratedOptions, RiverGridVectorEnv, task_map
 from recrl.environments.river_instances import (
     LEAST_DETOUR,
     InstanceSettings,
@@ -25,7 +26,7 @@ from recrl.environments.river_instances import (
 )
 from recrl.environments.river_limits import grid_entry, main
 from recrl.environments.river_maps import DRY, MAPS, RIVER, MapError, parse_map
-from recrl.orchestrator.grid import parse_grid
+from recrl.orchestrator.grid import parse_grid, read_grid
 
 PAPERS = {name: parse_map(drawing) for name, drawing in MAPS.items()}
 
@@ -196,3 +197,13 @@ def test_the_command_names_a_wrong_option(
     with pytest.raises(SystemExit):
         main()
     assert "widht" in capsys.readouterr().err
+
+
+def test_the_committed_grid_has_the_first_six_maps_under_the_limits_of_the_rule() -> None:
+    path = Path(__file__).parents[1] / "results" / "rivergrid" / "generated.yaml"
+    grid = read_grid(path)
+    assert [cell.task.options["map_seed"] for cell in grid.tasks] == list(range(6))
+    for cell in grid.tasks:
+        river_map = task_map(cell.task.name, RiverGridGeneratedOptions.model_validate(cell.task.options))
+        assert cell.deploy_limits == CostLimits((suggested_limit(river_map),))
+        assert "\n".join(f"  # {row}" for row in river_map.rows) in grid.text.decode()
