@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 
 from recrl.analysis import panels, styles
 from recrl.analysis.cumulative import policies_of, training_runs
-from recrl.analysis.frames import KEY, Sweep
+from recrl.analysis.frames import KEY, Sweep, occurring
 from recrl.analysis.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.environments.cmdp import Floats
 
@@ -51,7 +51,7 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
     if not len(trials):
         return None
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
-    tasks = [task for task in trials["task"].cat.categories if (trials["task"] == task).any()]
+    tasks = occurring(trials["task"])
     methods = [method for method in look if (trials["method"] == method).any()]
     runs = training_runs(sweep)
     with styles.context():

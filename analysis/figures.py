@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from recrl.analysis import panels, styles
-from recrl.analysis.frames import Sweep
+from recrl.analysis.frames import Sweep, occurring
 from recrl.analysis.metrics import MEAN, Averaging, mean_curve, step_grid
 from recrl.analysis.styles import TEXT_WIDTH, MethodStyle
 from recrl.environments.cmdp import Floats
@@ -39,7 +39,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) ->
     """
     trials = sweep.trials[sweep.trials["agent"] == agent]
     updates = sweep.updates[sweep.updates["agent"] == agent]
-    tasks = [task for task in updates["task"].cat.categories if (updates["task"] == task).any()]
+    tasks = occurring(updates["task"])
     num_costs = int(trials["num_costs"].max())
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     columns = 2 + 2 * num_costs
@@ -82,7 +82,7 @@ def curricula(sweep: Sweep) -> Figure:
     """
     updates = sweep.updates
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
-    agents = [agent for agent in updates["agent"].cat.categories if (updates["agent"] == agent).any()]
+    agents = occurring(updates["agent"])
     cells = [
         (task, i)
         for task in updates["task"].cat.categories

@@ -276,6 +276,11 @@ def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
     return [label for label in first if label in present] + sorted(present - set(first))
 
 
+def occurring(labels: pd.Series) -> list[str]:
+    """The categories of a column of labels that occur in it, in their order."""
+    return ordered(labels.unique(), list(labels.cat.categories))
+
+
 @dataclass(frozen=True, eq=False)
 class _Keys:
     """KEY of every trial.

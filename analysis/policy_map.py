@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from recrl.analysis import styles
-from recrl.analysis.frames import Sweep, ordered
+from recrl.analysis.frames import Sweep, occurring
 from recrl.analysis.styles import TEXT_WIDTH
 from recrl.analysis.tables import number
 from recrl.environments.cmdp import Floats
@@ -72,9 +72,9 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
         The figure, or None if there is no such trial.
     """
     policies = sweep.policies[sweep.policies["agent"] == agent]
-    tasks = [task for task in policies["task"].cat.categories if (policies["task"] == task).any()]
+    tasks = occurring(policies["task"])
     maps = {task: found for task in tasks if (found := river_task(sweep, task)) is not None}
-    methods = ordered(list(policies["method"]), list(policies["method"].cat.categories))
+    methods = occurring(policies["method"])
     if not maps:
         return None
     columns = min(MAX_COLUMNS, len(methods))

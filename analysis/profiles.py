@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from recrl.analysis import metrics, styles
-from recrl.analysis.frames import Sweep
+from recrl.analysis.frames import Sweep, occurring
 from recrl.analysis.intervals import performance_profile
 from recrl.analysis.metrics import Measure
 from recrl.analysis.styles import OPTIMUM_COLOUR, TEXT_WIDTH
@@ -35,8 +35,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     if not len(rows):
         return None
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
-    tasks = [task for task in rows["task"].cat.categories if (rows["task"] == task).any()]
-    agents = [agent for agent in rows["agent"].cat.categories if (rows["agent"] == agent).any()]
+    tasks, agents = occurring(rows["task"]), occurring(rows["agent"])
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 1.5 * len(tasks) + 0.6), layout="constrained")
         grid = figure.subplots(len(tasks), len(agents), squeeze=False, sharex="row", sharey=True)
