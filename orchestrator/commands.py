@@ -140,7 +140,7 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     kept = f", a mirror of {storage.objects.uri}" if storage else ""
     _say(console, f"Results    {_short(store.folder)}{kept}")
     if uri:
-        _say_mirrored(store, uri, arguments, console)
+        _say_mirrored(result, store, uri, arguments, console)
     return _say_result(result, store, arguments, console)
 
 
@@ -403,6 +403,8 @@ def run_sync(arguments: argparse.Namespace, console: Console) -> ExitCode:
             f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}"
         )
     _say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
+    if report.remark:
+        _say(console, f"without a snapshot ({report.remark}): reading it from a server takes longer")
     return ExitCode.OK
 
 
@@ -567,7 +569,9 @@ def _say_failures(now: SweepProgress, store: SweepStore, console: Console) -> No
         _say(console, line)
 
 
-def _say_mirrored(store: SweepStore, uri: str, arguments: argparse.Namespace, console: Console) -> None:
+def _say_mirrored(
+    result: SweepResult, store: SweepStore, uri: str, arguments: argparse.Namespace, console: Console
+) -> None:
     """Say where MLflow's view is and how to open it, and whether it is up to date."""
     place = [store.name]
     if arguments.root != DEFAULT_ROOT:
@@ -577,8 +581,8 @@ def _say_mirrored(store: SweepStore, uri: str, arguments: argparse.Namespace, co
     where = without_password(uri) if arguments.tracking_uri else _short(store.mlflow_database)
     _say(console, f"MLflow     {where}")
     _say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
-    report = last_report(store, uri)
-    if report is None or not report.is_up_to_date:
+    if not result.mirrored:  # a mirror that came to no end leaves the report of an earlier pass
+        report = last_report(store, uri)
         problem = f" ({report.problem})" if report and report.problem else ""
         again = shlex.join(["recrl-sweep", "sync", *place])
         _say(console, f"           MLflow is not up to date{problem}; nothing is lost: {again}")

@@ -47,7 +47,7 @@ from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.phase_totals import phase_totals
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.status import Standing, standing_of
-from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
+from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_atomically, write_json
 from recrl.orchestrator.tracking_points import (
     VIEW,
     VIEW_STATE,
@@ -62,6 +62,14 @@ from recrl.orchestrator.tracking_points import (
     rows_after,
     thinned,
 )
+from recrl.orchestrator.tracking_snapshot import (
+    SNAPSHOT_FOLDER,
+    SNAPSHOT_NAMES,
+    SNAPSHOT_TAG,
+    Announcement,
+    ShownTrial,
+    Snapshot,
+)
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
@@ -69,6 +77,8 @@ if TYPE_CHECKING:
 BATCH = 1_000  # metrics of a request; MLflow takes no more, and a row costs least in a full one
 MAX_ERROR = 5_000  # characters of a failed trial's error
 MAX_TAG = 8_000  # characters; MLflow cuts longer ones off, and half a JSON value is none
+SNAPSHOT_SECONDS = 600.0  # between two snapshots of a sweep that runs, at least
+SNAPSHOT_REST = 100.0  # times as long as the last one took
 SPEC_TAG, PROGRESS_TAG, PHASES_TAG = "recrl.spec", "recrl.progress", "recrl.phases"
 PROGRESS = ("update", "env_steps", "cpu_seconds", "start_limits")  # of the TrialRecord
 
@@ -94,6 +104,7 @@ class SyncReport:
         behind: those of them that MLflow does not show as their files are.
         points: points sent.
         problem: one line saying what kept MLflow from being up to date, or empty.
+        remark: one line saying why reading a server will take longer than it could, or empty.
         finished_at: when the pass ended, seconds since 1970.
         experiment_id: the sweep's experiment, or empty if MLflow could not be reached.
         parent_run_id: the sweep's run, likewise.
@@ -103,6 +114,7 @@ class SyncReport:
     behind: int = 0
     points: int = 0
     problem: str = ""
+    remark: str = ""
     finished_at: float = 0.0
     experiment_id: str = ""
     parent_run_id: str = ""
@@ -181,7 +193,7 @@ class Tracker:
             rebuild: delete what MLflow has of the sweep first.
         """
         trials = [trial for trial in self.store.trials() if trial.record().attempt]
-        sent, done, problems = 0, 0, []
+        sent, done, problems, remark = 0, 0, list[str](), ""
         with _alone(self.store, self.uri):
             view, self._view = self._view, None  # to be asked anew should anything go wrong
             try:
@@ -195,6 +207,7 @@ class Tracker:
                             raise
                         problems.append(f"{trial.folder.name}: {_one_line(error)}")
                 view.show_sweep(live=live)
+                remark = view.show_snapshot(live=live)
             except Exception as error:
                 problems.append(_one_line(error))
             report = SyncReport(
@@ -202,6 +215,7 @@ class Tracker:
                 behind=len(trials) - done,
                 points=sent,
                 problem=problems[0] if problems else "",
+                remark=remark,
                 finished_at=time.time(),
                 experiment_id=view.experiment_id if view else "",
                 parent_run_id=view.parent_run_id if view else "",
@@ -259,6 +273,7 @@ class _View:
         if parent is None or parent.run_id != found:
             parent = Position(found or self._create_parent())
         self._parent = parent
+        self._snapshot_due = time.monotonic() + SNAPSHOT_SECONDS
         if found is None:  # somebody may have deleted the parent alone
             for run_id in self._runs.values():
                 self.client.set_tag(run_id, "mlflow.parentRunId", parent.run_id)
@@ -335,10 +350,70 @@ class _View:
             self._set_status(position.run_id, status, last or time.time())
         position = self._send_files(position, [self.store.grid_path, self.store.info_path])
         position = self._send_files(position, sorted(self.store.figures_folder.glob("*")), "figures")
-        position = replace(position, shown={"note": text, "status": status})
+        position = replace(position, shown={**position.shown, "note": text, "status": status})
         if position != self._parent:
             write_json(self._parent_path, asdict(position))
             self._parent = position
+
+    def show_snapshot(self, *, live: bool) -> str:
+        """Bring the sweep's snapshot up to date; while a launch is there, only now and then.
+
+        Returns:
+            Why it could not be, or nothing; MLflow shows everything without it.
+        """
+        if live and time.monotonic() < self._snapshot_due:
+            return ""
+        shown = self._shown_trials()
+        known = [(it.run_id, it.attempt, it.committed, it.complete) for it in shown]
+        mark = hashlib.sha256(repr(known).encode()).hexdigest()
+        last = self._parent.shown.get("snapshot", {})
+        if not shown or last.get("mark") == mark:
+            return ""
+        began = time.monotonic()
+        name = next(name for name in SNAPSHOT_NAMES if name != last.get("name"))
+        try:
+            self._send_snapshot(name, Snapshot.take(shown))
+        except Exception as error:  # a server may take small files only
+            return _one_line(error)
+        finally:
+            now = time.monotonic()
+            self._snapshot_due = now + max(SNAPSHOT_SECONDS, SNAPSHOT_REST * (now - began))
+        sent = {"mark": mark, "name": name}
+        self._parent = replace(self._parent, shown={**self._parent.shown, "snapshot": sent})
+        write_json(self._parent_path, asdict(self._parent))
+        return ""
+
+    def _shown_trials(self) -> list[ShownTrial]:
+        """The trials as MLflow shows them, but for those whose files were cut back since."""
+        found = []
+        for trial in self.store.trials():
+            position = self._positions.get(trial.folder.name)
+            if position and position.shown:
+                committed = int(position.shown["committed"])
+                if position.fits(_head(trial.updates_path, committed)):
+                    attempt, complete = position.shown["attempt"], position.shown["status"] == "FINISHED"
+                    found.append(ShownTrial(trial, position.run_id, attempt, committed, complete))
+        return found
+
+    def _send_snapshot(self, name: str, snapshot: Snapshot) -> None:
+        """Add the file, and only then say that it is there."""
+        from mlflow.entities import RunTag  # noqa: PLC0415
+
+        data = snapshot.pack()
+        path = self._folder / name
+        write_atomically(path, data)
+        try:
+            self.client.log_artifact(self.parent_run_id, str(path), SNAPSHOT_FOLDER)
+        finally:
+            path.unlink()
+        announced = Announcement(
+            name=name,
+            size=len(data),
+            sha256=hashlib.sha256(data).hexdigest(),
+            trials=len(snapshot.runs),
+            updates=sum(run.update for run in snapshot.runs),
+        )
+        self.client.log_batch(self.parent_run_id, tags=[RunTag(SNAPSHOT_TAG, announced.model_dump_json())])
 
     def _summaries(self) -> list[Summary]:
         summaries = []

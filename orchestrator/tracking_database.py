@@ -78,6 +78,16 @@ class Points:
     values: Floats
     milliseconds: Ints
 
+    def followed_by(self, others: Points) -> Points:
+        """These points and others; a run may be named by both."""
+        return Points(
+            [*self.run_ids, *others.run_ids],
+            np.concatenate([self.runs, others.runs + len(self.run_ids)]),
+            np.concatenate([self.steps, others.steps]),
+            np.concatenate([self.values, others.values]),
+            np.concatenate([self.milliseconds, others.milliseconds]),
+        )
+
 
 def unreadable(uri: str, error: Exception) -> TrackingError:
     """What is said where MLflow's store cannot be read."""

@@ -3,11 +3,12 @@
 The other half of ``tracking``. Three kinds of queries, whatever the number of runs:
 
 * Runs, with their tags: a database is asked by one SELECT a table, a server by ``search_runs``, page by page.
-* Histories of metrics: a database is asked by one SELECT a metric (``tracking_database``). A server, whose
-  client has no request for many runs at once (mlflow#7365), by ``metrics/get-history-bulk-interval`` of its
+* Histories of metrics: a database is asked by one SELECT a metric (``tracking_database``). A server hands
+  over the sweep's snapshot (``tracking_snapshot``) and is asked only for what is newer. Its client has no
+  request for many runs at once (mlflow#7365), so that goes by ``metrics/get-history-bulk-interval`` of its
   REST API, for some runs and one metric a request; beyond 2,500 points of a run it thins them evenly.
-* Small files: artifacts, from this machine's disk where the store says they are there, else a few requests
-  at once.
+* Small files: from the snapshot as well; else artifacts, from this machine's disk where the store says they
+  are there, or a few requests at once.
 
 How long a thousand runs of 300 updates take: tests/benchmarks/bench_tracking_reader.py.
 """
@@ -15,6 +16,7 @@ How long a thousand runs of 300 updates take: tests/benchmarks/bench_tracking_re
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 from collections.abc import Sequence
@@ -39,6 +41,12 @@ from recrl.orchestrator.tracking_database import (
     points_of,
     unreadable,
 )
+from recrl.orchestrator.tracking_snapshot import (
+    SNAPSHOT_FOLDER,
+    SNAPSHOT_TAG,
+    Announcement,
+    Snapshot,
+)
 
 EXPERIMENTS = "recrl/"  # what the names of a sweep's experiment begin with
 RUNS_A_PAGE = 200
@@ -47,6 +55,10 @@ POINTS_A_RUN = 2_500  # a server takes no more
 REQUESTS_AT_ONCE = 4
 PATIENCE = 60  # seconds that a server may think about histories
 HISTORY = "/api/2.0/mlflow/metrics/get-history-bulk-interval"
+LAST_STEP = 2**31 - 1  # that a server takes for the end of an interval
+MAX_FILE_BYTES = 512 * 2**20  # of an artifact
+
+logger = logging.getLogger("recrl.sweep")
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,7 @@ class TrackedTrial:
     Attributes:
         spec: what it is.
         status: where it stands.
+        attempt: how often it was started.
         error: why it failed, or empty.
         progress: the fields of the TrialRecord that are shown, by name.
         phases: of a complete trial, ``phase_totals``; else empty.
@@ -66,6 +79,7 @@ class TrackedTrial:
 
     spec: TrialSpec
     status: TrialState
+    attempt: int
     error: str
     progress: dict[str, Any]
     phases: list[dict[str, Any]]
@@ -124,6 +138,7 @@ class TrackedSweep:
     experiment_id: str
     parent_artifacts: str
     _source: Source = field(repr=False)
+    _snapshot: Snapshot = field(repr=False)
 
     def histories(self, metrics: Sequence[str]) -> dict[str, History]:
         """Every point of each of some metrics."""
@@ -140,7 +155,11 @@ class TrackedSweep:
 
     def files(self, name: str) -> list[bytes | None]:
         """A file of every trial, None where it has none."""
-        return _files([trial.artifacts for trial in self.trials], name, self.uri)
+        found = _held_files(self._snapshot, self.trials, name)
+        rest = [trial for trial in self.trials if trial.run_id not in found]
+        asked = _files([trial.artifacts for trial in rest], name, self.uri)
+        found |= dict(zip((trial.run_id for trial in rest), asked, strict=True))
+        return [found[trial.run_id] for trial in self.trials]
 
     def own_file(self, name: str) -> bytes | None:
         """A file of the sweep's own run, None where it has none."""
@@ -167,6 +186,25 @@ class Server:
             raise unreadable(uri, error) from error
         self._uri = uri
         self._runs: list[ShownRun] = []
+        self._snapshot = Snapshot()
+        self._next_steps: dict[str, int] = {}
+        self._last_step = 0
+
+    def recall(self, snapshot: Snapshot, trials: Sequence[TrackedTrial]) -> None:
+        """Take from a snapshot, from now on, what it holds; the server is asked for what is newer.
+
+        Args:
+            snapshot: of the sweep, taken at whatever time.
+            trials: the sweep's trials as the server shows them now.
+        """
+        held = {run.run_id: run.update for run in snapshot.runs}
+        self._snapshot = snapshot
+        for trial in trials:
+            if trial.run_id in held:
+                is_new = int(trial.progress.get("update", 0)) > held[trial.run_id]
+                next_step = held[trial.run_id] * trial.spec.steps_per_update + 1
+                self._next_steps[trial.run_id] = next_step if is_new else LAST_STEP
+        self._last_step = max(it.spec.num_updates * it.spec.steps_per_update for it in trials)
 
     def experiments(self) -> dict[str, str]:
         """The identity of every experiment, by its name."""
@@ -202,22 +240,29 @@ class Server:
 
     def points(self, metric: str, experiment_id: str) -> Points:
         """Every point of a metric in the experiment whose runs were asked for last."""
-        runs = [run.run_id for run in self._runs if metric in run.metrics]
+        held = self._snapshot.points(metric)
+        after = self._next_steps if metric in self._snapshot.metrics else {}
+        runs = [it.run_id for it in self._runs if metric in it.metrics and after.get(it.run_id) != LAST_STEP]
         rows: list[tuple[str, int, float, int]] = []
         for start in range(0, len(runs), RUNS_A_REQUEST):
-            points = self._ask(metric, runs[start : start + RUNS_A_REQUEST])
+            asked = runs[start : start + RUNS_A_REQUEST]
+            points = self._ask(metric, asked, first_step=min(after.get(run, 0) for run in asked))
             rows += [
-                (it["run_id"], it.get("step", 0), it.get("value", 0.0), it["timestamp"]) for it in points
+                (it["run_id"], step, it.get("value", 0.0), it["timestamp"])
+                for it in points
+                if (step := int(it.get("step", 0))) >= after.get(it["run_id"], 0)
             ]
-        return points_of(rows)
+        return held.followed_by(points_of(rows))
 
-    def _ask(self, metric: str, runs: Sequence[str]) -> list[dict[str, Any]]:
+    def _ask(self, metric: str, runs: Sequence[str], *, first_step: int) -> list[dict[str, Any]]:
         from mlflow.exceptions import MlflowException  # noqa: PLC0415
         from mlflow.utils.rest_utils import http_request_safe  # noqa: PLC0415
 
         store: Any = self._client._tracking_client.store  # it knows the credentials
         asked = [("run_ids", run) for run in runs]
         asked += [("metric_key", metric), ("max_results", str(POINTS_A_RUN))]
+        if 0 < first_step <= self._last_step < LAST_STEP:
+            asked += [("start_step", str(first_step)), ("end_step", str(self._last_step))]
         request: Any = http_request_safe  # not annotated
         try:
             reply = request(store.get_host_creds(), HISTORY, "GET", params=asked, timeout=PATIENCE)
@@ -257,15 +302,50 @@ def find_sweep(uri: str, name: str | None) -> TrackedSweep:
         runs = [run for run in runs if run.tags.get("recrl.sweep_id") == identity]
     members = [run for run in runs if run.tags.get("recrl.kind") == "trial"]
     told = [run for run in members if run.tags.get(SPEC_TAG)]
+    trials = sorted(map(_trial, told), key=lambda trial: trial.spec.folder_name)
+    snapshot = Snapshot()
+    if isinstance(source, Server) and newest is not None and trials:
+        snapshot = _snapshot(newest, uri)
+        source.recall(snapshot, trials)
     return TrackedSweep(
         name=name,
-        trials=tuple(sorted(map(_trial, told), key=lambda trial: trial.spec.folder_name)),
+        trials=tuple(trials),
         untold=len(members) - len(told),
         uri=uri,
         experiment_id=names[name],
         parent_artifacts=newest.artifacts if newest is not None else "",
         _source=source,
+        _snapshot=snapshot,
     )
+
+
+def _snapshot(parent: ShownRun, uri: str) -> Snapshot:
+    """The sweep's snapshot; an empty one, and a warning, where the one that is announced cannot be used."""
+    from mlflow.exceptions import MlflowException  # noqa: PLC0415
+
+    tag = parent.tags.get(SNAPSHOT_TAG)
+    if not tag:
+        return Snapshot()
+    try:
+        announced = Announcement.of(tag)
+        (data,) = _files([parent.artifacts], f"{SNAPSHOT_FOLDER}/{announced.name}", uri)
+        return Snapshot.unpack(announced.check(data))
+    except (TrackingError, MlflowException, OSError) as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        logger.warning("%s; MLflow is asked run by run instead, which takes longer", reason)
+        return Snapshot()
+
+
+def _held_files(snapshot: Snapshot, trials: Sequence[TrackedTrial], name: str) -> dict[str, bytes | None]:
+    """A file by run, of those runs that have the same files as when the snapshot was taken."""
+    texts = dict(zip(snapshot.runs, snapshot.files.get(name, ()), strict=False))
+    held = {(run.run_id, run.attempt, run.complete): text for run, text in texts.items()}
+    now = {it.run_id: (it.run_id, it.attempt, it.status is TrialState.COMPLETE) for it in trials}
+    return {
+        run_id: text.encode() if (text := held[state]) is not None else None
+        for run_id, state in now.items()
+        if state in held
+    }
 
 
 def _trial(run: ShownRun) -> TrackedTrial:
@@ -273,6 +353,7 @@ def _trial(run: ShownRun) -> TrackedTrial:
     return TrackedTrial(
         spec=TrialSpec.from_json(json.loads(tags[SPEC_TAG])),
         status=TrialState(tags.get("recrl.status", TrialState.WAITING)),
+        attempt=int(tags.get("recrl.attempt", "0")),
         error=tags.get("recrl.error", ""),
         progress=json.loads(tags.get(PROGRESS_TAG) or "{}"),
         phases=[_with_nan(row) for row in json.loads(tags.get(PHASES_TAG) or "[]")],
@@ -302,8 +383,12 @@ def _fetch(place: str, name: str, uri: str, folder: Path) -> bytes | None:
     )
 
     repository: Any = get_artifact_repository(place, uri)
-    if name not in {file.path for file in repository.list_artifacts()}:
+    below = name.rpartition("/")[0] or None
+    sizes = {file.path: file.file_size or 0 for file in repository.list_artifacts(below)}
+    if name not in sizes:
         return None
+    if sizes[name] > MAX_FILE_BYTES:
+        raise TrackingError(f"{name} has {sizes[name]} bytes, at most {MAX_FILE_BYTES} are read")
     folder.mkdir()
     return _read(Path(repository.download_artifacts(name, str(folder))))
 

@@ -57,6 +57,7 @@ LAYERS = (
         "status",
         "tracking_database",
         "tracking_points",
+        "tracking_snapshot",
         "plan",
         "trial",
         "videos",

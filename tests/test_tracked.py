@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import re
 import shutil
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlparse
 
 import numpy as np
 import pandas as pd
@@ -30,11 +35,20 @@ from recrl.orchestrator.tracking_database import (
     unreadable,
 )
 from recrl.orchestrator.tracking_reader import find_sweep
+from recrl.orchestrator.tracking_snapshot import (
+    SNAPSHOT_FOLDER,
+    SNAPSHOT_TAG,
+    Announcement,
+    ShownTrial,
+    Snapshot,
+)
 from recrl.orchestrator.tracking_ui import UI, open_ui
 
 # MLflow 3.17 maps its tables in a way that SQLAlchemy 2.1 calls deprecated; not ours to mend.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")
 
+PORT = 5713
+SERVER = f"http://127.0.0.1:{PORT}"
 NOT_IN_MLFLOW = ["collect_seconds", "update_seconds"]
 
 
@@ -130,15 +144,131 @@ def test_a_long_trial_is_thinned_but_true(
 
 @pytest.fixture(scope="module")
 def server(sweep: SweepStore) -> Iterator[UI]:
-    ui = open_ui(sweep, tracking_uri(sweep, None), port=5713)
+    ui = open_ui(sweep, tracking_uri(sweep, None), port=PORT)
     yield ui
     ui.close()
 
 
 def test_a_server_says_what_its_database_says(server: UI, from_mlflow: Sweep) -> None:
-    found = tracked.load("http://127.0.0.1:5713", "made-up")
+    same(tracked.load(SERVER, "made-up"), from_mlflow)
+
+
+def test_a_server_without_a_snapshot_says_the_same(
+    server: UI, from_mlflow: Sweep, sweep: SweepStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415
+
+    client = MlflowClient(SERVER)
+    (parent,) = client.search_runs(
+        [find_sweep(SERVER, "made-up").experiment_id], "tags.`recrl.kind` = 'sweep'"
+    )
+    client.delete_tag(parent.info.run_id, SNAPSHOT_TAG)
+    try:
+        same(tracked.load(SERVER, "made-up"), from_mlflow)
+    finally:
+        client.set_tag(parent.info.run_id, SNAPSHOT_TAG, parent.data.tags[SNAPSHOT_TAG])
+    assert caplog.messages == []
+
+
+@contextmanager
+def announced(store: SweepStore, data: bytes, **changes: Any) -> Iterator[None]:
+    """Let MLflow announce other bytes as the sweep's snapshot for a while."""
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415
+
+    client = MlflowClient(tracking_uri(store, None))
+    experiment_id = find_sweep(tracking_uri(store, None), store.name).experiment_id
+    (parent,) = client.search_runs([experiment_id], "tags.`recrl.kind` = 'sweep'")
+    before = Announcement.of(parent.data.tags[SNAPSHOT_TAG])
+    path = Path(urlparse(parent.info.artifact_uri).path) / SNAPSHOT_FOLDER / before.name
+    kept = path.read_bytes()
+    digest = hashlib.sha256(data).hexdigest()
+    told = before.model_copy(update={"size": len(data), "sha256": digest, **changes})
+    path.write_bytes(data)
+    client.set_tag(parent.info.run_id, SNAPSHOT_TAG, told.model_dump_json())
+    try:
+        yield
+    finally:
+        path.write_bytes(kept)
+        client.set_tag(parent.info.run_id, SNAPSHOT_TAG, before.model_dump_json())
+
+
+def taken(store: SweepStore, *, share: float) -> bytes:
+    """The snapshot of a time when each trial had done only so much of its updates, in [0, 1]."""
+    runs = {trial.spec.trial_id: trial for trial in find_sweep(tracking_uri(store, None), store.name).trials}
+    shown = []
+    for trial in store.trials():
+        lines = trial.updates_path.read_bytes().splitlines(keepends=True)
+        committed = sum(map(len, lines[: 1 + round(share * (len(lines) - 1))]))
+        run = runs[trial.spec.trial_id]
+        complete = share == 1.0
+        shown.append(ShownTrial(trial, run.run_id, run.attempt, committed, complete=complete))
+    return Snapshot.take(shown).pack()
+
+
+def same(found: Sweep, expected: Sweep) -> None:
     for name in ("trials", "phases", "updates", "evaluations", "events", "policies"):
-        pd.testing.assert_frame_equal(getattr(found, name), getattr(from_mlflow, name), check_exact=True)
+        pd.testing.assert_frame_equal(getattr(found, name), getattr(expected, name), check_exact=True)
+    assert (found.facts, found.grid, found.notes) == (expected.facts, expected.grid, expected.notes)
+
+
+def test_a_fresh_snapshot_spares_every_question(
+    server: UI, from_mlflow: Sweep, sweep: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.tracking_reader.HISTORY", "/api/2.0/mlflow/not-there")
+    same(tracked.load(SERVER, "made-up"), from_mlflow)
+    with announced(sweep, taken(sweep, share=0.9)), pytest.raises(TrackingError, match="cannot be read"):
+        tracked.load(SERVER, "made-up")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_what_a_stale_snapshot_lacks_is_asked_for(
+    server: UI, from_mlflow: Sweep, sweep: SweepStore, share: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    with announced(sweep, taken(sweep, share=share)):
+        same(tracked.load(SERVER, "made-up"), from_mlflow)
+    assert caplog.messages == []
+
+
+def test_a_snapshot_of_runs_that_are_gone_is_no_use_and_no_harm(
+    server: UI, from_mlflow: Sweep, sweep: SweepStore
+) -> None:
+    whole = Snapshot.unpack(taken(sweep, share=1.0))
+    runs = tuple(run.model_copy(update={"run_id": f"gone-{run.run_id}"}) for run in whole.runs)
+    with announced(sweep, dataclasses.replace(whole, runs=runs).pack()):
+        same(tracked.load(SERVER, "made-up"), from_mlflow)
+
+
+@pytest.fixture
+def warnings(caplog: pytest.LogCaptureFixture, from_mlflow: Sweep) -> Callable[[], list[str]]:
+    """A function that reads from the server, finds the same as ever, and returns what it was warned of."""
+
+    def read() -> list[str]:
+        same(tracked.load(SERVER, "made-up"), from_mlflow)
+        return caplog.messages
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("kept", "changes", "sentence"),
+    [
+        (-9, {"size": 10_000}, r"snapshot/[ab]\.zip must have 10000 bytes, got \d+"),
+        (None, {"sha256": "0"}, r"snapshot/[ab]\.zip is not what was announced: its SHA-256 differs"),
+        (-9, {}, "the snapshot cannot be read: File is not a zip file"),
+    ],
+    ids=["a part of it", "another one", "a part announced as whole"],
+)
+@pytest.mark.usefixtures("server")
+def test_a_damaged_snapshot_costs_a_warning_and_time(
+    sweep: SweepStore,
+    kept: int | None,
+    changes: dict[str, Any],
+    sentence: str,
+    warnings: Callable[[], list[str]],
+) -> None:
+    with announced(sweep, taken(sweep, share=1.0)[:kept], **changes):
+        (warning,) = warnings()
+    assert re.fullmatch(f"{sentence}; MLflow is asked run by run instead, which takes longer", warning)
 
 
 def test_every_way_to_a_database_gives_the_same(sweep: SweepStore) -> None:

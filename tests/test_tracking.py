@@ -32,6 +32,7 @@ from recrl.orchestrator.tracking_points import (
     rows_after,
     thinned,
 )
+from recrl.orchestrator.tracking_snapshot import SNAPSHOT_TAG
 from recrl.orchestrator.tracking_ui import open_ui, ui_command, ui_url
 
 if TYPE_CHECKING:
@@ -266,7 +267,7 @@ def history(store: SweepStore, run: Run) -> dict[str, list[tuple[int, int, float
 
 def everything(store: SweepStore) -> dict[str, Any]:
     """All that MLflow shows of a sweep, but for names that MLflow made up itself."""
-    made_up = {"mlflow.parentRunId"}
+    made_up = {"mlflow.parentRunId", SNAPSHOT_TAG}  # the snapshot has the runs' identities in it
     return {
         name: {
             "points": history(store, run),
