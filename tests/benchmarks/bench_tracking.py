@@ -75,13 +75,14 @@ def write_sweep(root: Path, *, trials: int, updates: int) -> SweepStore:
 
 def mirror_seconds(store: SweepStore, uri: str) -> tuple[float, float]:
     """CPU and wall seconds of the mirror's whole process over the sweep as it is."""
-    cpu, wall = _children_cpu(), time.monotonic()
+    cpu, wall = children_cpu(), time.monotonic()
     if not start_mirror(store, uri, interval_seconds=3600.0).stop(timeout=3600.0):
         sys.exit(f"the mirror did not come to its end: {last_report(store, uri)}")
-    return _children_cpu() - cpu, time.monotonic() - wall
+    return children_cpu() - cpu, time.monotonic() - wall
 
 
-def _children_cpu() -> float:
+def children_cpu() -> float:
+    """CPU seconds of the processes that this one started and waited for."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 

@@ -1,16 +1,22 @@
-"""How long figures wait for MLflow: a large sweep from a sqlite store to frames.
+"""How long figures wait for MLflow: a large sweep from a sqlite store, or from a server, to frames.
 
     OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_tracking_reader [--trials 1000] [--updates 300]
+    ... --server [--without-snapshot]
 
 A store is made with as many runs and points as are asked for, with the columns, artifacts and sums of real
 trials and random numbers; rows are written to MLflow's tables directly, as MLflow itself would take half an
 hour. Then ``recrl.analysis.tracked.load`` reads it in a fresh process. The aim: 1,000 runs x 300 points, each
 with all metrics of a trial, within 10 seconds on two cores, imports counted.
+
+With ``--server`` an MLflow server of one process stands before that store, hands out the artifacts as well,
+and has the sweep's snapshot as the mirror would have left it; ``--without-snapshot``, it has none, as one
+that an older version wrote to. Two numbers more: the CPU seconds of the server, and the size of the snapshot.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sqlite3
 import subprocess
@@ -24,12 +30,25 @@ from urllib.parse import urlparse
 import numpy as np
 import pandas as pd
 
-from recrl.environments.cmdp import Phase
+from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.tracking import PHASES_TAG, PROGRESS_TAG, SPEC_TAG, sync, tracking_uri
-from tests.benchmarks.bench_tracking import STEPS_PER_UPDATE, STUDENT_METRICS, write_sweep
+from recrl.orchestrator.tracking_snapshot import (
+    AT_THE_END,
+    BEFORE_METRICS,
+    FROM_THE_BEGINNING,
+    SNAPSHOT_FOLDER,
+    SNAPSHOT_TAG,
+    Announcement,
+    HeldRun,
+    Snapshot,
+)
+from recrl.orchestrator.tracking_ui import open_ui
+from tests.benchmarks.bench_tracking import STEPS_PER_UPDATE, STUDENT_METRICS, children_cpu, write_sweep
 
+PORT = 5714
+NUM_METRICS = len(STUDENT_METRICS) + 9  # three in each phase, and three of the curriculum and the speed
 INSERT = "INSERT INTO {table} (key, value, timestamp, run_uuid, step, is_nan) VALUES (?, ?, ?, ?, ?, 0)"
 SUMS = {
     **{"episodes": 4560, "steps": 912_000, "episode_return": 1.5, "episode_return_std": 0.25},
@@ -46,8 +65,12 @@ print(len(sweep.trials), len(sweep.updates), imported - start, end - imported, t
 """
 
 
-def fill(store: SweepStore, *, trials: int, updates: int) -> int:
-    """Put runs into the store's database that are like its only one; returns the number of points."""
+def fill(store: SweepStore, *, trials: int, updates: int) -> tuple[int, Snapshot]:
+    """Put runs into the store's database that are like its only one.
+
+    Returns:
+        The number of points, and the snapshot of the new runs.
+    """
     database = sqlite3.connect(store.mlflow_database)
     (model,) = (trial.spec for trial in store.trials())
     template = database.execute(
@@ -58,7 +81,9 @@ def fill(store: SweepStore, *, trials: int, updates: int) -> int:
     others = ", ".join(name for name in columns if name != "run_uuid")
     tags = database.execute("SELECT key, value FROM tags WHERE run_uuid = ?", template[:1]).fetchall()
     generator, points = np.random.default_rng(0), 0
-    _write_artifacts(Path(urlparse(template[1]).path), generator)  # all runs have the same
+    folder = Path(urlparse(template[1]).path)
+    _write_artifacts(folder, generator)  # all runs have the same
+    held, metrics, tables = [], list[str](), []
     phases = json.dumps([{"phase": phase.value, **SUMS} for phase in Phase])
     database.execute("UPDATE tags SET value = ? WHERE key = ?", (phases, PHASES_TAG))
     for seed in range(1, trials):
@@ -68,22 +93,63 @@ def fill(store: SweepStore, *, trials: int, updates: int) -> int:
             f"INSERT INTO runs (run_uuid, {others}) SELECT ?, {others} FROM runs WHERE run_uuid = ?",
             (run, template[0]),
         )
-        told = {
-            SPEC_TAG: json.dumps(spec.to_json()),
-            PROGRESS_TAG: json.dumps({"env_steps": updates * STEPS_PER_UPDATE, "cpu_seconds": 1.0}),
-        }
+        progress = {"update": updates, "env_steps": updates * STEPS_PER_UPDATE, "cpu_seconds": 1.0}
+        told = {SPEC_TAG: json.dumps(spec.to_json()), PROGRESS_TAG: json.dumps(progress)}
         database.executemany(
             "INSERT INTO tags (key, value, run_uuid) VALUES (?, ?, ?)",
             [(key, told.get(key, value), run) for key, value in tags],
         )
         rows = list(_points(run, spec, updates, generator))
         points += len(rows)
+        held.append(HeldRun(run_id=run, attempt=1, update=updates, complete=True))
+        tables.append(_table(seed - 1, rows, metrics))
         database.executemany(INSERT.format(table="metrics"), rows)
         latest = {row[0]: row for row in rows}
         database.executemany(INSERT.format(table="latest_metrics"), latest.values())
     database.commit()
     database.close()
-    return points
+    texts = {name: [(folder / name).read_text()] * len(held) for name in (*FROM_THE_BEGINNING, *AT_THE_END)}
+    return points, Snapshot(tuple(held), tuple(metrics), np.concatenate(tables), texts)
+
+
+def _table(position: int, rows: Sequence[tuple[str, float, int, str, int]], metrics: list[str]) -> Floats:
+    """The points of a run as a snapshot has them; ``metrics`` grows by those that are new."""
+    metrics += [key for key in dict.fromkeys(row[0] for row in rows) if key not in metrics]
+    steps = {step: index for index, step in enumerate(dict.fromkeys(row[4] for row in rows))}
+    table = np.full((len(steps), BEFORE_METRICS + NUM_METRICS), np.nan)
+    for key, value, milliseconds, _, step in rows:
+        table[steps[step], :BEFORE_METRICS] = position, step, milliseconds
+        table[steps[step], BEFORE_METRICS + metrics.index(key)] = value
+    return table
+
+
+def behind_a_server(store: SweepStore, snapshot: Snapshot | None) -> int:
+    """Leave the store as if all had been sent to a server; returns the bytes of the snapshot."""
+    database = sqlite3.connect(store.mlflow_database)
+    (run_id,) = database.execute(
+        "SELECT run_uuid FROM tags WHERE key = 'recrl.kind' AND value = 'sweep'"
+    ).fetchone()
+    database.execute("DELETE FROM tags WHERE key = ?", (SNAPSHOT_TAG,))
+    data = b""
+    if snapshot is not None:
+        data = snapshot.pack()
+        folder = store.mlflow_artifacts / run_id / "artifacts" / SNAPSHOT_FOLDER
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "a.zip").write_bytes(data)
+        told = Announcement(
+            name="a.zip",
+            size=len(data),
+            sha256=hashlib.sha256(data).hexdigest(),
+            trials=len(snapshot.runs),
+            updates=sum(run.update for run in snapshot.runs),
+        )
+        tag = (SNAPSHOT_TAG, told.model_dump_json(), run_id)
+        database.execute("INSERT INTO tags (key, value, run_uuid) VALUES (?, ?, ?)", tag)
+    place = (store.mlflow_artifacts.as_uri(), "mlflow-artifacts:")
+    database.execute("UPDATE runs SET artifact_uri = replace(artifact_uri, ?, ?)", place)
+    database.commit()
+    database.close()
+    return len(data)
 
 
 def _write_artifacts(folder: Path, generator: np.random.Generator) -> None:
@@ -118,26 +184,43 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--trials", type=int, default=1000)
     parser.add_argument("--updates", type=int, default=300)
+    parser.add_argument("--server", action="store_true", help="read through an MLflow server")
+    parser.add_argument("--without-snapshot", action="store_true", help="which has no snapshot of the sweep")
     arguments = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
         store = write_sweep(Path(folder), trials=1, updates=arguments.updates)
         uri = tracking_uri(store, None)
         assert sync(store, uri).is_up_to_date
         start = time.monotonic()
-        points = fill(store, trials=arguments.trials, updates=arguments.updates)
+        points, snapshot = fill(store, trials=arguments.trials, updates=arguments.updates)
         print(f"{points:,} points made in {time.monotonic() - start:.0f} s")
-        print(f"{store.mlflow_database.stat().st_size / 2**20:,.0f} MiB")
-        for which in ("first", "second"):
-            start = time.monotonic()
-            done = subprocess.run(
-                [sys.executable, "-c", READ, uri], check=True, capture_output=True, text=True
-            )
-            trials, rows, imports, loading, cpu = map(float, done.stdout.split())
-            wall = time.monotonic() - start
-            print(
-                f"{which}: {trials:.0f} trials, {rows:.0f} updates: {wall:.1f} s in all, imports "
-                f"{imports:.1f}, frames {loading:.1f}, CPU {cpu:.1f}"
-            )
+        print(f"{store.mlflow_database.stat().st_size / 2**20:,.0f} MiB", flush=True)
+        if not arguments.server:
+            read(uri)
+            return
+        size = behind_a_server(store, None if arguments.without_snapshot else snapshot)
+        print(f"snapshot: {size / 2**20:.1f} MiB", flush=True)
+        ui = open_ui(store, uri, port=PORT)
+        try:
+            read(f"http://127.0.0.1:{PORT}")
+        finally:
+            before = children_cpu()
+            ui.close()
+            print(f"the server: {children_cpu() - before:.1f} CPU s, its start counted")
+
+
+def read(uri: str) -> None:
+    """Read the sweep twice, each time in a fresh process."""
+    for which in ("first", "second"):
+        start = time.monotonic()
+        done = subprocess.run([sys.executable, "-c", READ, uri], check=True, capture_output=True, text=True)
+        trials, rows, imports, loading, cpu = map(float, done.stdout.split())
+        wall = time.monotonic() - start
+        print(
+            f"{which}: {trials:.0f} trials, {rows:.0f} updates: {wall:.1f} s in all, imports "
+            f"{imports:.1f}, frames {loading:.1f}, CPU {cpu:.1f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
