@@ -146,6 +146,10 @@ class ActorCritic:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
         return self._policy.sample(observations, generator)
 
+    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """What ``act`` inverts at B observations [B, n], float64 [B, A]; for Discrete actions only."""
+        return self._policy.cumulative_masses(observations)
+
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         return self._policy.mode(observations)

@@ -66,6 +66,23 @@ class DiscretePolicy(Protocol):
         ...
 
 
+@runtime_checkable
+class InvertedPolicy(Policy, Protocol):
+    """A policy that draws one of A actions by inversion and shows its masses; agents may have it.
+
+    With it, experience of a finite CMDP is collected from a table of the policy, not observation by
+    observation, and is the same.
+    """
+
+    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """At each of B observations [B, n] the actions' probabilities summed up, in any unit, float64 [B, A].
+
+        ``act`` draws B numbers u by ``generator.random(B)`` and takes the first action a whose cumulative
+        mass exceeds u times the whole.
+        """
+        ...
+
+
 class Agent(Policy, Protocol):
     """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
 

@@ -105,11 +105,21 @@ class StochasticPolicy:
             spread = np.exp(self._acting_log_std)
             outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
             return outputs
-        cumulative = np.exp(outputs - outputs.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
+        cumulative = _cumulative(outputs)
         thresholds = generator.random(len(outputs)) * cumulative[:, -1]
         # A threshold may round up to the whole mass, so the last action is what is left.
         actions: npt.NDArray[np.int64] = (cumulative[:, :-1] <= thresholds[:, None]).sum(axis=1)
         return actions
+
+    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """What ``sample`` inverts: cumulative masses, not normalised, of B observations, float64 [B, A].
+
+        Raises:
+            ValueError: actions are continuous.
+        """
+        if not self._is_categorical:
+            raise ValueError("continuous actions have densities, not probabilities")
+        return _cumulative(self.outputs(observations))
 
     def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
@@ -197,6 +207,12 @@ class StochasticPolicy:
             "randomness_before": mean_before,
             "randomness_after": mean_after,
         }
+
+
+def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:
+    """The softmax of logits [B, A], but for its normalisation, summed up over the actions."""
+    masses: Floats = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
+    return masses
 
 
 @dataclass(frozen=True, eq=False)
