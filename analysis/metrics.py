@@ -7,6 +7,9 @@ the one a user would take away.
 Feasible means cost_i <= d_d,i for every i, of the sample means, without tolerance. ``feasible_within_se``
 allows one standard error over the trial's episodes. At a cost of exactly d_d in expectation the first is a
 coin's toss, which is why both are reported.
+
+Where J*(d_d) is known, ``optimal`` says whether a trial has found it: within OPTIMAL_GAP of the return at
+costs within d_d + OPTIMAL_EXCESS.
 """
 
 from __future__ import annotations
@@ -36,6 +39,8 @@ from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.spec import TrialState
 
 BAND_REPLICATIONS = 500  # a band has a hundred intervals
+OPTIMAL_GAP = 0.2  # of the return to J*(d_d)
+OPTIMAL_EXCESS = 0.05  # of each mean cost over d_d
 BAND_ENDS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 
 
@@ -64,7 +69,8 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     Returns:
         KEY, measure, episodes, episode_return, episode_return_se, cost_i, cost_i_se (standard errors over
         the trial's episodes), deploy_limit_i, optimal_return, gap (J*(d_d) minus the return; only an
-        honest score where the trial is feasible), feasible, feasible_within_se.
+        honest score where the trial is feasible), feasible, feasible_within_se, optimal (False where J* is
+        not known).
     """
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
     measured = pd.concat([_deployment(sweep, costs), _frozen(sweep, costs)], ignore_index=True)
@@ -72,12 +78,42 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     limits = [f"deploy_limit_{i}" for i in range(sweep.num_costs)]
     rows = measured.merge(complete[[*KEY, *limits, "optimal_return"]], on=list(KEY))
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
-    rows["feasible"] = _within(rows, sweep.num_costs, tolerance=0.0)
-    rows["feasible_within_se"] = _within(rows, sweep.num_costs, tolerance=1.0)
+    rows["feasible"] = within_limits(rows)
+    rows["feasible_within_se"] = within_limits(rows, standard_errors=1.0)
+    rows["optimal"] = optimal(rows)
     order = {measure.value: position for position, measure in enumerate(Measure)}
     by_measure = rows["measure"].map(order).rename("_order")
     rows = rows.assign(_order=by_measure).sort_values([*KEY, "_order"], kind="stable", ignore_index=True)
     return rows.drop(columns="_order")
+
+
+def within_limits(
+    rows: pd.DataFrame, *, standard_errors: float = 0.0, excess: float = 0.0
+) -> pd.Series[bool]:
+    """Whether every mean cost is at most its limit plus a tolerance; costs that a task lacks are.
+
+    Args:
+        rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se if it is asked for.
+        standard_errors: the tolerance, in standard errors of the mean (0 where they are not known).
+        excess: more of it, in episode cost.
+    """
+    within = pd.Series(True, index=rows.index)
+    for limit in (str(name) for name in rows if str(name).startswith("deploy_limit_")):
+        cost = limit.removeprefix("deploy_limit_")
+        bounds = rows[limit] + excess
+        if standard_errors:
+            bounds = bounds + standard_errors * rows[f"cost_{cost}_se"].fillna(0.0)
+        within &= (rows[f"cost_{cost}"] <= bounds) | rows[limit].isna()
+    return within
+
+
+def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
+    """Whether a gap to J*(d_d) is known and small and the costs are within d_d; the module says how far.
+
+    Args:
+        rows: gap, and what ``within_limits`` takes.
+    """
+    return (rows["gap"] <= OPTIMAL_GAP) & within_limits(rows, excess=OPTIMAL_EXCESS)
 
 
 def training_totals(sweep: Sweep) -> pd.DataFrame:
@@ -109,7 +145,8 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     Returns:
         GROUP, measure, seeds, then mean and standard error (``_se``) of episode_return, cost_i and gap,
         deploy_limit_i, optimal_return, feasible_seeds, feasible_share with Wilson's 95% interval
-        (feasible_low, feasible_high), and feasible_within_se_seeds.
+        (feasible_low, feasible_high), feasible_within_se_seeds, and optimal_seeds with Wilson's interval of
+        their share (optimal_low, optimal_high).
     """
     names = [str(name) for name in rows]
     averaged = [name for name in names if name in ("episode_return", "gap") or _is_cost(name)]
@@ -121,13 +158,18 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
         for name in averaged:
             line[name], line[f"{name}_se"] = mean_and_standard_error(chosen[name].to_numpy(np.float64))
         line |= {name: chosen[name].iloc[0] for name in constant}
-        share = wilson_interval(int(chosen["feasible"].sum()), len(chosen))
+        share, best = (
+            wilson_interval(int(chosen[name].sum()), len(chosen)) for name in ("feasible", "optimal")
+        )
         line |= {
             "feasible_seeds": int(chosen["feasible"].sum()),
             "feasible_share": share.estimate,
             "feasible_low": share.low,
             "feasible_high": share.high,
             "feasible_within_se_seeds": int(chosen["feasible_within_se"].sum()),
+            "optimal_seeds": int(chosen["optimal"].sum()),
+            "optimal_low": best.low,
+            "optimal_high": best.high,
         }
         lines.append(line)
     return pd.DataFrame(lines)
@@ -384,12 +426,3 @@ def _frozen(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
         statistics = grouped[name].agg(["mean", "sem"]).reset_index()
         rows[name], rows[f"{name}_se"] = statistics["mean"], statistics["sem"]
     return rows
-
-
-def _within(rows: pd.DataFrame, num_costs: int, *, tolerance: float) -> pd.Series[bool]:
-    """Whether every cost is at most its limit plus ``tolerance`` standard errors; costs a task lacks are."""
-    within = pd.Series(True, index=rows.index)
-    for i in range(num_costs):
-        slack = tolerance * rows[f"cost_{i}_se"].fillna(0.0) if tolerance else 0.0
-        within &= (rows[f"cost_{i}"] <= rows[f"deploy_limit_{i}"] + slack) | rows[f"deploy_limit_{i}"].isna()
-    return within

@@ -45,6 +45,9 @@ def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
         low, high = round(100 * row["feasible_low"]), round(100 * row["feasible_high"])
         line["cost ≤ limit"] = f"{row['feasible_seeds']} of {seeds} ({low}–{high}%)"
         line["within one s.e."] = f"{row['feasible_within_se_seeds']} of {seeds}"
+        low, high = round(100 * row["optimal_low"]), round(100 * row["optimal_high"])
+        found = f"{row['optimal_seeds']} of {seeds} ({low}–{high}%)"
+        line["at the optimum"] = DASH if math.isnan(row["optimal_return"]) else found
         lines.append(line)
     return pd.DataFrame(lines)
 

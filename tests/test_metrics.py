@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from recrl.analysis import frames, metrics
+from recrl.analysis import frames, metrics, tables
 from recrl.analysis.frames import Sweep
 from recrl.analysis.intervals import interquartile_mean, stratified_bootstrap
 from recrl.orchestrator.store import SweepStore
@@ -49,6 +49,24 @@ def test_feasible_is_strict_and_within_one_standard_error_is_named_apart(finishe
     phases.loc[deployed, "cost_0"] = 5.0
     rows = metrics.outcomes(dataclasses.replace(finished, phases=phases))
     assert rows.loc[rows["measure"] == "deployment", "feasible"].all()
+
+
+def test_at_the_optimum_is_who_is_near_it_and_within_every_limit() -> None:
+    near = {"gap": 0.2, "cost_0": 5.05, "deploy_limit_0": 5.0, "cost_1": 7.0, "deploy_limit_1": math.nan}
+    others = [{"gap": 0.21}, {"gap": -0.4, "cost_0": 5.06}, {"deploy_limit_1": 6.9}, {"gap": math.nan}]
+    rows = pd.DataFrame([near, *(near | other for other in others)])
+    assert metrics.optimal(rows).tolist() == [True, False, False, False, False]
+
+
+def test_a_summary_counts_the_seeds_at_the_optimum(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    rows.loc[rows["measure"] == "stochastic", ["gap", "cost_0"]] = [0.1, 4.0]
+    rows["optimal"] = metrics.optimal(rows)
+    found = metrics.summary(rows).set_index("measure").loc["stochastic"]
+    assert (found["optimal_seeds"] == found["seeds"]).all()
+    table = tables.outcome_table(metrics.summary(rows), metrics.Measure.STOCHASTIC)
+    seeds = int(found["seeds"].iloc[0])
+    assert table["at the optimum"].str.startswith(f"{seeds} of {seeds} (").all()
 
 
 def test_every_cost_must_be_feasible(made_up_sweep: Callable[..., SweepStore]) -> None:

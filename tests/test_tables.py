@@ -25,6 +25,7 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
         "gap": "21.33 ± 7.67",
         "cost ≤ limit": "3 of 3 (44–100%)",
         "within one s.e.": "3 of 3",
+        "at the optimum": "0 of 3 (0–56%)",
     }
 
 
