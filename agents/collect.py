@@ -121,6 +121,7 @@ class Collector:
         assert self._observations is not None
         if (
             isinstance(environments, FiniteVectorEnv)
+            and environments.follows_tables
             and isinstance(policy, InvertedPolicy)
             and environments.finite_cmdp().num_states <= num_steps * environments.num_envs
         ):

@@ -201,11 +201,17 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self.states = states
         return self.observations[states], self._rewards[pairs], terminated, truncated, info
 
+    @property
+    def follows_tables(self) -> bool:
+        """Whether ``step`` is this class's own, so that ``follow`` is the same."""
+        return type(self).step is FiniteVectorEnv.step and "step" not in vars(self)
+
     def follow(self, masses: Floats, draws: Floats) -> FiniteSteps:
         """Take T steps under a policy that is a table: many times as fast as ``step``, with equal results.
 
         The policy acts by inversion: in state s it takes the first action a with
-        u masses[s, -1] < masses[s, a]. A subclass whose ``step`` does more must do so here, too.
+        u masses[s, -1] < masses[s, a]. To be called only where ``follows_tables``: elsewhere ``step`` does
+        something else.
 
         Args:
             masses: each state's action probabilities, summed up over the actions, in any unit, [S, A].

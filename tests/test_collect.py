@@ -154,6 +154,15 @@ def test_from_a_table_is_collected_what_would_be_step_by_step(task: str, options
     np.testing.assert_equal(tabular_states, stepped_states)
 
 
+def test_environments_with_a_step_of_their_own_take_it() -> None:
+    environments = make_vector("two-state", 2)
+    environments.step = lambda actions: (_ for _ in ()).throw(ArithmeticError("taken"))  # type: ignore[method-assign]
+    collector = Collector(environments, num_steps=5)
+    collector.reset(seed=0)
+    with pytest.raises(ArithmeticError, match="taken"):
+        collector.collect(ShownTabular(2, 2), np.random.default_rng(0))
+
+
 def test_a_student_acts_by_the_masses_that_it_shows() -> None:
     environments = make_vector("rivergrid-1a", 4)
     agent = make_agent("ppo", environments.cmdp, {}, np.random.SeedSequence(0))

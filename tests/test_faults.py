@@ -42,11 +42,11 @@ SPEC = TrialSpec(
 # A task of the user's own whose rewards are no numbers from the twelfth step on.
 POISONED_TASK = """\
 import numpy as np
-from recrl.environments.continuous_bandit import ContinuousBanditOptions, make_continuous_bandit
+from recrl.environments.two_state import TwoStateOptions, make_two_state
 from recrl.environments.registry import Task
 
 def make(name, num_envs, options):
-    environments = make_continuous_bandit(name, num_envs, options)
+    environments = make_two_state("two-state", num_envs, options)
     step, steps = environments.step, iter(range(1, 10**9))
     def poisoned(actions):
         observations, rewards, *rest = step(actions)
@@ -54,7 +54,7 @@ def make(name, num_envs, options):
     environments.step = poisoned
     return environments
 
-TASK = Task("Poisoned.", ContinuousBanditOptions, make)
+TASK = Task("Poisoned.", TwoStateOptions, make)
 """
 
 
