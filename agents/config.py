@@ -280,6 +280,7 @@ class IPOConfig(AscentConfig):
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_ASCENT,
         "barrier_sharpness": 20.0,
+        "cost_surrogate": "plain",
     }
 
     clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
@@ -289,6 +290,11 @@ class IPOConfig(AscentConfig):
         default=2000.0,
         description="t of the barrier log(slack) / t; at the optimum it gives away 1 / t of the reward "
         "advantages' standard deviation a step and constraint (ours; Liu et al. 2020: 20).",
+    )
+    cost_surrogate: Literal["pessimistic", "plain"] = Field(
+        default="pessimistic",
+        description="Whether a cost's surrogate counts relief beyond the clip range: not (ours), or however "
+        "far the policy goes (Liu et al. 2020).",
     )
     barrier_slope: Positive = Field(
         default=20.0,
@@ -338,13 +344,14 @@ class CRPOConfig(TrustRegionConfig):
     paper: ClassVar[Mapping[str, Any]] = {
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_TRUST_REGION,
-        "steps": "full",
+        "temperature": 0.0,
     }
 
-    steps: Literal["predicted", "full"] = Field(
-        default="predicted",
-        description="How long steps are: predicted to end at the limit (ours), or as the trust region allows, "
-        "to and fro (Xu et al. 2021).",
+    temperature: NonNegative = Field(
+        default=1.0,
+        description="lambda, what a nat of KL must be worth beyond a limit, in standard deviations of the "
+        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
+        "(ours; Xu et al. 2021: 0).",
     )
     tolerance: NonNegative = Field(
         default=0.0,

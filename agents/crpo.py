@@ -5,20 +5,40 @@ surrogate; otherwise one down the surrogate of a violated cost (algorithm 1), he
 standard deviations of its advantages, whatever the costs' units. Nothing is remembered from one update to the
 next, so a limit that moves is answered at once.
 
+Steps of one length go to and fro about the optimum by that length for ever; what the source proves is for
+steps that shrink as learning goes on. So, ours, they shrink with what is left to be gained (symbols as in
+``recrl.agents.cpo_dual``, but g is the gradient of the reward, v = H^-1 g, q = g.v, r_i = b_i.v): with
+
+    p = q - r.nu,  beta = sqrt(p / q) / (2 lambda),
+
+    up the reward:   sqrt(2 delta / q) v, but at most (min over r_i > 0 of -c_i / r_i, plus beta) v;
+    down cost i:     sqrt(2 delta / s) w_i, but at most ((c_i + beta max(r_i, 0)) / s) w_i,  s = S_ii.
+
+p is the squared length of what is left of v when the costs at hand are projected out, with nu >= 0 from their
+complementarity problem. At the optimum it is 0: the reward pulls against costs and nothing else, and a step
+beyond a limit would only be taken back. Then a cost step mends the violation and no more, as Polyak (1967)
+steps down a violated constraint, and a reward step ends at the limit. Before, steps go as far beyond the
+limit on one side as on the other. A cost is at hand if the trust region reaches its limit. lambda is the
+``temperature``, in the same unit and for the same reason as that of ``trpo-lag``; 0 is the source's.
+
 If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, k
-costs.
+costs, of which j have a finite limit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.advantages import SMALLEST_STD
+from recrl.agents.advantages import SMALLEST_STD, reward_spread
 from recrl.agents.config import CRPOConfig
-from recrl.agents.experience import Experience
+from recrl.agents.cpo import LocalModel, along, linearise
+from recrl.agents.cpo_dual import NO_INFLUENCE, DualSolution, StepCase, StepProblem, projection_weights
+from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.trpo import step_up
+from recrl.agents.trust_region import backtrack
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -39,6 +59,42 @@ def most_violated(gaps: Floats, spreads: Floats, tolerance: float) -> int | None
     return int(np.argmax(np.where(violated, gaps / spreads, -np.inf)))
 
 
+def step_down(problem: StepProblem, mended: int, config: CRPOConfig) -> DualSolution:
+    """The module's step down one of the j costs."""
+    squared = float(problem.gram[mended, mended])
+    weights = np.zeros_like(problem.violations)
+    if squared > NO_INFLUENCE:
+        weights[mended] = np.sqrt(2.0 * problem.radius / squared)
+        if config.temperature > 0.0:
+            beyond = overshoot(problem, config) * max(-float(problem.mixed[mended]), 0.0)
+            weights[mended] = min(weights[mended], (float(problem.violations[mended]) + beyond) / squared)
+    return DualSolution(StepCase.RECOVERY, 0.0, weights, np.full_like(weights, np.nan), (mended,))
+
+
+def step_up(problem: StepProblem, config: CRPOConfig) -> DualSolution:
+    """The module's step up the reward; violations, if any, are within the tolerance."""
+    nothing, size = np.zeros_like(problem.violations), 0.0
+    if problem.squared_gradient > NO_INFLUENCE:
+        size = float(np.sqrt(2.0 * problem.radius / problem.squared_gradient))
+        if config.temperature > 0.0:
+            rises, slack = -problem.mixed, np.maximum(-problem.violations, 0.0)
+            raised = rises > 0.0
+            up_to_limit = float(np.min(slack[raised] / rises[raised], initial=np.inf))
+            size = min(size, up_to_limit + overshoot(problem, config))
+    return DualSolution(StepCase.UNCONSTRAINED, size, nothing, nothing, ())
+
+
+def overshoot(problem: StepProblem, config: CRPOConfig) -> float:
+    """beta, how many times v a step goes beyond a limit, with a temperature above 0."""
+    squared = max(problem.squared_gradient, NO_INFLUENCE)
+    reach = np.sqrt(2.0 * problem.radius * np.diag(problem.gram))
+    at_hand = np.flatnonzero(-problem.violations <= reach)
+    rises = -problem.mixed[at_hand]
+    weights = projection_weights(problem.gram[np.ix_(at_hand, at_hand)], rises)
+    taken = 0.0 if weights is None else float(rises @ weights)
+    return float(np.sqrt(max(1.0 - taken / squared, 0.0))) / (2.0 * config.temperature)
+
+
 class ConstraintRectifiedPolicyOptimisation:
     """The rule of ``crpo``; a ``recrl.agents.actor_critic.PolicyRule``."""
 
@@ -50,19 +106,50 @@ class ConstraintRectifiedPolicyOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one step up the reward or down a violated cost, unless nothing is known of the constraints."""
-        constraints, advantages = experience.constraints, experience.advantages
+        config, constraints = self._config, experience.constraints
         if not constraints.known:
             stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
             return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
-        spreads = np.maximum(advantages.std(axis=0), SMALLEST_STD)
-        standardised = (advantages - advantages.mean(axis=0)) / spreads
-        mended = most_violated(constraints.gaps, spreads[1:], self._config.tolerance)
-        objective = standardised[:, 0] if mended is None else -standardised[:, 1 + mended]
+        centred = experience.advantages - experience.advantages.mean(axis=0)
+        spreads = np.maximum(centred[:, 1:].std(axis=0), SMALLEST_STD)
+        centred[:, 0] /= reward_spread(centred)
+        mended = most_violated(constraints.gaps, spreads, config.tolerance)
+        active = ActiveConstraints.of(constraints)
+        model = LocalModel(policy, experience, centred)
+        problem, solved = linearise(model, active, config, generator)
         multipliers = np.zeros_like(constraints.limits)
-        if mended is not None:
+        if mended is None:
+            solution = step_up(problem, config)
+        else:
+            solution = step_down(problem, int(np.searchsorted(active.index, mended)), config)
             multipliers[mended] = np.inf  # as if this constraint were all that counts
-        metrics = step_up(policy, experience, objective, self._config, generator)
-        return {**metrics, **indexed("multiplier", multipliers)}
+        step = along(solution, solved)
+        shortened = backtrack(
+            policy.parameters,
+            step,
+            improvement(model, mended, config.target_kl),
+            ratio=config.backtrack_ratio,
+            tries=config.backtrack_tries,
+        )
+        taken = 0.0 if shortened is None else config.backtrack_ratio**shortened
+        return {
+            "policy_steps": float(shortened is not None),
+            "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
+            "step_norm": taken * float(step.norm()),
+            **indexed("multiplier", multipliers),
+        }
+
+
+def improvement(model: LocalModel, mended: int | None, target_kl: float) -> Callable[[], bool]:
+    """The line search's test: the KL is within delta, and the reward has not fallen or the cost not risen."""
+    before = model.start()
+
+    def is_acceptable() -> bool:
+        now, divergence = model.measure()
+        improved = now[0] >= before[0] if mended is None else now[1 + mended] <= before[1 + mended]
+        return bool(improved) and divergence <= target_kl
+
+    return is_acceptable
 
 
 def make_crpo(cmdp: CMDPSpec, config: CRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

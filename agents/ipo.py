@@ -4,7 +4,9 @@ The policy climbs, in cost per step,
 
     L_r + sum_i phi(s_i),  s_i = -(L_i + c_i),  c_i = (mean episode cost i - limit i) / mean episode length,
 
-with L_r the clipped surrogate of the reward, L_i the surrogate of cost i, and phi(s) = log(s) / t. The
+with L_r the clipped surrogate of the reward, L_i that of cost i, and phi(s) = log(s) / t. L_i is, ours, the
+*pessimistic* surrogate of ``p3o``: with the source's plain one, a violated constraint sends the policy as far
+as it can within an update, for a relief that is true only nearby (on a RiverGrid, to one goal for good). The
 optimum gives away 1 / t of reward a step for each constraint that binds. The paper leaves open what happens
 where there is no slack: there phi goes on along its tangent (Kervadec et al. 2022), from the slack
 1 / (t kappa) at which its slope is kappa,
@@ -36,7 +38,7 @@ from recrl.agents.config import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, surrogate
+from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief, surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -54,6 +56,15 @@ def slopes(slack: npt.NDArray[np.floating], config: IPOConfig) -> Floats:
     return np.asarray(charged, dtype=np.float64)
 
 
+def relief_of(batch: LearningBatch, costs: Floats, config: IPOConfig) -> Callable[[Tensor], Tensor]:
+    """-L_i, how far the surrogates of costs, [N, j], have fallen, as a function of the ratios, [D] -> [j]."""
+    if config.cost_surrogate == "pessimistic":
+        split = [SignedAdvantages.split(batch, -column) for column in costs.T]
+        return partial(pessimistic_relief, relief=split, clip=config.clip)
+    per_decision = batch.per_decision(-costs)
+    return lambda ratios: surrogate(ratios - 1.0, per_decision)
+
+
 def barrier_gain(
     batch: LearningBatch, rewards: Floats, costs: Floats, violations: Floats, config: IPOConfig
 ) -> Callable[[Tensor], tuple[Tensor, float]]:
@@ -67,14 +78,15 @@ def barrier_gain(
         rewards: centred advantages, [N].
         costs: centred advantages of the costs that have a limit, [N, j].
         violations: c, [j].
-        config: clip, t and kappa.
+        config: clip, cost_surrogate, t and kappa.
     """
     signed = SignedAdvantages.split(batch, rewards)
-    per_decision, offsets = batch.per_decision(costs), to_tensor(violations)
+    offsets = to_tensor(violations)
     shape = partial(barrier, sharpness=config.barrier_sharpness, slope=config.barrier_slope)
+    relief = relief_of(batch, costs, config)
 
     def gain(ratios: Tensor) -> tuple[Tensor, float]:
-        slack = -(surrogate(ratios - 1.0, per_decision) + offsets)
+        slack = relief(ratios) - offsets
         charged = slopes(slack.detach().numpy(force=True), config)
         return clipped_surrogate(ratios, signed, config.clip) + shape(slack).sum(), float(charged.sum())
 

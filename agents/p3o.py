@@ -23,12 +23,12 @@ from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.ascent import Objective, climb, with_prices
-from recrl.agents.batch import LearningBatch
+from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.config import P3OConfig
 from recrl.agents.experience import Experience
 from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate
+from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -55,16 +55,13 @@ def penalised_gain(
         factor: kappa.
     """
     signed = SignedAdvantages.split(batch, rewards)
-    # The pessimistic surrogate of a cost is minus that of its negative.
     relief = [SignedAdvantages.split(batch, -column) for column in costs.T]
+    offsets = to_tensor(violations)
 
     def gain(ratios: Tensor) -> tuple[Tensor, float]:
-        value, price = clipped_surrogate(ratios, signed, clip), 0.0
-        for each, violation in zip(relief, violations.tolist(), strict=True):
-            excess = violation - (clipped_surrogate(ratios, each, clip) - each.total)
-            value = value - factor * torch.relu(excess)
-            price += factor * float(excess.detach() > 0.0)
-        return value, price
+        excess = torch.relu(offsets - pessimistic_relief(ratios, relief, clip))
+        value = clipped_surrogate(ratios, signed, clip) - factor * excess.sum()
+        return value, factor * float((excess.detach() > 0.0).sum())
 
     return gain
 

@@ -7,6 +7,7 @@ probability ratio and, linearly, its advantage; so advantages are summed by deci
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,3 +69,20 @@ def clipped_surrogate(ratios: Tensor, advantages: SignedAdvantages, clip: float)
     """
     gain = torch.dot(ratios.clamp(max=1.0 + clip), advantages.positive)
     return gain + torch.dot(ratios.clamp(min=1.0 - clip), advantages.negative)
+
+
+def pessimistic_relief(ratios: Tensor, relief: Sequence[SignedAdvantages], clip: float) -> Tensor:
+    """How far each cost's surrogate has fallen since ratios of 1, at least, [j].
+
+    The pessimistic surrogate of a cost, the mean of max(ratio A, clip(ratio) A), is minus PPO's of -A. A
+    plain one promises ever more relief for going ever further, and a policy that is charged a lot for a
+    violation goes there in one update, whatever it does to the reward.
+
+    Args:
+        ratios: pi(a | s) / pi_old(a | s), [D].
+        relief: minus the advantages of each cost, by sign.
+        clip: e in (0, 1).
+    """
+    if not relief:
+        return torch.zeros(0)
+    return torch.stack([clipped_surrogate(ratios, each, clip) - each.total for each in relief])

@@ -13,7 +13,7 @@ from recrl.agents.config import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.distributions import Categorical
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.focops import FirstOrderConstrainedOptimisation, projection_objective
-from recrl.agents.ipo import InteriorPointPolicyOptimisation, barrier, barrier_gain, slopes
+from recrl.agents.ipo import InteriorPointPolicyOptimisation, barrier, barrier_gain, relief_of, slopes
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.p3o import PenalisedProximalPolicyOptimisation, penalised_gain
 from recrl.agents.policies import StochasticPolicy
@@ -85,6 +85,17 @@ def test_ipos_gain_is_the_one_computed_by_hand() -> None:
     slack = 0.5 / SPREAD
     assert float(value) == pytest.approx(math.log(slack) / 10.0, rel=1e-5)
     assert price == pytest.approx(1.0 / (10.0 * slack), rel=1e-5)
+
+
+def test_ipo_counts_relief_up_to_the_clip_range_and_the_papers_goes_on() -> None:
+    # Sample 1 has the cost advantage -1: at the ratio 1.6 it would save 0.6 / 6, clipped 0.2 / 6.
+    ratios = torch.tensor([1.0, 1.6, 1.0, 1.0, 1.0, 1.0])
+    clipped, plain = (
+        relief_of(BATCH, COSTS, IPOConfig(clip=CLIP, cost_surrogate=name))(ratios)
+        for name in ("pessimistic", "plain")
+    )
+    assert (SPREAD * clipped).tolist() == pytest.approx([0.2 / 6.0], rel=1e-5)
+    assert (SPREAD * plain).tolist() == pytest.approx([0.6 / 6.0], rel=1e-5)
 
 
 def test_focops_weighs_what_is_gained_against_how_far_the_policy_moves() -> None:
