@@ -53,7 +53,7 @@ RUNS_A_PAGE = 200
 RUNS_A_REQUEST = 25  # of metric histories; a server takes 100, which can keep it busy for long
 POINTS_A_RUN = 2_500  # a server takes no more
 REQUESTS_AT_ONCE = 4
-PATIENCE = 60  # seconds that a server may think about histories
+PATIENCE = 120  # seconds that a server may think about a page of runs or histories
 HISTORY = "/api/2.0/mlflow/metrics/get-history-bulk-interval"
 LAST_STEP = 2**31 - 1  # that a server takes for the end of an interval
 MAX_FILE_BYTES = 512 * 2**20  # of an artifact
@@ -174,7 +174,7 @@ class Server:
     """
 
     def __init__(self, uri: str) -> None:
-        for key, value in ENVIRONMENT.items():
+        for key, value in (ENVIRONMENT | {"MLFLOW_HTTP_REQUEST_TIMEOUT": str(PATIENCE)}).items():
             os.environ.setdefault(key, value)
         from mlflow.exceptions import MlflowException  # noqa: PLC0415
         from mlflow.tracking import MlflowClient  # noqa: PLC0415  (takes seconds)

@@ -103,22 +103,28 @@ def mirror_cpu(store: SweepStore) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def family_cpu() -> dict[int, float]:
-    """CPU seconds of this process and of each one below it, by process."""
+def family() -> dict[int, list[str]]:
+    """This process and each one below it, with the fields of ``/proc/<pid>/stat`` behind its name."""
     fields: dict[int, list[str]] = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields[int(path.parent.name)] = path.read_text().rpartition(")")[2].split()
         except OSError:
             continue
-    seconds: dict[int, float] = {}
+    found = {}
     for pid, values in fields.items():
         above = pid
         while above in fields and above != os.getpid():
             above = int(fields[above][1])
         if above == os.getpid():
-            seconds[pid] = sum(map(int, values[11:13])) / os.sysconf("SC_CLK_TCK")
-    return seconds
+            found[pid] = values
+    return found
+
+
+def family_cpu() -> dict[int, float]:
+    """CPU seconds of this process and of each one below it, by process."""
+    ticks = os.sysconf("SC_CLK_TCK")
+    return {pid: sum(map(int, values[11:13])) / ticks for pid, values in family().items()}
 
 
 class FamilyWatch(threading.Thread):

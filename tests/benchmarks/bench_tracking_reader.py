@@ -1,16 +1,16 @@
 """How long figures wait for MLflow: a large sweep from a sqlite store, or from a server, to frames.
 
     OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_tracking_reader [--trials 1000] [--updates 300]
-    ... --server [--without-snapshot]
+    ... --server
 
 A store is made with as many runs and points as are asked for, with the columns, artifacts and sums of real
 trials and random numbers; rows are written to MLflow's tables directly, as MLflow itself would take half an
 hour. Then ``recrl.analysis.tracked.load`` reads it in a fresh process. The aim: 1,000 runs x 300 points, each
 with all metrics of a trial, within 10 seconds on two cores, imports counted.
 
-With ``--server`` an MLflow server of one process stands before that store, hands out the artifacts as well,
-and has the sweep's snapshot as the mirror would have left it; ``--without-snapshot``, it has none, as one
-that an older version wrote to. Two numbers more: the CPU seconds of the server, and the size of the snapshot.
+With ``--server`` an MLflow server of one process stands before that store and hands out the artifacts as
+well. At first it has the sweep's snapshot as the mirror would have left it, of all runs but one; then none,
+as one that an older version wrote to. One number more: the CPU seconds of the server.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def _table(position: int, rows: Sequence[tuple[str, float, int, str, int]], metr
 
 
 def behind_a_server(store: SweepStore, snapshot: Snapshot | None) -> int:
-    """Leave the store as if all had been sent to a server; returns the bytes of the snapshot."""
+    """Leave the store as if all had been sent to a server; returns the bytes of the snapshot, if any."""
     database = sqlite3.connect(store.mlflow_database)
     (run_id,) = database.execute(
         "SELECT run_uuid FROM tags WHERE key = 'recrl.kind' AND value = 'sweep'"
@@ -185,7 +185,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--trials", type=int, default=1000)
     parser.add_argument("--updates", type=int, default=300)
     parser.add_argument("--server", action="store_true", help="read through an MLflow server")
-    parser.add_argument("--without-snapshot", action="store_true", help="which has no snapshot of the sweep")
     arguments = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
         store = write_sweep(Path(folder), trials=1, updates=arguments.updates)
@@ -198,22 +197,25 @@ def main(argv: Sequence[str] | None = None) -> None:
         if not arguments.server:
             read(uri)
             return
-        size = behind_a_server(store, None if arguments.without_snapshot else snapshot)
-        print(f"snapshot: {size / 2**20:.1f} MiB", flush=True)
-        ui = open_ui(store, uri, port=PORT)
-        try:
-            read(f"http://127.0.0.1:{PORT}")
-        finally:
-            before = children_cpu()
-            ui.close()
-            print(f"the server: {children_cpu() - before:.1f} CPU s, its start counted")
+        for told in (snapshot, None):
+            size = behind_a_server(store, told)
+            print(f"a server, snapshot of {size / 2**20:.1f} MiB:", flush=True)
+            ui = open_ui(store, uri, port=PORT)
+            try:
+                read(f"http://127.0.0.1:{PORT}", times=2 if told else 1)
+            finally:
+                before = children_cpu()
+                ui.close()
+                print(f"the server: {children_cpu() - before:.1f} CPU s, its start counted", flush=True)
 
 
-def read(uri: str) -> None:
-    """Read the sweep twice, each time in a fresh process."""
-    for which in ("first", "second"):
+def read(uri: str, *, times: int = 2) -> None:
+    """Read the sweep, each time in a fresh process."""
+    for which in ("first", "second")[:times]:
         start = time.monotonic()
-        done = subprocess.run([sys.executable, "-c", READ, uri], check=True, capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, "-c", READ, uri], check=True, stdout=subprocess.PIPE, text=True
+        )
         trials, rows, imports, loading, cpu = map(float, done.stdout.split())
         wall = time.monotonic() - start
         print(
