@@ -23,6 +23,7 @@ from recrl.orchestrator.trial import run_recorded
 from recrl.teachers.registry import TEACHERS
 
 SMALL = {"hidden_sizes": [16]}
+QUICK = {**SMALL, "critic_steps": 4}  # for what holds however long critics are fitted
 SPEC = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
     agent=Choice("ppo-lag", SMALL),
@@ -93,13 +94,13 @@ def assert_pieces_make_the_whole(folder: Path, spec: TrialSpec, stops: tuple[int
 @pytest.mark.parametrize("method", TEACHERS)
 def test_interrupted_equals_uninterrupted(tmp_path: Path, agent: str, method: str) -> None:
     options = {"window": 8} if method == "dynamic" else {}
-    spec = replace(SPEC, agent=Choice(agent, SMALL), method=Choice(method, options))
+    spec = replace(SPEC, agent=Choice(agent, QUICK), method=Choice(method, options))
     assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 0, 7, 11))
 
 
 @pytest.mark.parametrize("agent", sorted(set(AGENTS) - {"ppo-lag", "cpo"}))
 def test_every_other_student_interrupted_equals_itself_uninterrupted(tmp_path: Path, agent: str) -> None:
-    spec = replace(SPEC, agent=Choice(agent, SMALL))
+    spec = replace(SPEC, agent=Choice(agent, QUICK))
     assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 8))
 
 
@@ -111,7 +112,7 @@ def test_physics_and_maps_interrupted_equal_themselves_uninterrupted(
     spec = replace(
         SPEC,
         task=Choice(task, {"horizon": 25}),
-        agent=Choice(agent, SMALL),
+        agent=Choice(agent, QUICK),
         method=Choice("dynamic", {"window": 2, "start_updates": 1}),
         train_steps=7 * 60,
     )
