@@ -56,6 +56,8 @@ if TYPE_CHECKING:
 
 STOP_QUESTION_SECONDS = 0.5
 HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats, at least
+LONGEST_PAUSE_SECONDS = 0.5  # in which nobody asks Ray whether a trial has ended
+PAUSE_SHARE = 0.01  # of the time since a trial last began or ended
 CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
@@ -382,6 +384,16 @@ def look_seconds(silence_seconds: float) -> float:
     return min(max(HEARTBEAT_SECONDS, silence_seconds / 30.0), silence_seconds / 4.0)
 
 
+def pause_seconds(quiet_seconds: float) -> float:
+    """How long to wait before Ray is asked again whether a trial has ended, in seconds.
+
+    Args:
+        quiet_seconds: since a trial last began or ended, at least 0; no trial is kept waiting for more than a
+            hundredth of them.
+    """
+    return min(PAUSE_SHARE * quiet_seconds, LONGEST_PAUSE_SECONDS)
+
+
 def _end_process(record: TrialRecord, actor: Any) -> None:
     """Kill a trial's process: directly where it is here, because one that is stopped serves no request."""
     if record.host == socket.gethostname() and _is_worker(record.pid):
@@ -417,10 +429,16 @@ class _Watch(tune.Callback):
         self._queue = queue
         self._store = store
         self._silence = silence
+        self._last_event = time.monotonic()
         self.stopped_and_idle = False
 
     def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
-        """Look at the stop event and the heartbeats; Tune calls this ten times a second or more."""
+        """Look at the stop event and the heartbeats.
+
+        Tune would call this ten times a second, and each turn of its loop costs a millisecond of a core that
+        trials want. So it waits here while trials are long, and never for the stop event.
+        """
+        self._stop.wait(pause_seconds(time.monotonic() - self._last_event))
         self._silence.end(trials)
         if self._stop.is_set():
             if not self._queue.is_finished():
@@ -428,12 +446,22 @@ class _Watch(tune.Callback):
             self._stop_sign.set()
             self.stopped_and_idle = all(trial.status != "RUNNING" for trial in trials)
 
+    def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Look again soon: where one trial begins, others may."""
+        self._last_event = time.monotonic()
+
+    def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Look again soon: the next trial is to begin."""
+        self._last_event = time.monotonic()
+
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Say that Tune starts a trial again."""
+        self._last_event = time.monotonic()
         logger.warning("%s: its process failed; it goes on from its last checkpoint", _spec_of(trial).title)
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
+        self._last_event = time.monotonic()
         cause, spec = _last_error(trial), _spec_of(trial)
         if isinstance(cause, StorageError):
             logger.warning("%s: %s; it waits", spec.title, cause)

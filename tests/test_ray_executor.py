@@ -19,7 +19,14 @@ from ray.exceptions import RayActorError
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
-from recrl.orchestrator.ray_executor import RayExecutor, StopFile, existing_cluster, local_cluster
+from recrl.orchestrator.ray_executor import (
+    LONGEST_PAUSE_SECONDS,
+    RayExecutor,
+    StopFile,
+    existing_cluster,
+    local_cluster,
+    pause_seconds,
+)
 from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
 from recrl.orchestrator.remote_sweep import RemoteSweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
@@ -310,6 +317,11 @@ def test_a_cluster_that_is_not_there_is_a_sentence() -> None:
         existing_cluster("127.0.0.1:1"),
     ):
         pass
+
+
+def test_a_trial_that_ends_is_seen_within_a_hundredth_of_its_time_and_half_a_second() -> None:
+    assert [pause_seconds(seconds) for seconds in (0.0, 0.01, 10.0, 50.0, 1e6)] == [0.0, 1e-4, 0.1, 0.5, 0.5]
+    assert LONGEST_PAUSE_SECONDS == 0.5
 
 
 def test_a_stop_file_tells_its_own_run_and_all_earlier_ones(tmp_path: Path) -> None:
