@@ -251,12 +251,18 @@ class FOCOPSConfig(AscentConfig, MultiplierConfig):
         "multiplier_step": 0.01,
         "multiplier_maximum": 2.0,
         "temperature": 1.5,
+        "trust_region": "passed",
     }
 
     temperature: Positive = Field(
         default=0.5,
         description="lambda, standard deviations of the reward advantages that are worth a nat (ours; Zhang "
         "et al. 2020: 1.5).",
+    )
+    trust_region: Literal["kept", "passed"] = Field(
+        default="kept",
+        description="Whether the step that goes past target_kl is taken back to it (ours), or stands and is the "
+        "last (Zhang et al. 2020).",
     )
 
 

@@ -11,7 +11,10 @@ multipliers nu move by a rule of ``recrl.agents.lagrange``; the paper's is proje
 in ``ppo-lag``, the penalised advantage is divided by 1 + sum_i nu_i, so that a large multiplier does not make
 the policy jump; lam keeps its meaning where no constraint binds.
 
-Letters: N samples, U rows, D decisions, k costs.
+The source stops when the mean KL is past delta; but the step that went past stands, and one Adam step may
+double the KL. So, ours, it is taken back as far as it went past: ``trust_region: kept``.
+
+Letters: N samples, U rows, D decisions, k costs, P parameters.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, inde
 from recrl.agents.advantages import penalised_advantages, scaled_advantages
 from recrl.agents.ascent import Objective, climb
 from recrl.agents.config import FOCOPSConfig
-from recrl.agents.distributions import Distribution
+from recrl.agents.distributions import Distribution, mean_divergence
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
 from recrl.agents.networks import Adam
@@ -58,6 +61,23 @@ def projection_objective(
     return objective
 
 
+def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, radius: float) -> None:
+    """Take a change of the parameters back until the mean KL is the radius, if it is more.
+
+    theta <- theta_0 + sqrt(delta / KL) (theta - theta_0): exact as far as the KL is a square of the change.
+
+    Args:
+        policy: changed in place.
+        experience: the samples, and pi_old at their rows.
+        start: theta_0, the parameters of pi_old, [P].
+        radius: delta, nats.
+    """
+    batch = experience.batch
+    divergence = float(mean_divergence(experience.old, policy.distribution(batch.rows), batch.row_weights))
+    if divergence > radius:
+        policy.parameters.values.lerp_(start, 1.0 - (radius / divergence) ** 0.5)
+
+
 class FirstOrderConstrainedOptimisation:
     """The rule of ``focops``; a ``recrl.agents.actor_critic.PolicyRule``."""
 
@@ -71,7 +91,7 @@ class FirstOrderConstrainedOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
-        config = self._config
+        config, start = self._config, policy.parameters.values.clone()
         multipliers = self._multipliers.answer(experience.constraints)
         rewards, costs = scaled_advantages(experience.advantages, "reward-scaled")
         objective = partial(
@@ -81,6 +101,8 @@ class FirstOrderConstrainedOptimisation:
             radius=config.target_kl,
         )
         metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        if config.trust_region == "kept":
+            keep_near(policy, experience, start, config.target_kl)
         return {**metrics, **indexed("multiplier", multipliers)}
 
 

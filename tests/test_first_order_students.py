@@ -114,6 +114,21 @@ def test_focops_weighs_what_is_gained_against_how_far_the_policy_moves() -> None
     assert float(objective(now, ratios)) == pytest.approx(expected, rel=1e-5)
 
 
+def test_focops_keeps_its_trust_region_however_long_a_step_is() -> None:
+    found = {}
+    for name in ("kept", "passed"):
+        policy = StochasticPolicy(
+            3, Discrete(2), NetworkForm((8,), orthogonal), 1.0, torch.Generator().manual_seed(0)
+        )
+        constraints = Constraints(np.array([math.inf]), np.array([-math.inf]), 10.0)
+        experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
+        config = FOCOPSConfig(target_kl=0.01, policy_learning_rate=0.1, trust_region=name)
+        rule = FirstOrderConstrainedOptimisation(config, policy, 1)
+        found[name] = improve_and_measure(rule, policy, experience, np.random.default_rng(0))["kl"]
+    assert found["passed"] > 0.05
+    assert found["kept"] == pytest.approx(0.01, rel=0.2)
+
+
 def improved(name: str, gap: float, limit: float = 5.0) -> tuple[dict[str, float], bool]:
     """The metrics of one update, and whether the policy is another."""
     generator = torch.Generator().manual_seed(0)

@@ -13,7 +13,7 @@ from recrl.agents.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.cpo_dual import StepCase, StepProblem, projection_weights
-from recrl.agents.crpo import ConstraintRectifiedPolicyOptimisation, most_violated
+from recrl.agents.crpo import ConstraintRectifiedPolicyOptimisation, most_violated, step_down, step_up
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
@@ -160,6 +160,38 @@ def test_without_a_finished_episode_the_multipliers_stay_and_the_policy_goes_on(
     metrics, change = improved("trpo-lag", SPACES[0], [math.nan, math.nan], [1.0, 1.0])
     assert change.any()
     assert metrics["multiplier_0"] == 0.0
+
+
+def crpo_sizes(gradient: list[float], violation: float, temperature: float) -> tuple[float, float]:
+    """How long CRPO's steps up the reward and down the cost are, with H = I, b = (1, 0), and radius 1."""
+    g, costs = np.array(gradient), EAST[None]
+    problem = StepProblem(float(g @ g), -costs @ g, costs @ costs.T, np.array([violation]), 0.5)
+    config = CRPOConfig(temperature=temperature)
+    return step_up(problem, config).gradient_weight, step_down(problem, 0, config).constraint_weights[0]
+
+
+def test_crpos_steps_end_at_the_limit_where_nothing_is_left_to_gain() -> None:
+    assert crpo_sizes([1.0, 0.0], -0.05, 1.0)[0] == pytest.approx(0.05)
+    assert crpo_sizes([1.0, 0.0], 0.1, 1.0)[1] == pytest.approx(0.1)
+
+
+def test_crpos_steps_go_beyond_the_limit_for_what_is_left_to_gain() -> None:
+    # p = 1 - 0.6^2, beta = 0.8 / 2; the reward's step raises the cost by 0.6.
+    assert crpo_sizes([0.6, 0.8], -0.06, 1.0)[0] == pytest.approx(0.06 / 0.6 + 0.4)
+    assert crpo_sizes([0.6, 0.8], 0.1, 1.0)[1] == pytest.approx(0.1 + 0.4 * 0.6)
+
+
+def test_crpos_steps_are_as_long_as_the_trust_region_far_from_limits_and_without_a_temperature() -> None:
+    assert crpo_sizes([0.6, 0.8], -9.0, 1.0)[0] == pytest.approx(1.0)
+    assert crpo_sizes([0.6, 0.8], 9.0, 1.0)[1] == pytest.approx(1.0)
+    assert crpo_sizes([1.0, 0.0], 0.01, 0.0) == pytest.approx((1.0, 1.0))
+    assert crpo_sizes([-1.0, 0.0], 0.01, 0.0) == pytest.approx((1.0, 1.0))
+
+
+def test_crpo_rests_where_nothing_can_be_changed() -> None:
+    nothing = StepProblem(0.0, np.zeros(1), np.zeros((1, 1)), np.array([0.1]), 0.5)
+    assert step_up(nothing, CRPOConfig()).gradient_weight == 0.0
+    assert step_down(nothing, 0, CRPOConfig()).constraint_weights.tolist() == [0.0]
 
 
 def test_crpo_mends_what_is_most_violated_in_its_own_spread() -> None:
