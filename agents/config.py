@@ -261,7 +261,7 @@ class FOCOPSConfig(AscentConfig, MultiplierConfig):
     )
     trust_region: Literal["kept", "passed"] = Field(
         default="kept",
-        description="Whether the step that goes past target_kl is taken back to it (ours), or stands and is the "
+        description="Whether the step that goes past target_kl is taken back to it (ours), or stands as the "
         "last (Zhang et al. 2020).",
     )
 
