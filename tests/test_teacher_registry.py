@@ -28,6 +28,7 @@ def test_the_names() -> None:
         "cosine",
         "dynamic",
         "exponential",
+        "guarded",
         "linear",
         "none",
         "step",
