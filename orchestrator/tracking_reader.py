@@ -201,7 +201,7 @@ class Server:
         self._snapshot = snapshot
         for trial in trials:
             if trial.run_id in held:
-                is_new = int(trial.progress.get("update", 0)) > held[trial.run_id]
+                is_new = int(trial.progress.get("update", LAST_STEP)) > held[trial.run_id]
                 next_step = held[trial.run_id] * trial.spec.steps_per_update + 1
                 self._next_steps[trial.run_id] = next_step if is_new else LAST_STEP
         self._last_step = max(it.spec.num_updates * it.spec.steps_per_update for it in trials)
