@@ -301,12 +301,11 @@ class DynamicTeacher:
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
-        config: these options, where a variant of this teacher has read them.
     """
 
-    def __init__(self, spec: TeacherSpec, config: DynamicConfig | None = None) -> None:
+    def __init__(self, spec: TeacherSpec) -> None:
         self.spec = spec
-        self.config = config or DynamicConfig.model_validate(dict(spec.options))
+        self.config = DynamicConfig.model_validate(dict(spec.options))
         self.measurement = StartMeasurement(spec, self.config.start_updates)
 
     def start(self) -> tuple[Lesson, TeacherState]:
@@ -318,7 +317,6 @@ class DynamicTeacher:
             last_change=0,
             history=(),
             start=self.measurement.begin(),
-            memory=self.first_memory(),
         )
         return last_lesson(state), state
 
@@ -333,15 +331,12 @@ class DynamicTeacher:
         )
         before = last_lesson(state).limits
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
-        lesson, memory = Lesson(limits), {key: state[key] for key in self.first_memory()}
         if progress(report.env_steps, self.spec.train_steps) >= 1.0:
             lesson, history = Lesson(self.spec.deploy_limits), ()
-        elif start["start_limits"] is not None and limits == before and last_change >= self.config.window:
-            windows = last_two_windows(history, self.config.window, unit=self.config.window_unit)
-            if windows is not None:
-                old, new = map(Stretch.pooled, windows)
-                lesson = self._judged(old, new, limits, report.env_steps)
-                lesson, memory = self.reconsider(lesson, limits, old, new, memory)
+        elif start["start_limits"] is None or limits != before or last_change < self.config.window:
+            lesson = Lesson(limits)
+        else:
+            lesson = self._judge(limits, history, report.env_steps)
         if lesson.policy_noise > 0.0 and self.config.windows_after_noise == 2:
             history = ()
         has_changed = lesson.limits != before or lesson.policy_noise > 0.0
@@ -352,30 +347,8 @@ class DynamicTeacher:
             last_change=0 if has_changed else last_change,
             history=history,
             start=start,
-            memory=memory,
         )
         return lesson, next_state
-
-    def first_memory(self) -> dict[str, Any]:
-        """What a variant of this teacher keeps in its state besides, at the start; JSON."""
-        return {}
-
-    def reconsider(
-        self, lesson: Lesson, limits: CostLimits, old: Stretch, new: Stretch, memory: dict[str, Any]
-    ) -> tuple[Lesson, dict[str, Any]]:
-        """Where a variant of this teacher thinks otherwise.
-
-        Args:
-            lesson: what Algorithm 2 says.
-            limits: in force.
-            old: the window before the last.
-            new: the last window, wholly after the last change.
-            memory: what the variant kept.
-
-        Returns:
-            The lesson to give, and what to keep.
-        """
-        return lesson, memory
 
     def _history(self, state: TeacherState, report: ProgressReport) -> tuple[Stretch, ...]:
         """The updates of the last two windows, or all of them as long as they are fewer."""
@@ -389,8 +362,12 @@ class DynamicTeacher:
         windows = last_two_windows(history, self.config.window, unit=unit)
         return history if windows is None else (*windows[0], *windows[1])
 
-    def _judged(self, old: Stretch, new: Stretch, limits: CostLimits, env_steps: int) -> Lesson:
-        """What Algorithm 2 says of two windows."""
+    def _judge(self, limits: CostLimits, history: Sequence[Stretch], env_steps: int) -> Lesson:
+        """The next lesson once W has passed since the last change."""
+        windows = last_two_windows(history, self.config.window, unit=self.config.window_unit)
+        if windows is None:
+            return Lesson(limits)
+        old, new = map(Stretch.pooled, windows)
         return judge(
             old,
             new,
@@ -411,7 +388,6 @@ def _state(
     last_change: int,
     history: Sequence[Stretch],
     start: dict[str, Any],
-    memory: dict[str, Any],
 ) -> dict[str, Any]:
     """A state as JSON."""
     return {
@@ -422,5 +398,4 @@ def _state(
         "last_change": last_change,
         "history": [stretch.to_json() for stretch in history],
         **start,
-        **memory,
     }

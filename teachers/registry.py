@@ -11,7 +11,6 @@ from pydantic import BaseModel
 
 from recrl.environments.plugins import resolve
 from recrl.teachers.dynamic import DynamicConfig, DynamicTeacher
-from recrl.teachers.guarded import GuardedConfig, GuardedTeacher
 from recrl.teachers.static import (
     DecayConfig,
     NoConfig,
@@ -60,11 +59,6 @@ TEACHERS: dict[str, TeacherKind] = {
         "CLiC_D: lower limits for a student that keeps them, noise for one that is stuck.",
         DynamicConfig,
         DynamicTeacher,
-    ),
-    "guarded": TeacherKind(
-        "CLiC_D, and noise also for a student whose return collapses under the limits that it keeps (ours).",
-        GuardedConfig,
-        GuardedTeacher,
     ),
 }
 

@@ -28,7 +28,6 @@ def test_the_names() -> None:
         "cosine",
         "dynamic",
         "exponential",
-        "guarded",
         "linear",
         "none",
         "step",
