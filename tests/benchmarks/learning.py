@@ -102,8 +102,8 @@ class Lesson:
 
 
 STUDENTS = ("ppo-lag", "cpo", "trpo-lag", "pcpo", "focops", "p3o", "ipo", "crpo")
-# While no other way is known the river is worth 16 of reward, at a limit of 1; by the default gains (1 and 0.1
-# at that limit) the policy may be deterministic before that price is reached.
+# While no other way is known the river is worth 16 of reward, at a limit of 1; by the default gains (1 and
+# 0.1 at that limit) the policy may be deterministic before that price is reached.
 STEEP_MULTIPLIERS = {"multiplier_proportional": 5.0, "multiplier_step": 0.2}
 OPTIONS = {agent: STEEP_MULTIPLIERS for agent in ("ppo-lag", "trpo-lag", "focops")}
 LESSONS = [
