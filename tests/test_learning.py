@@ -32,7 +32,7 @@ class Lesson:
 LESSONS = [
     Lesson("ppo-lag", "two-state", (3.0,), 150, seeds=2),
     Lesson("cpo", "two-state", (3.0,), 80, seeds=2),
-    Lesson("ppo-lag", "two-state-2", (5.0, 2.0), 150, seeds=2),
+    Lesson("ppo-lag", "two-state-2", (5.0, 2.0), 150, seeds=2, num_envs=64),
     Lesson("cpo", "two-state-2", (5.0, 2.0), 80, seeds=2),
     Lesson("ppo-lag", "continuous-bandit", (2.5,), 250, seeds=2),
     Lesson("cpo", "continuous-bandit", (2.5,), 80, seeds=2),
