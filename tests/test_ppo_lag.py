@@ -46,8 +46,8 @@ def improved(gap: float, limit: float = 5.0, **options: object) -> dict[str, flo
 
 
 def test_the_multiplier_answers_before_the_policy_moves() -> None:
-    options = {"multiplier_rule": "projected", "multiplier_step": 0.02, "multiplier_unit": "cost"}
-    assert improved(10.0, **options)["multiplier_0"] == 0.2
+    found = improved(10.0, multiplier_rule="projected", multiplier_step=0.02, multiplier_unit="cost")
+    assert found["multiplier_0"] == 0.2
 
 
 @pytest.mark.parametrize("rule", ["projected", "pid"])
