@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from recrl.agents.agent import InvertedPolicy, Policy, Rollout
 from recrl.agents.spaces import environment_actions, observation_rows, observation_size
-from recrl.environments.cmdp import Floats
 from recrl.environments.finite_cmdp import FiniteVectorEnv
 from recrl.environments.vector import CMDPVectorEnv
 
@@ -40,20 +39,6 @@ class FinishedEpisode:
     length: int
     episode_return: float
     costs: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class _Steps:
-    """What T steps were, as in a ``Rollout``, and the observations that follow them."""
-
-    observations: npt.NDArray[np.float32]
-    actions: npt.NDArray[Any]
-    rewards: Floats
-    costs: Floats
-    terminated: npt.NDArray[np.bool_]
-    truncated: npt.NDArray[np.bool_]
-    final_observations: npt.NDArray[np.float32]
-    following: npt.NDArray[np.float32]
 
 
 class Collector:
@@ -100,33 +85,79 @@ class Collector:
         """
         if self._observations is None:
             raise RuntimeError("a collector must be reset or restored before it collects")
-        carried_costs = self._costs.copy()
-        taken = self._take_steps(policy, generator)
-        self._observations = taken.following
-        rollout = Rollout(
-            observations=taken.observations,
-            actions=taken.actions,
-            rewards=taken.rewards,
-            costs=taken.costs,
-            terminated=taken.terminated,
-            truncated=taken.truncated,
-            final_observations=taken.final_observations,
-            last_observations=taken.following,
-            carried_costs=carried_costs,
-        )
-        return rollout, self._finished(rollout)
-
-    def _take_steps(self, policy: Policy, generator: np.random.Generator) -> _Steps:
-        environments, num_steps = self._environments, self._num_steps
-        assert self._observations is not None
+        environments = self._environments
         if (
             isinstance(environments, FiniteVectorEnv)
             and environments.follows_tables
             and isinstance(policy, InvertedPolicy)
-            and environments.finite_cmdp().num_states <= num_steps * environments.num_envs
+            # With more states than samples, the table is more work than the rollout.
+            and environments.finite_cmdp().num_states <= self._num_steps * environments.num_envs
         ):
-            return _steps_by_table(environments, policy, num_steps, generator)
-        return _steps_by_observation(environments, self._observations, policy, num_steps, generator)
+            rollout = self._collect_by_table(environments, policy, generator)
+        else:
+            rollout = self._collect_by_observation(self._observations, policy, generator)
+        self._observations = rollout.last_observations
+        return rollout, self._finished(rollout)
+
+    def _collect_by_observation(
+        self, current: npt.NDArray[np.float32], policy: Policy, generator: np.random.Generator
+    ) -> Rollout:
+        """Ask the policy at each observation [B, n], beginning with the current ones."""
+        environments, cmdp = self._environments, self._environments.cmdp
+        shape = (self._num_steps, environments.num_envs)
+        observations = np.empty((*shape, observation_size(cmdp.observation_space)), dtype=np.float32)
+        rewards = np.empty(shape, dtype=np.float64)
+        costs = np.empty((*shape, cmdp.num_costs), dtype=np.float64)
+        terminated = np.empty(shape, dtype=np.bool_)
+        truncated = np.empty(shape, dtype=np.bool_)
+        actions: npt.NDArray[Any] | None = None
+        final_observations: list[npt.NDArray[np.float32]] = []
+        for step in range(self._num_steps):
+            chosen = policy.act(current, generator)
+            if actions is None:
+                actions = np.empty((self._num_steps, *chosen.shape), dtype=chosen.dtype)
+            observations[step] = current
+            actions[step] = chosen
+            following, rewards[step], terminated[step], truncated[step], info = environments.step(
+                environment_actions(cmdp.action_space, chosen)
+            )
+            costs[step] = info["cost"]
+            current = observation_rows(cmdp.observation_space, following)
+            truncated[step] &= ~terminated[step]
+            if truncated[step].any():
+                final = info["final_obs"][truncated[step]]
+                final_observations.append(observation_rows(cmdp.observation_space, final))
+        assert actions is not None  # T >= 1
+        return Rollout(
+            observations=observations,
+            actions=actions,
+            rewards=rewards,
+            costs=costs,
+            terminated=terminated,
+            truncated=truncated,
+            final_observations=np.concatenate([observations[0, :0], *final_observations]),
+            last_observations=current,
+            carried_costs=self._costs.copy(),
+        )
+
+    def _collect_by_table(
+        self, environments: FiniteVectorEnv, policy: InvertedPolicy, generator: np.random.Generator
+    ) -> Rollout:
+        """Ask the policy once for every state; equal to the other way, and many times as fast."""
+        observations = environments.observations
+        draws = generator.random((self._num_steps, environments.num_envs))
+        steps = environments.follow(policy.cumulative_masses(observations), draws)
+        return Rollout(
+            observations=observations[steps.states],
+            actions=steps.actions,
+            rewards=steps.rewards,
+            costs=steps.costs,
+            terminated=steps.terminated,
+            truncated=steps.truncated,
+            final_observations=observations[steps.successors[steps.truncated]],
+            last_observations=observations[environments.states],
+            carried_costs=self._costs.copy(),
+        )
 
     def _finished(self, rollout: Rollout) -> tuple[FinishedEpisode, ...]:
         """The episodes that ended in the rollout, and the sums of those under way brought up to date."""
@@ -175,62 +206,6 @@ class Collector:
         self._lengths = np.array(state["lengths"], dtype=np.int64)
         self._returns = np.array(state["returns"], dtype=np.float64)
         self._costs = np.array(state["costs"], dtype=np.float64)
-
-
-def _steps_by_observation(
-    environments: CMDPVectorEnv,
-    observations: npt.NDArray[np.float32],
-    policy: Policy,
-    num_steps: int,
-    generator: np.random.Generator,
-) -> _Steps:
-    """Ask the policy at each observation [B, n], beginning with ``observations``."""
-    cmdp, shape = environments.cmdp, (num_steps, environments.num_envs)
-    seen = np.empty((*shape, observation_size(cmdp.observation_space)), dtype=np.float32)
-    rewards = np.empty(shape, dtype=np.float64)
-    costs = np.empty((*shape, cmdp.num_costs), dtype=np.float64)
-    terminated = np.empty(shape, dtype=np.bool_)
-    truncated = np.empty(shape, dtype=np.bool_)
-    actions: npt.NDArray[Any] | None = None
-    final_observations: list[npt.NDArray[np.float32]] = []
-    current = observations
-    for step in range(num_steps):
-        chosen = policy.act(current, generator)
-        if actions is None:
-            actions = np.empty((num_steps, *chosen.shape), dtype=chosen.dtype)
-        seen[step] = current
-        actions[step] = chosen
-        following, rewards[step], terminated[step], truncated[step], info = environments.step(
-            environment_actions(cmdp.action_space, chosen)
-        )
-        costs[step] = info["cost"]
-        current = observation_rows(cmdp.observation_space, following)
-        truncated[step] &= ~terminated[step]
-        if truncated[step].any():
-            final = info["final_obs"][truncated[step]]
-            final_observations.append(observation_rows(cmdp.observation_space, final))
-    assert actions is not None  # T >= 1
-    finals = np.concatenate([seen[0, :0], *final_observations])
-    return _Steps(seen, actions, rewards, costs, terminated, truncated, finals, current)
-
-
-def _steps_by_table(
-    environments: FiniteVectorEnv, policy: InvertedPolicy, num_steps: int, generator: np.random.Generator
-) -> _Steps:
-    """Ask the policy once for every state; equal to ``_steps_by_observation``, and many times as fast."""
-    observations = environments.observations
-    draws = generator.random((num_steps, environments.num_envs))
-    steps = environments.follow(policy.cumulative_masses(observations), draws)
-    return _Steps(
-        observations=observations[steps.states],
-        actions=steps.actions,
-        rewards=steps.rewards,
-        costs=steps.costs,
-        terminated=steps.terminated,
-        truncated=steps.truncated,
-        final_observations=observations[steps.successors[steps.truncated]],
-        following=observations[environments.states],
-    )
 
 
 def episode_costs(episodes: tuple[FinishedEpisode, ...], num_costs: int) -> npt.NDArray[np.float64]:

@@ -29,7 +29,7 @@ from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.policies import FisherMetric, StochasticPolicy
 from recrl.agents.surrogates import surrogate
-from recrl.agents.trust_region import backtrack, conjugate_gradient
+from recrl.agents.trust_region import conjugate_gradient, line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 NAN = float("nan")
@@ -109,24 +109,11 @@ def constrained_step(
     active = ActiveConstraints.of(constraints)
     problem, solved = linearise(model, active, config, generator)
     solution = solve(problem)
-    step = along(solution, solved)
-    shortened = backtrack(
-        policy.parameters,
-        step,
-        acceptance(model, active, solution, config.target_kl),
-        ratio=config.backtrack_ratio,
-        tries=config.backtrack_tries,
-    )
-    taken = 0.0 if shortened is None else config.backtrack_ratio**shortened
+    is_acceptable = acceptance(model, active, solution, config.target_kl)
+    metrics = line_search(policy.parameters, along(solution, solved), is_acceptable, config)
     multipliers[:] = 0.0
     multipliers[active.index] = solution.multipliers
-    return {
-        "policy_steps": float(shortened is not None),
-        "case": float(solution.case),
-        "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
-        "step_norm": taken * float(step.norm()),
-        **indexed("multiplier", multipliers),
-    }
+    return {**metrics, "case": float(solution.case), **indexed("multiplier", multipliers)}
 
 
 def linearise(

@@ -38,7 +38,7 @@ from recrl.agents.cpo import LocalModel, along, linearise
 from recrl.agents.cpo_dual import NO_INFLUENCE, DualSolution, StepCase, StepProblem, projection_weights
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.trust_region import backtrack
+from recrl.agents.trust_region import line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -123,21 +123,9 @@ class ConstraintRectifiedPolicyOptimisation:
         else:
             solution = step_down(problem, int(np.searchsorted(active.index, mended)), config)
             multipliers[mended] = np.inf  # as if this constraint were all that counts
-        step = along(solution, solved)
-        shortened = backtrack(
-            policy.parameters,
-            step,
-            improvement(model, mended, config.target_kl),
-            ratio=config.backtrack_ratio,
-            tries=config.backtrack_tries,
-        )
-        taken = 0.0 if shortened is None else config.backtrack_ratio**shortened
-        return {
-            "policy_steps": float(shortened is not None),
-            "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
-            "step_norm": taken * float(step.norm()),
-            **indexed("multiplier", multipliers),
-        }
+        is_acceptable = improvement(model, mended, config.target_kl)
+        metrics = line_search(policy.parameters, along(solution, solved), is_acceptable, config)
+        return {**metrics, **indexed("multiplier", multipliers)}
 
 
 def improvement(model: LocalModel, mended: int | None, target_kl: float) -> Callable[[], bool]:

@@ -20,7 +20,7 @@ from recrl.agents.cpo import LocalModel
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.trust_region import backtrack, conjugate_gradient
+from recrl.agents.trust_region import conjugate_gradient, line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -64,19 +64,7 @@ def step_up(
         now, divergence = model.measure()
         return bool(now[0] >= before[0]) and divergence <= config.target_kl
 
-    shortened = backtrack(
-        policy.parameters,
-        direction,
-        is_acceptable,
-        ratio=config.backtrack_ratio,
-        tries=config.backtrack_tries,
-    )
-    taken = 0.0 if shortened is None else config.backtrack_ratio**shortened
-    return {
-        "policy_steps": float(shortened is not None),
-        "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
-        "step_norm": taken * float(direction.norm()),
-    }
+    return line_search(policy.parameters, direction, is_acceptable, config)
 
 
 def step_size(squared: float, target_kl: float, temperature: float) -> float:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from recrl.agents.config import TrustRegionConfig
 from recrl.agents.networks import FlatParameters
 
 # Of a system scaled to a right-hand side of length 1.
@@ -76,3 +77,23 @@ def backtrack(
             return shortened
     parameters.values.copy_(start)
     return None
+
+
+def line_search(
+    parameters: FlatParameters, step: Tensor, is_acceptable: Callable[[], bool], config: TrustRegionConfig
+) -> dict[str, float]:
+    """``backtrack`` with a student's settings.
+
+    Returns:
+        Metrics: ``policy_steps``, 1 or 0; ``line_search_steps``, how often the step was shortened; and
+        ``step_norm``, the length of what was taken.
+    """
+    shortened = backtrack(
+        parameters, step, is_acceptable, ratio=config.backtrack_ratio, tries=config.backtrack_tries
+    )
+    taken = 0.0 if shortened is None else config.backtrack_ratio**shortened
+    return {
+        "policy_steps": float(shortened is not None),
+        "line_search_steps": float(config.backtrack_tries if shortened is None else shortened),
+        "step_norm": taken * float(step.norm()),
+    }
