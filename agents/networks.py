@@ -30,6 +30,40 @@ BLOCK_ROWS = 1024
 # (1 - h^2) slope in one sweep over memory, into ``grad_input``; no public function does that.
 tanh_backward = torch.ops.aten.tanh_backward.grad_input
 
+
+def add_product(into: Tensor, left: Tensor, right: Tensor, *, keep: bool) -> None:
+    """Write left^T right, [C, i, o], into memory, or add it to what the memory holds.
+
+    A single column (o = 1, as critics have) is written as the row right^T left: the same sums in the same
+    order, but MKL takes three times as long for columns of several matrices at once.
+
+    Args:
+        into: [C, i, o].
+        left: [C, U, i].
+        right: [C, U, o].
+        keep: whether to add.
+    """
+    if right.shape[2] == 1:
+        into, left, right = into.transpose(1, 2), right, left
+    if keep:
+        into.baddbmm_(left.transpose(1, 2), right)
+    else:
+        torch.bmm(left.transpose(1, 2), right, out=into)
+
+
+def pull_through(slope: Tensor, weight: Tensor, out: Tensor) -> Tensor:
+    """Write slope weight^T, [C, U, i], into ``out``; an outer product where there is but one output.
+
+    Args:
+        slope: [C, U, o].
+        weight: [C, i, o].
+        out: [C, U, i].
+    """
+    transposed = weight.transpose(1, 2)
+    product = torch.mul if slope.shape[2] == 1 else torch.bmm
+    return product(slope, transposed, out=out)
+
+
 # Initialise one weight matrix [in, out] in place; biases start at 0.
 Initialiser = Callable[[Tensor, torch.Generator], None]
 
@@ -197,8 +231,8 @@ class TanhStack:
         layers = [rows.expand(len(self.weights[0]), *rows.shape)]
         for layer, (weight, bias) in enumerate(zip(self.weights[:-1], self.biases[:-1], strict=True)):
             memory = scratch.tensor(layer, (*layers[0].shape[:2], weight.shape[2]))
-            layers.append(torch.bmm(layers[-1], weight, out=memory).add_(bias).tanh_())
-        layers.append(torch.bmm(layers[-1], self.weights[-1]).add_(self.biases[-1]))
+            layers.append(torch.baddbmm(bias, layers[-1], weight, out=memory).tanh_())
+        layers.append(torch.baddbmm(self.biases[-1], layers[-1], self.weights[-1]))
         return layers
 
     def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
@@ -213,12 +247,15 @@ class TanhStack:
         Returns:
             [C, U, out].
         """
-        moved = torch.baddbmm(change[1], activations[0], change[0])
+        memory = [
+            self._slope_scratch.tensor(layer, hidden.shape)
+            for layer, hidden in enumerate(activations[1:-1], start=1)
+        ] + [torch.empty_like(activations[-1])]
+        moved = torch.baddbmm(change[1], activations[0], change[0], out=memory[0])
         for layer in range(1, len(self.weights)):
             tanh_backward(moved, activations[layer], grad_input=moved)
-            moved = torch.baddbmm(change[2 * layer + 1], moved, self.weights[layer]).baddbmm_(
-                activations[layer], change[2 * layer]
-            )
+            moved = torch.baddbmm(change[2 * layer + 1], moved, self.weights[layer], out=memory[layer])
+            moved.baddbmm_(activations[layer], change[2 * layer])
         return moved
 
     def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
@@ -233,15 +270,14 @@ class TanhStack:
         """
         for layer in range(len(self.weights) - 1, -1, -1):
             by_weight, by_bias = self._slopes[layer]
+            add_product(by_weight, activations[layer], slope, keep=add)
             if add:
-                by_weight.baddbmm_(activations[layer].transpose(1, 2), slope)
                 by_bias.add_(slope.sum(dim=1, keepdim=True))
             else:
-                torch.bmm(activations[layer].transpose(1, 2), slope, out=by_weight)
                 torch.sum(slope, dim=1, keepdim=True, out=by_bias)
             if layer > 0:
                 memory = self._slope_scratch.tensor(layer, activations[layer].shape)
-                slope = torch.bmm(slope, self.weights[layer].transpose(1, 2), out=memory)
+                slope = pull_through(slope, self.weights[layer], out=memory)
                 tanh_backward(slope, activations[layer], grad_input=slope)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
+from weakref import ref
 
 import gymnasium
 import numpy as np
@@ -76,6 +77,7 @@ class StochasticPolicy:
         self._biases = [bias[0] for bias in acting[layers][1::2]]
         self._acting_log_std = acting[-1]
         self._scratch: list[Scratch] = []
+        self._latest: _Latest | None = None
 
     def publish(self) -> None:
         """Let acting know of changed parameters; on a CPU it always does."""
@@ -140,8 +142,17 @@ class StochasticPolicy:
         return probabilities
 
     def distribution(self, rows: Tensor) -> Distribution:
-        """The action distributions at U rows, [U, n]; not differentiable, see ``evaluate``."""
-        return self.head(self.stack.outputs(rows)[0], self.log_std.clone())  # the policy will move
+        """The action distributions at U rows, [U, n]; not differentiable, see ``evaluate``.
+
+        Asked again for the same rows at the same parameters, it gives what it gave: what a line search has
+        accepted is not evaluated anew to be measured.
+        """
+        latest = self._latest
+        if latest is None or not latest.is_of(rows, self.parameters.values):
+            kept = self.log_std.clone()  # the policy will move
+            distribution = self.head(self.stack.outputs(rows)[0], kept)
+            self._latest = latest = _Latest(ref(rows), self.parameters.values.clone(), distribution)
+        return latest.distribution
 
     def evaluate(self, rows: Tensor) -> PolicyEvaluation:
         """The action distributions at U rows, [U, n], of which a loss can be differentiated."""
@@ -207,6 +218,25 @@ class StochasticPolicy:
             "randomness_before": mean_before,
             "randomness_after": mean_after,
         }
+
+
+@dataclass(frozen=True, eq=False)
+class _Latest:
+    """What a policy was asked for last.
+
+    Attributes:
+        rows: where; not kept alive.
+        parameters: with which, a copy, [P].
+        distribution: what came out.
+    """
+
+    rows: ref[Tensor]
+    parameters: Tensor
+    distribution: Distribution
+
+    def is_of(self, rows: Tensor, parameters: Tensor) -> bool:
+        """Whether it is what these rows, as long as nobody writes to them, and parameters give."""
+        return self.rows() is rows and torch.equal(self.parameters, parameters)
 
 
 def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:

@@ -204,3 +204,19 @@ def test_probabilities_are_the_distributions() -> None:
 def test_continuous_actions_have_no_probabilities() -> None:
     with pytest.raises(ValueError, match="continuous actions have densities, not probabilities"):
         policy_for(TWO_COMPONENTS).probabilities(random_rows().numpy())
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_what_is_asked_for_again_is_not_computed_again_and_a_policy_that_moved_is(
+    space: Space[object],
+) -> None:
+    policy, rows = policy_for(space), random_rows()
+    before = policy.distribution(rows)
+    assert policy.distribution(rows) is before
+    policy.parameters.values.add_(0.1)
+    after = policy.distribution(rows)
+    assert float(mean_divergence(before, after, torch.full((6,), 1.0 / 6.0))) > 0.0
+    # neither for equal parameters nor for equal rows that are others is anything taken over
+    torch.testing.assert_close(policy.distribution(rows.clone()).entropy(), after.entropy())
+    policy.parameters.values.sub_(0.1)
+    torch.testing.assert_close(policy.distribution(rows).entropy(), before.entropy())
