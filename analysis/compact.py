@@ -25,6 +25,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.frames import KEY, TRIAL, Sweep, TrialFacts, assemble, drawn_columns
+from recrl.orchestrator.archives import UNREADABLE, unpacked
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import write_atomically
@@ -34,6 +35,7 @@ FORMAT = 1
 DIGITS = 6
 FRAMES = ("phases", "updates", "evaluations", "events", "policies")
 ROUNDED = ("updates", "policies")
+MAX_BYTES = 512 * 2**20  # unpacked; about 50 times the largest sweep so far
 LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: zip knows none before
 
 
@@ -43,6 +45,9 @@ def save(sweep: Sweep, path: Path) -> Path:
     Args:
         sweep: finished or not.
         path: of the file; its folder is made if it is not there.
+
+    Raises:
+        RecrlError: nobody would read it back, as it is too large.
     """
     positions = {key: position for position, key in enumerate(_keys(sweep))}
     members = {"sweep.json": json.dumps(_told(sweep), indent=1, allow_nan=False) + "\n"}
@@ -55,6 +60,9 @@ def save(sweep: Sweep, path: Path) -> Path:
         members[f"{name}.csv"] = (_rounded(rows) if name in ROUNDED else rows).to_csv(
             index=False, lineterminator="\n"
         )
+    size = sum(len(text.encode()) for text in members.values())
+    if size > MAX_BYTES:
+        raise RecrlError(f"{path}: a compact file may unpack to {MAX_BYTES} bytes, this one has {size}")
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as archive:
         for name, text in members.items():
@@ -68,16 +76,19 @@ def load(path: Path) -> Sweep:
     """Read a compact file back.
 
     Raises:
-        RecrlError: the file is not there, or is none.
+        RecrlError: the file is not there, is none, or unpacks to more than MAX_BYTES.
     """
+    names = ("sweep.json", *(f"{name}.csv" for name in FRAMES))
     try:
         with zipfile.ZipFile(path) as archive:
-            told = json.loads(archive.read("sweep.json"))
-            rows = {name: pd.read_csv(io.BytesIO(archive.read(f"{name}.csv"))) for name in FRAMES}
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
+            sweep, *frames = unpacked(archive, names, max_bytes=MAX_BYTES)
+        told = json.loads(sweep)
+        rows = {name: pd.read_csv(io.BytesIO(data)) for name, data in zip(FRAMES, frames, strict=True)}
+    except UNREADABLE as error:
         raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({error})") from error
-    if told.get("format") != FORMAT:
-        raise RecrlError(f"{path}: its format must be {FORMAT}, got {told.get('format')!r}")
+    found = told.get("format") if isinstance(told, dict) else None
+    if found != FORMAT:
+        raise RecrlError(f"{path}: its format must be {FORMAT}, got {found!r}")
     return assemble(
         told["name"],
         [_facts(trial, told["provenance"]) for trial in told["trials"]],

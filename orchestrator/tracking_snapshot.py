@@ -26,7 +26,6 @@ import hashlib
 import io
 import math
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -35,6 +34,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from recrl.environments.cmdp import Floats
+from recrl.orchestrator.archives import UNREADABLE, unpacked
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.store import TrialStore
 from recrl.orchestrator.tracking_database import Points
@@ -52,8 +52,6 @@ NUMBERS = "<f8"
 BEFORE_METRICS = 3  # columns of the points
 LARGEST = 2**53  # below which float64 holds every integer
 LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: equal snapshots give equal bytes
-# What unpacking a damaged or hostile archive raises; RuntimeError stands for encryption and deep nesting.
-UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError, IndexError)
 
 STRICT = ConfigDict(frozen=True, extra="forbid")
 Count = Annotated[int, Field(ge=0, lt=LARGEST)]
@@ -314,12 +312,6 @@ def _members(data: bytes) -> list[bytes]:
         ValueError: they are not; what else is wrong with the archive, ``zipfile`` says.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        there = archive.infolist()
-        if tuple(it.filename for it in there) != MEMBERS:
+        if tuple(archive.namelist()) != MEMBERS:
             raise ValueError(f"its members must be {', '.join(MEMBERS)}")
-        if any(it.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for it in there):
-            raise ValueError("its members must be deflated")
-        size = sum(it.file_size for it in there)
-        if size > MAX_BYTES:
-            raise ValueError(f"it unpacks to {size} bytes, at most {MAX_BYTES} are taken")
-        return [archive.read(it) for it in there]  # at most as many bytes as were just counted
+        return unpacked(archive, MEMBERS, max_bytes=MAX_BYTES)

@@ -1,5 +1,6 @@
 """A finished sweep in one file: what comes back, and what it leaves out."""
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -77,6 +78,29 @@ def test_what_is_no_compact_file_is_named(tmp_path: Path) -> None:
         compact.load(path)
     path.write_text("nothing")
     with pytest.raises(RecrlError, match="File is not a zip file"):
+        compact.load(path)
+
+
+def test_a_file_that_would_fill_the_memory_is_refused(
+    finished: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = compact.save(finished, tmp_path / "sweep.zip")
+    monkeypatch.setattr(compact, "MAX_BYTES", 10_000)
+    with pytest.raises(RecrlError, match=r"file \(it unpacks to \d+ bytes, at most 10000 are taken\)"):
+        compact.load(path)
+    with pytest.raises(RecrlError, match=r"a compact file may unpack to 10000 bytes, this one has \d+"):
+        compact.save(finished, path)
+
+
+@pytest.mark.parametrize("told", ["[]", '{"format": 2}', "null"])
+def test_a_file_of_another_format_is_named(finished: Sweep, tmp_path: Path, told: str) -> None:
+    path = compact.save(finished, tmp_path / "sweep.zip")
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, member in (members | {"sweep.json": told.encode()}).items():
+            archive.writestr(name, member)
+    with pytest.raises(RecrlError, match=r"sweep\.zip: its format must be 1, got (2|None)"):
         compact.load(path)
 
 
