@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -13,6 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from recrl.orchestrator.beside import beside
 from recrl.orchestrator.plan import Estimate, Plan, Work
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, standing_of
 from recrl.orchestrator.store import TrialStore
@@ -171,15 +173,9 @@ def live_progress(ask: Callable[[], SweepProgress], console: Console) -> Iterato
         ask: reads the progress from the files.
         console: where to show it.
     """
-    done = threading.Event()
     show = _show_in_place if console.is_terminal else _show_lines
-    thread = threading.Thread(target=show, args=(ask, console, done), name="progress", daemon=True)
-    thread.start()
-    try:
+    with beside(partial(show, ask, console), name="progress"):
         yield
-    finally:
-        done.set()
-        thread.join()
 
 
 def _show_in_place(ask: Callable[[], SweepProgress], console: Console, done: threading.Event) -> None:

@@ -31,9 +31,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.remote_trial import ALIVE, RemoteTrial, Upload, patiently, working_copy
@@ -198,7 +200,7 @@ class RemoteSweep:
             StorageError: the store cannot be read at the end.
         """
 
-        def follow() -> None:
+        def follow(over: threading.Event) -> None:
             pause = every
             while not over.wait(pause):
                 try:
@@ -210,14 +212,8 @@ class RemoteSweep:
                 else:
                     pause = every
 
-        over = threading.Event()
-        thread = threading.Thread(target=follow, name="mirror", daemon=True)
-        thread.start()
-        try:
+        with beside(follow, name="mirror"):
             yield
-        finally:
-            over.set()
-            thread.join()
         patiently(lambda: self._pull_trials(store), stop.is_set)
 
     def publish(self, store: SweepStore) -> None:
@@ -279,16 +275,11 @@ class RemoteSweep:
         }
         self._take(own)
         self._token = str(own["token"])
-        over = threading.Event()
-        thread = threading.Thread(target=self._hold, args=(own, stop, over), name="launch", daemon=True)
         try:
             self.objects.delete([STOP_REQUEST])
-            thread.start()
-            yield
+            with beside(partial(self._hold, own, stop), name="launch"):
+                yield
         finally:
-            over.set()
-            if thread.is_alive():
-                thread.join()
             try:
                 if self._holder().get("token") == own["token"]:
                     self.objects.delete([STOP_REQUEST, LAUNCH])

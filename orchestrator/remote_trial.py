@@ -30,9 +30,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Self
 
 from recrl.orchestrator import checkpoint
+from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.scratch import scratch_folder
@@ -476,7 +478,7 @@ def working_copy(
         patiently(lambda: remote.take_up(trial), should_stop)
         upload = Upload(remote, trial)
         try:
-            with _followed(upload):
+            with beside(partial(_follow, upload), name="upload"):
                 yield trial
         except Exception:  # but not a KeyboardInterrupt: that means at once
             _finish(upload, should_stop)
@@ -492,36 +494,24 @@ def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:
         logger.warning("%s", error)
 
 
-@contextmanager
-def _followed(upload: Upload) -> Iterator[None]:
-    """Send what is committed, from a thread beside the body."""
-
-    def follow() -> None:
-        pause = LOOK_SECONDS
-        while not over.wait(pause):
-            try:
-                upload.follow()
-            except LostLeaseError as error:
-                logger.warning("%s", error)
-                upload.revoke()
-                return
-            except (StorageError, OSError) as error:
-                if pause == LOOK_SECONDS:
-                    logger.warning("%s; the trial goes on, this is tried again", error)
-                pause = min(2.0 * max(pause, FIRST_PAUSE_SECONDS / 2.0), LONGEST_PAUSE_SECONDS)
-            else:
-                if pause > LOOK_SECONDS:
-                    logger.info("the storage takes everything again")
-                pause = LOOK_SECONDS
-
-    over = threading.Event()
-    thread = threading.Thread(target=follow, name="upload", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+def _follow(upload: Upload, over: threading.Event) -> None:
+    """Send what is committed, until it is over."""
+    pause = LOOK_SECONDS
+    while not over.wait(pause):
+        try:
+            upload.follow()
+        except LostLeaseError as error:
+            logger.warning("%s", error)
+            upload.revoke()
+            return
+        except (StorageError, OSError) as error:
+            if pause == LOOK_SECONDS:
+                logger.warning("%s; the trial goes on, this is tried again", error)
+            pause = min(2.0 * max(pause, FIRST_PAUSE_SECONDS / 2.0), LONGEST_PAUSE_SECONDS)
+        else:
+            if pause > LOOK_SECONDS:
+                logger.info("the storage takes everything again")
+            pause = LOOK_SECONDS
 
 
 def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:

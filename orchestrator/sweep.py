@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import TYPE_CHECKING, Protocol
 
+from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.grid import GridSpec
@@ -179,21 +180,17 @@ def _settle(specs: Sequence[TrialSpec], store: SweepStore, storage: RemoteSweep 
 def _stopping_on_request(store: SweepStore, stop: threading.Event) -> Iterator[None]:
     """Set ``stop`` when ``request_stop`` is called, in whatever process; what was asked before is void."""
 
-    def watch() -> None:
+    def watch(over: threading.Event) -> None:
         while not over.wait(REQUEST_SECONDS):
             if store.stop_request_path.exists():
                 stop.set()
                 return
 
     store.stop_request_path.unlink(missing_ok=True)
-    over = threading.Event()
-    thread = threading.Thread(target=watch, name="stop request", daemon=True)
-    thread.start()
     try:
-        yield
+        with beside(watch, name="stop request"):
+            yield
     finally:
-        over.set()
-        thread.join()
         store.stop_request_path.unlink(missing_ok=True)
 
 

@@ -19,6 +19,7 @@ ALLOWED = {
     "agents": ("recrl.environments",),
     "analysis": (
         "recrl.environments",
+        "recrl.orchestrator.archives",
         "recrl.orchestrator.errors",
         "recrl.orchestrator.phase_totals",
         "recrl.orchestrator.spec",
@@ -49,7 +50,17 @@ ADAPTERS = {
 }
 # The order inside the orchestrator: no module may import one that stands in a later line.
 LAYERS = (
-    ("errors", "exit_codes", "located_yaml", "own_package", "phase_totals", "provenance", "scratch"),
+    (
+        "archives",
+        "beside",
+        "errors",
+        "exit_codes",
+        "located_yaml",
+        "own_package",
+        "phase_totals",
+        "provenance",
+        "scratch",
+    ),
     ("spec", "checkpoint", "heartbeat", "object_store"),
     ("store", "validation"),
     (
