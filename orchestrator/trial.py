@@ -305,8 +305,9 @@ def run_trial(
         Exception: whatever the task, the student or the teacher raised, with a note of where; the last
             commit stands.
     """
-    trial = Trial(spec, writer, teacher)
-    with Heartbeat(_beat_of(trial, writer), seconds=HEARTBEAT_SECONDS) as heartbeat:
+    life = _Life(writer)
+    with Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS) as heartbeat:  # to get ready may take minutes
+        trial = life.of(Trial(spec, writer, teacher))
         committed = time.monotonic()
         while not trial.learned and not should_stop():
             with _located(f"in update {trial.update + 1}", writer):
@@ -328,19 +329,33 @@ def run_trial(
     return TrialState.COMPLETE
 
 
-def _beat_of(trial: Trial, writer: TrialWriter) -> Callable[[], None]:
-    """What says that the trial lives, how far it is, and how fast: over its last updates, however long."""
-    steps, since, speed = trial.env_steps, time.monotonic(), 0.0
+class _Life:
+    """What a trial's heartbeat says: how far it is, and how fast over its last updates, however long."""
 
-    def beat() -> None:
-        nonlocal steps, since, speed
-        now, done = time.monotonic(), trial.env_steps
-        if done > steps:
-            speed = (done - steps) / (now - since)
-            steps, since = done, now
-        writer.heartbeat(update=trial.update, env_steps=done, steps_per_second=speed)
+    def __init__(self, writer: TrialWriter) -> None:
+        self._writer = writer
+        self._trial: Trial | None = None
+        self._speed = 0.0
 
-    return beat
+    def of(self, trial: Trial) -> Trial:
+        """The trial, now that it is made; until then the heartbeat says where it stood before."""
+        self._steps, self._since = trial.env_steps, time.monotonic()
+        self._trial = trial
+        return trial
+
+    def beat(self) -> None:
+        """Say it."""
+        if self._trial is None:
+            before = self._writer.record
+            self._writer.heartbeat(
+                update=before.update, env_steps=before.env_steps, steps_per_second=self._speed
+            )
+            return
+        now, done = time.monotonic(), self._trial.env_steps
+        if done > self._steps:
+            self._speed = (done - self._steps) / (now - self._since)
+            self._steps, self._since = done, now
+        self._writer.heartbeat(update=self._trial.update, env_steps=done, steps_per_second=self._speed)
 
 
 @contextmanager
@@ -378,6 +393,7 @@ def run_recorded(
         TeacherUnavailableError: the teacher's process is gone; the trial waits to be resumed.
     """
     torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
+    provenance = collect_provenance()  # waits for git, in silence: so before the trial begins
     try:
         writer = store.begin(spec)
     except StorageError as error:
@@ -386,7 +402,7 @@ def run_recorded(
     with _log_to(store):
         try:
             with store.writing():
-                write_json(store.provenance_path, collect_provenance())
+                write_json(store.provenance_path, provenance)
             return run_trial(
                 spec,
                 writer,

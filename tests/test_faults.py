@@ -39,6 +39,26 @@ SPEC = TrialSpec(
     seed=0,
 )
 
+# A task of the user's own that takes long to make: until somebody has heard of its trial.
+SLOW_TASK = """\
+import time
+from pathlib import Path
+from recrl.environments.two_state import TwoStateOptions, make_two_state
+from recrl.environments.registry import Task
+
+STATE = Path({state!r})
+heard = False
+
+def make(name, num_envs, options):
+    global heard
+    before, end = STATE.read_bytes(), time.monotonic() + 30.0
+    while not heard and time.monotonic() < end:
+        heard = STATE.read_bytes() != before
+    return make_two_state("two-state", num_envs, options)
+
+TASK = Task("Slow.", TwoStateOptions, make)
+"""
+
 # A task of the user's own whose rewards are no numbers from the twelfth step on.
 POISONED_TASK = """\
 import numpy as np
@@ -207,6 +227,18 @@ def test_a_thread_that_works_is_heard_and_one_that_waits_is_not() -> None:
     heard.clear()
     with Heartbeat(heard.set, seconds=0.05):
         assert not heard.wait(0.5)
+
+
+def test_a_trial_that_takes_long_to_begin_is_heard_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = replace(SPEC, task=Choice("my_slow_task:TASK", {"horizon": 10}))
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    (tmp_path / "my_slow_task.py").write_text(SLOW_TASK.format(state=str(store.state_path)))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("recrl.orchestrator.trial.HEARTBEAT_SECONDS", 0.01)
+    assert run_recorded(spec, store, should_stop=lambda: True) is TrialState.WAITING
+    assert sys.modules.pop("my_slow_task").heard
 
 
 def test_a_trial_that_was_taken_over_learns_it_from_its_heartbeat() -> None:
