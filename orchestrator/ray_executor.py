@@ -78,6 +78,22 @@ WORKER = {
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
 }
 
+# Ray's processes look after themselves up to ten times a second. A cluster of our own has one machine, no
+# objects to speak of, and nobody who reads its metrics; none of these settings tells that a process has died.
+SELDOM: Mapping[str, Any] = {
+    "enable_metrics_collection": False,
+    "gcs_pull_resource_loads_period_milliseconds": 10_000,  # for an autoscaler
+    "kill_idle_workers_interval_ms": 1_000,
+    "local_fs_monitor_interval_ms": 10_000,  # before objects are spilled to disk
+    "memory_monitor_refresh_ms": 2_000,
+    "object_manager_timer_freq_ms": 1_000,
+    "prestart_worker_first_driver": False,  # a worker without work wakes a hundred times a second
+    "raylet_check_gc_period_milliseconds": 10_000,
+}
+# Processes that ``ray start`` can leave out and ``ray.init`` cannot: one copies the workers' output to the
+# driver, which does not want it (trials have logs), the other asks for machines where there are none.
+LEFT_OUT: Mapping[str, Any] = {"include_log_monitor": False, "no_monitor": True}
+
 logger = logging.getLogger("recrl.sweep")
 
 
@@ -344,7 +360,8 @@ class _Silence:
     """Ends the processes of trials that hang, so that Tune starts these trials again.
 
     Silence is measured on this process's clock, from when it last saw a heartbeat change: the clocks of the
-    nodes need not agree.
+    nodes need not agree. A process that was given a trial is not silent before it first speaks of it: it may
+    take long to import torch on a busy machine, and what is on disk until then is an earlier attempt's.
     """
 
     def __init__(self, store: SweepStore, seconds: float, storage: RemoteSweep | None) -> None:
@@ -353,6 +370,10 @@ class _Silence:
         self._storage = storage
         self._heard: dict[str, tuple[tuple[int, float], float]] = {}
         self._looked_at = float("-inf")
+
+    def begin(self, trial: Any) -> None:
+        """A process is given one of Tune's trials."""
+        self._heard[trial.trial_id] = (_sign_of(self._store.trial(_spec_of(trial)).record()), float("inf"))
 
     def end(self, trials: Sequence[Any]) -> None:
         """End those of Tune's trials whose recrl trial runs without a heartbeat."""
@@ -369,7 +390,7 @@ class _Silence:
                 continue
             spec = _spec_of(trial)
             record = self._store.trial(spec).record()
-            sign = (record.attempt, record.heartbeat)
+            sign = _sign_of(record)
             last, heard_at = self._heard.get(trial.trial_id, (None, now))
             if sign != last:
                 self._heard[trial.trial_id] = (sign, now)
@@ -377,6 +398,11 @@ class _Silence:
                 self._heard[trial.trial_id] = (sign, float("inf"))  # once for a silence
                 logger.warning("%s: no sign of work for %.0f seconds", spec.title, self._seconds)
                 _end_process(record, trial.temporary_state.ray_actor)
+
+
+def _sign_of(record: TrialRecord) -> tuple[int, float]:
+    """What changes with every sign of life."""
+    return record.attempt, record.heartbeat
 
 
 def look_seconds(silence_seconds: float) -> float:
@@ -449,6 +475,7 @@ class _Watch(tune.Callback):
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Look again soon: where one trial begins, others may."""
         self._last_event = time.monotonic()
+        self._silence.begin(trial)
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """Look again soon: the next trial is to begin."""
@@ -529,6 +556,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
                 num_cpus=num_cpus,
                 include_dashboard=False,
                 object_store_memory=OBJECT_STORE_BYTES,
+                _system_config=dict(SELDOM),
                 _temp_dir=f"{folder}/ray",
             ):
                 yield
@@ -589,7 +617,7 @@ def _connect(**settings: Any) -> None:
     """``ray.init``, tried again where a busy machine took longer than the seconds that Ray allows."""
     for tries_left in range(CONNECT_TRIES - 1, -1, -1):
         try:
-            with _own_signal_handlers(), _own_sessions():
+            with _own_signal_handlers(), _own_sessions(), _fewer_processes():
                 ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
             return
         except Exception as error:  # that a node is too slow to start, Ray says by a bare Exception
@@ -639,6 +667,18 @@ def _own_sessions() -> Iterator[None]:
         yield
     finally:
         services.ConsolePopen = popen
+
+
+@contextmanager
+def _fewer_processes() -> Iterator[None]:
+    """Start no process of LEFT_OUT; where a cluster is there already, none is started anyhow."""
+    module: Any = ray._private.parameter
+    whole = module.RayParams
+    module.RayParams = partial(whole, **LEFT_OUT)
+    try:
+        yield
+    finally:
+        module.RayParams = whole
 
 
 @cache

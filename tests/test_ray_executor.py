@@ -1,15 +1,19 @@
 """A sweep on Ray leaves the bytes of an inline one, whoever is killed or stopped on the way."""
 
+import json
 import os
 import re
+import shutil
 import signal
 import stat
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,6 +27,7 @@ from recrl.orchestrator.ray_executor import (
     LONGEST_PAUSE_SECONDS,
     RayExecutor,
     StopFile,
+    _Silence,
     existing_cluster,
     local_cluster,
     pause_seconds,
@@ -30,7 +35,7 @@ from recrl.orchestrator.ray_executor import (
 from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
 from recrl.orchestrator.remote_sweep import RemoteSweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore
+from recrl.orchestrator.store import SweepStore, write_json
 from recrl.orchestrator.teacher_service import RayTeacher, start_teacher_service
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, TeacherSpec
@@ -307,6 +312,17 @@ def test_only_this_user_can_read_the_clusters_token() -> None:
 
 
 @pytest.mark.usefixtures("cluster")
+def test_a_cluster_of_ours_has_no_process_that_serves_nobody() -> None:
+    commands = [
+        path.read_bytes()
+        for path in Path("/proc").glob("[0-9]*/cmdline")
+        if os.environ["RAY_AUTH_TOKEN_PATH"].removesuffix("token").encode() in path.read_bytes()
+    ]
+    assert any(b"gcs_server" in command for command in commands)
+    assert not any(name in command for command in commands for name in (b"log_monitor", b"monitor.py"))
+
+
+@pytest.mark.usefixtures("cluster")
 def test_rays_signal_handlers_do_not_replace_ours() -> None:
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
@@ -322,6 +338,35 @@ def test_a_cluster_that_is_not_there_is_a_sentence() -> None:
 def test_a_trial_that_ends_is_seen_within_a_hundredth_of_its_time_and_half_a_second() -> None:
     assert [pause_seconds(seconds) for seconds in (0.0, 0.01, 10.0, 50.0, 1e6)] == [0.0, 1e-4, 0.1, 0.5, 0.5]
     assert LONGEST_PAUSE_SECONDS == 0.5
+
+
+def test_a_process_is_silent_only_after_it_has_spoken_of_its_trial(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    files = store.trial(LONG)
+    tune_trial = SimpleNamespace(
+        trial_id="1",
+        status="RUNNING",
+        config={"spec": json.dumps(LONG.to_json())},
+        temporary_state=SimpleNamespace(ray_actor=None),
+    )
+    process = subprocess.Popen(["ray::trial", "60"], executable=shutil.which("sleep"))
+    try:
+        files.begin(LONG)  # by a process that is dead, and left its record so
+        silence = _Silence(store, 0.0, None)
+        silence.begin(tune_trial)
+        write_json(files.state_path, asdict(replace(files.record(), pid=process.pid)))
+        for _ in range(3):
+            silence.end([tune_trial])
+        assert process.poll() is None
+        files.begin(LONG)
+        write_json(files.state_path, asdict(replace(files.record(), pid=process.pid)))
+        silence.end([tune_trial])
+        assert process.poll() is None
+        silence.end([tune_trial])
+        assert process.wait(timeout=30.0) == -signal.SIGKILL
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_a_stop_file_tells_its_own_run_and_all_earlier_ones(tmp_path: Path) -> None:
