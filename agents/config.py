@@ -254,6 +254,11 @@ class FOCOPSConfig(AscentConfig, MultiplierConfig):
         "trust_region": "passed",
     }
 
+    policy_learning_rate: Positive = Field(
+        default=3e-4,
+        description="Adam's, for the policy (Zhang et al. 2020). Larger steps go far past the trust region "
+        "before the KL is seen.",
+    )
     temperature: Positive = Field(
         default=0.5,
         description="lambda, standard deviations of the reward advantages that are worth a nat (ours; Zhang "
