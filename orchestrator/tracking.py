@@ -37,7 +37,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -48,6 +48,7 @@ from recrl.orchestrator.phase_totals import phase_totals
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.status import Standing, standing_of
 from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_atomically, write_json
+from recrl.orchestrator.tracking_database import Database, OtherTables, ShownRun
 from recrl.orchestrator.tracking_points import (
     VIEW,
     VIEW_STATE,
@@ -74,7 +75,6 @@ from recrl.orchestrator.tracking_snapshot import (
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
-BATCH = 1_000  # metrics of a request; MLflow takes no more, and a row costs least in a full one
 MAX_ERROR = 5_000  # characters of a failed trial's error
 MAX_TAG = 8_000  # characters; MLflow cuts longer ones off, and half a JSON value is none
 SNAPSHOT_SECONDS = 600.0  # between two snapshots of a sweep that runs, at least
@@ -260,6 +260,8 @@ class _View:
         self._folder = mirror_folder(store, uri)
         self._sweep_tags = {"recrl.sweep": store.name, "recrl.sweep_id": _sweep_id(store)}
         self.experiment_id = self._find_experiment()
+        self._places: dict[str, str] = {}  # of the runs' artifacts
+        self._without_params: set[str] = set()  # runs that were just made, or whose maker died over them
         self._runs = self._find_runs()
         if rebuild:
             for run_id in self._runs.values():
@@ -288,8 +290,11 @@ class _View:
         return self._folder / "sweep.json"
 
     def show_trial(self, trial: TrialStore, *, live: bool) -> int:
-        """Bring the trial's run up to date; returns the number of points sent."""
-        from mlflow.entities import Metric  # noqa: PLC0415  (mlflow takes seconds to import)
+        """Bring the trial's run up to date; returns the number of points sent.
+
+        In as few requests as MLflow allows, because each costs the server, or this process, about 10 ms.
+        """
+        from mlflow.entities import Metric, Param, RunTag  # noqa: PLC0415  (mlflow takes seconds to import)
 
         record = trial.record()
         status = run_status(record, live=live)
@@ -317,12 +322,22 @@ class _View:
             summary = {point.key: point.value for point in last if point.key.startswith("summary/")}
             new_points, position = [*new_points, *last], replace(position, summary=summary)
         metrics = [Metric(point.key, point.value, point.milliseconds, point.step) for point in new_points]
-        for start in range(0, len(metrics), BATCH):
-            self.client.log_batch(position.run_id, metrics=metrics[start : start + BATCH])
-        position = self._send_results(trial, record, position)
-        for path in added:
-            position = self._send_files(position, [path], path.parent.name)
-        self._send_state(trial, record, status, position)
+        is_new = position.run_id in self._without_params
+        told = [Param(key, value) for key, value in params(trial.spec).items()] if is_new else []
+        try:
+            position = self._send_results(trial, record, position)
+            for path in added:
+                position = self._send_files(position, [path], path.parent.name)
+        except OSError:  # where there is no room for files there may be some for the curves
+            self.client.log_batch(position.run_id, metrics=metrics, params=told)
+            raise
+        tags = [RunTag(key, value) for key, value in _state_tags(trial, record).items() if value]
+        self.client.log_batch(position.run_id, metrics=metrics, params=told, tags=tags)
+        self._without_params.discard(position.run_id)
+        if position.shown.get("error") and not record.error:
+            self.client.delete_tag(position.run_id, "recrl.error")
+        if position.shown.get("status") != status:
+            self._set_status(position.run_id, status, record.heartbeat)
         self._save(trial, replace(position, shown=shown))
         return len(metrics)
 
@@ -446,19 +461,36 @@ class _View:
     def _find_runs(self) -> dict[str, str]:
         """Run by trial id, and the parent by the empty id; the oldest where there are several."""
         runs: dict[str, str] = {}
+        for run in sorted(self._shown_runs(), key=lambda run: run.start_time):
+            if run.tags.get("recrl.sweep_id") == self._sweep_tags["recrl.sweep_id"]:
+                runs.setdefault(run.tags.get("recrl.trial_id", ""), run.run_id)
+                self._places[run.run_id] = run.artifacts
+        return runs
+
+    def _shown_runs(self) -> Iterable[ShownRun]:
+        """The experiment's runs, without the points: MLflow's client would take 5 ms for each of them."""
+        if not is_server(self._uri):
+            return Database(self._uri, OtherTables(self._uri)).runs(self.experiment_id)
+        found: list[ShownRun] = []
         token: str | None = None
-        while True:
+        while token is None or token:
             page = self.client.search_runs(
                 [self.experiment_id],
                 filter_string=f"tags.`recrl.sweep_id` = '{self._sweep_tags['recrl.sweep_id']}'",
-                order_by=["attributes.start_time ASC"],
                 page_token=token,
             )
-            for run in page:
-                runs.setdefault(run.data.tags.get("recrl.trial_id", ""), run.info.run_id)
-            token = page.token
-            if not token:
-                return runs
+            found += [
+                ShownRun(
+                    str(run.info.run_id),
+                    str(run.info.artifact_uri),
+                    run.info.start_time,
+                    run.data.tags,
+                    frozenset(run.data.metrics),
+                )
+                for run in page
+            ]
+            token = page.token or ""
+        return found
 
     def _create_parent(self) -> str:
         records = (trial.record() for trial in self.store.trials())
@@ -469,11 +501,10 @@ class _View:
             run_name=self.store.name,
             tags={**self._sweep_tags, "recrl.kind": "sweep"},
         )
+        self._places[run.info.run_id] = str(run.info.artifact_uri)
         return str(run.info.run_id)
 
     def _create_run(self, trial: TrialStore, record: TrialRecord) -> str:
-        from mlflow.entities import Param  # noqa: PLC0415
-
         spec = trial.spec
         tags = {
             **self._sweep_tags,
@@ -488,7 +519,8 @@ class _View:
         )
         run_id = str(run.info.run_id)
         self._runs[spec.trial_id] = run_id
-        self.client.log_batch(run_id, params=[Param(key, value) for key, value in params(spec).items()])
+        self._places[run_id] = str(run.info.artifact_uri)
+        self._without_params.add(run_id)
         return run_id
 
     def _delete_run(self, run_id: str) -> None:
@@ -503,6 +535,8 @@ class _View:
             found = self._runs.get(trial.spec.trial_id)
             if position is None or position.run_id != found:
                 position = Position(found or self._create_run(trial, record))
+                if found and not self.client.get_run(found).data.params:
+                    self._without_params.add(found)
             self._positions[name] = position
         return self._positions[name]
 
@@ -512,25 +546,6 @@ class _View:
     def _save(self, trial: TrialStore, position: Position) -> None:
         write_json(self._position_path(trial), asdict(position))
         self._positions[trial.folder.name] = position
-
-    def _send_state(self, trial: TrialStore, record: TrialRecord, status: str, position: Position) -> None:
-        from mlflow.entities import RunTag  # noqa: PLC0415
-
-        tags = {
-            "recrl.status": record.status,
-            "recrl.attempt": str(record.attempt),
-            "recrl.host": record.host,
-            "recrl.error": record.error[:MAX_ERROR],
-            PROGRESS_TAG: _json_tag({name: getattr(record, name) for name in PROGRESS}),
-        }
-        if record.status is TrialState.COMPLETE:
-            totals = phase_totals(trial.episodes(), trial.spec.deploy_limits.values)
-            tags[PHASES_TAG] = _json_tag(totals)
-        self.client.log_batch(position.run_id, tags=[RunTag(key, tags[key]) for key in tags if tags[key]])
-        if position.shown.get("error") and not record.error:
-            self.client.delete_tag(position.run_id, "recrl.error")
-        if position.shown.get("status") != status:
-            self._set_status(position.run_id, status, record.heartbeat)
 
     def _set_status(self, run_id: str, status: str, end: float) -> None:
         if status in ("RUNNING", "SCHEDULED"):
@@ -549,14 +564,35 @@ class _View:
 
     def _send_files(self, position: Position, paths: Sequence[Path], folder: str | None = None) -> Position:
         """Add those of the files that are there, not empty, and not sent as they are now."""
+        from mlflow.store.artifact.artifact_repository_registry import (  # noqa: PLC0415
+            get_artifact_repository,
+        )
+
+        # client.log_artifact would ask for the whole run first, to know this place
+        repository: Any = get_artifact_repository(self._places[position.run_id], self._uri)
         sent = list(position.artifacts)
         for path in paths:
             with suppress(FileNotFoundError):
                 mark = _mark(path)
                 if mark not in sent and path.stat().st_size and path.is_file():
-                    self.client.log_artifact(position.run_id, str(path), folder)
+                    repository.log_artifact(str(path), folder)
                     sent.append(mark)
         return replace(position, artifacts=sent)
+
+
+def _state_tags(trial: TrialStore, record: TrialRecord) -> dict[str, str]:
+    """How a run is marked for where its trial stands; empty where there is nothing to say."""
+    tags = {
+        "recrl.status": str(record.status),
+        "recrl.attempt": str(record.attempt),
+        "recrl.host": record.host,
+        "recrl.error": record.error[:MAX_ERROR],
+        PROGRESS_TAG: _json_tag({name: getattr(record, name) for name in PROGRESS}),
+    }
+    if record.status is TrialState.COMPLETE:
+        totals = phase_totals(trial.episodes(), trial.spec.deploy_limits.values)
+        tags[PHASES_TAG] = _json_tag(totals)
+    return tags
 
 
 def _added_afterwards(trial: TrialStore) -> list[Path]:

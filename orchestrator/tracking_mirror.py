@@ -87,12 +87,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.nice(POLITENESS)
     store = SweepStore(arguments.folder.parent, arguments.folder.name)
     tracker = Tracker(store, os.environ["MLFLOW_TRACKING_URI"])
-    wait = arguments.interval
-    while True:
+    wait = 0.0  # a launch that had nothing to do is over already: one pass is enough
+    while not _is_over(arguments.parent, wait):
         report = _pass(tracker, live=True)
-        wait = min(2 * wait, LONGEST_WAIT_SECONDS) if report.problem else arguments.interval
-        if _is_over(arguments.parent, wait):
-            break
+        longer = min(2 * max(wait, arguments.interval), LONGEST_WAIT_SECONDS)
+        wait = longer if report.problem else arguments.interval
     end = time.monotonic() + ORPHAN_SECONDS
     while _any_runs(store) and time.monotonic() < end:
         time.sleep(0.5)

@@ -392,6 +392,36 @@ def test_a_run_deleted_by_hand_is_made_again(write: Callable[..., SweepStore]) -
     assert everything(store) == shown
 
 
+def test_a_run_whose_maker_died_over_it_gets_its_params(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    shown, client = runs(store)[NONE], connect(store)
+    client.delete_run(shown.info.run_id)
+    half = client.create_run(
+        shown.info.experiment_id, run_name=NONE, start_time=shown.info.start_time, tags=shown.data.tags
+    )
+    assert sync(store, uri).is_up_to_date
+    assert runs(store)[NONE].info.run_id == half.info.run_id
+    assert runs(store)[NONE].data.params == shown.data.params
+
+
+def test_where_files_do_not_fit_the_curves_are_there(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    store.mlflow_artifacts.touch()  # where a folder should be
+    report = sync(store, uri)
+    assert (report.behind, report.points) == (2, 0)
+    assert "mlartifacts" in report.problem
+    shown = runs(store)[NONE]
+    assert shown.data.metrics.keys() >= {"train/return", "summary/deploy_return"}
+    assert shown.data.params["task"] == "river-a"
+    assert "recrl.status" not in shown.data.tags
+    store.mlflow_artifacts.unlink()
+    assert sync(store, uri).is_up_to_date
+    assert runs(store)[NONE].data.tags["recrl.status"] == "complete"
+
+
 def test_rows_that_were_cut_back_are_gone_from_mlflow_too(
     half_and_done: tuple[SweepStore, SweepStore],
 ) -> None:

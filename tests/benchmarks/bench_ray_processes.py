@@ -1,10 +1,15 @@
-"""What each of Ray's processes uses: with nothing to do but one idle actor, and beside a trial.
+"""What Ray, the driver and the teacher service use beside trials of CarGoal2, with our settings and without.
 
-    OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_ray_processes [--seconds 30]
+    OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_ray_processes [--seconds 30] [--trials 2] [--pairs 1]
 
-CPU time by process, in per cent of one core, from the kernel's schedule statistics; a trial of CarGoal2 runs
-in the second part. What is there without a trial is the floor: no documented setting of Ray 2.60 takes it
-away. It is there once on a machine, however many trials run beside it.
+CPU time from the kernel's schedule statistics, in per cent of one core. Each pair is a cluster of ours and
+one as ``ray.init`` starts it (but for the dashboard, which is off in both). First it has one idle actor, the
+teacher service; then trials run on it, a core each, with their teacher in that service.
+
+A worker's main thread is its trial; its other threads are Ray's, but for the heartbeat, and count as such.
+What is around a trial is there once on a machine, however many trials run beside each other. It goes by the
+clock: where others take the cores from the trials, its share of their CPU time looks larger than it is, so
+the share is also given for trials that have a core each.
 """
 
 from __future__ import annotations
@@ -13,69 +18,114 @@ import argparse
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from recrl.orchestrator import ray_executor
+from recrl.orchestrator.beside import beside
 from recrl.orchestrator.ray_executor import RayExecutor, local_cluster
+from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.teacher_service import start_teacher_service
 from tests.benchmarks.bench_memory import name_of
 from tests.benchmarks.bench_overhead import car_trial, family
 
-SETTLING_SECONDS = 10.0
+SETTLING_SECONDS = 8.0
+OTHERS = "Ray: others"
+TRIALS = "trials"
+NICENESS = {"worker_niceness": 0}  # of trials: on a busy machine they would get no core at Ray's 15
 
 
-def used() -> dict[int, tuple[str, float]]:
-    """What each process of ours is, and its CPU seconds, over all of its threads."""
+@contextmanager
+def settings(*, ours: bool) -> Iterator[None]:
+    """Start clusters with our settings meanwhile, or without."""
+    before: Mapping[str, Any] = {name: getattr(ray_executor, name) for name in ("SELDOM", "LEFT_OUT")}
+    now = {**before, "SELDOM": {**before["SELDOM"], **NICENESS}}
+    for name, value in (now if ours else {"SELDOM": NICENESS, "LEFT_OUT": {}}).items():
+        setattr(ray_executor, name, value)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(ray_executor, name, value)
+
+
+def used() -> dict[tuple[int, int], tuple[str, float]]:
+    """What each thread of each process of ours belongs to, and its CPU seconds."""
     found = {}
     for pid in family():
-        seconds = 0.0
+        name = name_of(pid) or OTHERS
         for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            thread = int(path.parent.name)
             try:
-                seconds += int(path.read_text().split()[0]) / 1e9
+                seconds = int(path.read_text().split()[0]) / 1e9
             except OSError:
                 continue
-        found[pid] = (name_of(pid) or "Ray: others", seconds)
+            trial = TRIALS if thread == pid else "workers' other threads"
+            found[pid, thread] = (trial if name == "worker" else name, seconds)
     return found
 
 
-def show_shares(title: str, seconds: float) -> None:
-    """Watch for a while, and say what was used."""
+def show_shares(title: str, seconds: float, cores: int = 0) -> None:
+    """Watch for a while, and say what was used; in relation to so many trials with a core each."""
     before, began = used(), time.monotonic()
     time.sleep(seconds)
     after, took = used(), time.monotonic() - began
     shares: dict[str, float] = {}
-    for pid, (name, total) in after.items():
-        shares[name] = shares.get(name, 0.0) + (total - before.get(pid, ("", 0.0))[1]) / took
-    around = sum(share for name, share in shares.items() if name != "worker")
-    print(f"{title}, {took:.0f} s: all but the worker {around:.2%} of a core", flush=True)
-    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
-        print(f"  {name:24} {share:7.2%}", flush=True)
+    for key, (name, total) in after.items():
+        shares[name] = shares.get(name, 0.0) + (total - before.get(key, ("", 0.0))[1]) / took
+    trials = shares.pop(TRIALS, 0.0)
+    around = sum(shares.values())
+    parts = ", ".join(f"{name} {share:.2%}" for name, share in sorted(shares.items(), key=lambda it: -it[1]))
+    print(f"{title}, {took:.0f} s: around {around:.2%} of a core ({parts})", flush=True)
+    if cores:
+        print(
+            f"    {around / cores:.2%} of trials with a core each; these had {trials / cores:.0%} of one: "
+            f"{around / trials:.2%} of that",
+            flush=True,
+        )
+
+
+def watch_trials(specs: Sequence[TrialSpec], root: Path, title: str, seconds: float) -> None:
+    """Run trials until they were watched."""
+    store, stop = SweepStore(root, "beside"), threading.Event()
+
+    def watch(over: threading.Event) -> None:
+        while any(store.trial(spec).record().update < 1 for spec in specs) and not over.wait(1.0):
+            pass
+        time.sleep(SETTLING_SECONDS)
+        show_shares(title, seconds, len(specs))
+        stop.set()
+
+    with beside(watch, name="watch"):
+        RayExecutor(num_cpus=len(specs)).run(specs, store, stop)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=30.0, help="to watch, in each part")
-    seconds = parser.parse_args(argv).seconds
-    with local_cluster(num_cpus=1):
-        service = start_teacher_service("idle")
-        time.sleep(SETTLING_SECONDS)
-        show_shares("Ray and an idle actor", seconds)
-        del service
-        with tempfile.TemporaryDirectory() as folder:
-            store, spec, stop = SweepStore(Path(folder), "beside"), car_trial(10_000), threading.Event()
-
-            def watch() -> None:
-                while store.trial(spec).record().update < 1:
-                    time.sleep(1.0)
-                time.sleep(SETTLING_SECONDS)
-                show_shares("beside a trial", seconds)
-                stop.set()
-
-            watching = threading.Thread(target=watch)
-            watching.start()
-            RayExecutor(num_cpus=1).run([spec], store, stop)
-            watching.join()
+    parser.add_argument("--seconds", type=float, default=30.0, help="to watch, each time")
+    parser.add_argument(
+        "--trials", type=int, default=2, help="beside each other; 0 for the idle clusters only"
+    )
+    parser.add_argument("--pairs", type=int, default=1)
+    arguments = parser.parse_args(argv)
+    specs = [replace(car_trial(10_000), seed=seed) for seed in range(arguments.trials)]
+    for ours in (True, False) * arguments.pairs:
+        name = "ours" if ours else "Ray's own"
+        began = time.monotonic()
+        with settings(ours=ours), local_cluster(num_cpus=max(1, len(specs))):
+            print(f"{name}: started in {time.monotonic() - began:.1f} s", flush=True)
+            service = start_teacher_service("idle")
+            time.sleep(SETTLING_SECONDS)
+            show_shares(f"{name}, an idle actor", arguments.seconds)
+            del service
+            if specs:
+                with tempfile.TemporaryDirectory() as folder:
+                    title = f"{name}, beside {len(specs)} trials"
+                    watch_trials(specs, Path(folder), title, arguments.seconds)
 
 
 if __name__ == "__main__":
