@@ -11,6 +11,9 @@ The bound is the time of the matrix products of the networks alone, at a rate me
 once that of products of the networks' own shapes into memory that is there already (``bare``), once the rate
 that this machine reaches on a product of two 1024 x 1024 matrices (``square``). Products that the
 algorithm asks for are counted, by hand: not those that an implementation may do besides.
+
+A machine's rate changes by a third from second to second, with its neighbours and its clock. So the passes
+that ``paper`` consists of are measured once more by themselves, in turn with the bare products of a pass.
 """
 
 from __future__ import annotations
@@ -29,6 +32,8 @@ from recrl.agents.agent import Rollout
 from recrl.agents.batch import distinct_rows
 from recrl.agents.collect import Collector, episode_costs
 from recrl.agents.config import AscentConfig, StudentConfig, TrustRegionConfig
+from recrl.agents.networks import Adam, Critics, NetworkForm, xavier
+from recrl.agents.policies import StochasticPolicy
 from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.registry import make_vector
@@ -77,8 +82,8 @@ def flops_a_millisecond() -> float:
     return 2.0 * 1024**3 / float(np.median([milliseconds(lambda: matrix @ matrix) for _ in range(15)]))
 
 
-def bare_flops_a_millisecond(rows: int) -> float:
-    """Floating-point operations a millisecond in the products of one pass of a critic, and nothing else."""
+def bare_pass(rows: int) -> Callable[[], object]:
+    """The products of one pass of a critic, and nothing else."""
     sizes = (NUM_OBSERVATIONS, *HIDDEN, 1)
     layers = [torch.ones(1, rows, size) for size in sizes]
     weights = [torch.ones(1, inputs, outputs) for inputs, outputs in pairwise(sizes)]
@@ -94,7 +99,14 @@ def bare_flops_a_millisecond(rows: int) -> float:
 
     for layer in layers:
         layer.zero_()
-    return pass_flops(rows, sizes) / float(np.median([milliseconds(products) for _ in range(7)]))
+    return products
+
+
+def bare_flops_a_millisecond(rows: int) -> float:
+    """Floating-point operations a millisecond in a bare pass."""
+    products = bare_pass(rows)
+    flops = pass_flops(rows, (NUM_OBSERVATIONS, *HIDDEN, 1))
+    return flops / float(np.median([milliseconds(products) for _ in range(7)]))
 
 
 def forward_flops(rows: float, sizes: tuple[int, ...]) -> float:
@@ -170,6 +182,64 @@ def measure_large(agent_name: str, preset: str, samples: int) -> tuple[float, fl
     return spent / 1e3, bare, square, metrics["policy_steps"]
 
 
+def passes_in_turn(samples: int, rounds: int) -> dict[str, list[float]]:
+    """Milliseconds of passes over all samples: of two critics, of a policy, and of what bounds them."""
+    generator = torch.Generator().manual_seed(0)
+    form = NetworkForm(HIDDEN, xavier)
+    critics = Critics(NUM_OBSERVATIONS, 1, form, generator)
+    actions = Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32)
+    policy = StochasticPolicy(NUM_OBSERVATIONS, actions, form, 1.0, generator)
+    rows = torch.randn(samples, NUM_OBSERVATIONS, generator=generator)
+    targets = torch.randn(2, samples, generator=generator)
+    shares = torch.full((samples,), 1.0 / samples)
+    critics_optimiser, policy_optimiser = Adam(critics.parameters, 1e-3), Adam(policy.parameters, 3e-4)
+    chosen = torch.randn(samples, NUM_ACTIONS, generator=generator)
+    old_log_probs = policy.distribution(rows).log_prob(chosen, None)
+
+    def fit() -> None:
+        critics.differentiate(rows, shares, targets)
+        critics_optimiser.step()
+
+    def climb() -> None:
+        now = policy.evaluate(rows)
+        ratios = torch.exp(now.distribution.log_prob(chosen, None) - old_log_probs)
+        now.gradient(-torch.dot(ratios.clamp(0.8, 1.2), shares))
+        policy_optimiser.step()
+
+    bare = bare_pass(samples)
+    works: dict[str, Callable[[], object]] = {
+        "bare": bare,
+        "two critics": fit,
+        "bare again": bare,
+        "policy": climb,
+    }
+    spent: dict[str, list[float]] = {name: [] for name in works}
+    for turn in range(rounds + 1):
+        for name, work in works.items():
+            milliseconds_taken = milliseconds(work)
+            if turn > 0:
+                spent[name].append(milliseconds_taken)
+    return spent
+
+
+def print_passes(samples: int, rounds: int) -> None:
+    """The table of passes over all samples, each beside the bare products of as many networks."""
+    spent = passes_in_turn(samples, rounds)
+    bare = np.array([spent["bare"], spent["bare again"]])
+    print(f"\n{samples:,} rows, {HIDDEN[0]} x {HIDDEN[1]}, a pass with its step of Adam, {rounds} rounds")
+    print(
+        f"{'pass':<14}{'median ms':>10}{'bare ms':>9}{'times':>7}{'least ms':>10}{'bare ms':>9}{'times':>7}"
+    )
+    for name, networks in (("two critics", 2), ("policy", 1)):
+        median, least = np.median(spent[name]), np.min(spent[name])
+        bounds = networks * np.median(bare), networks * np.min(bare)
+        print(
+            f"{name:<14}{median:>10.0f}{bounds[0]:>9.0f}{median / bounds[0]:>7.2f}"
+            f"{least:>10.0f}{bounds[1]:>9.0f}{least / bounds[1]:>7.2f}",
+            flush=True,
+        )
+
+
 def print_rivergrid() -> None:
     """The table of small batches with repeated observations."""
     rate = flops_a_millisecond()
@@ -216,9 +286,11 @@ def main() -> None:
     )
     parser.add_argument("--samples", type=int, default=30_000, help="a multiple of 1,000")
     parser.add_argument("--agents", nargs="+", default=["ppo-lag", "cpo"], choices=list(AGENTS))
+    parser.add_argument("--rounds", type=int, default=15, help="turns of the passes beside the bare products")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print_rivergrid()
+    print_passes(arguments.samples, arguments.rounds)
     print_large(arguments.agents, arguments.samples)
 
 
