@@ -1,14 +1,15 @@
-"""What everything around learning costs: files, MLflow, the teacher and Ray, beside a trial's own CPU time.
+"""What everything around learning costs: files and MLflow beside a trial's own CPU time, and small trials.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_overhead.py [--updates 30] [--trials 2000]
 
-First one trial of CarGoal2 (``ppo-lag``, 256x256, 16 environments). Its files: the CPU time of its thread
-inside the writer, heartbeats included. Its row in MLflow: the mirror's process over the finished trial, less
-that over an empty sweep. Ray and the teacher service: what the cluster's processes use beside the trial, as
-the growth from a short trial to a long one, because starting is paid once a sweep. CPU seconds throughout, so
-a busy machine matters little. The aim: files and MLflow at most 2% of the trial, Ray and the teacher 2%.
+First one trial of CarGoal2 (``ppo-lag``, 256x256, 16 environments) in this process. Its files: the CPU time
+of its thread inside the writer, heartbeats included, with a commit every 20 seconds. MLflow: the mirror's
+process beside the trial, as a launch has it, less that over an empty sweep. CPU seconds throughout, so a busy
+machine matters little. The aim is at most 2% of the trial. Ray, the driver and the teacher service are in
+``bench_ray_processes``.
 
-Then the whole command over many trials of some milliseconds: wall seconds, on a quiet machine only.
+Then the whole command over many trials of some milliseconds: wall seconds, on a quiet machine only; and when
+each line of a launch with nothing to do came.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ import resource
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.ray_executor import RayExecutor, local_cluster
+from recrl.orchestrator.commands import MIRROR_INTERVAL_SECONDS
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.tracking import tracking_uri
@@ -94,13 +95,21 @@ def inline_trial(store: SweepStore, spec: TrialSpec) -> tuple[float, float, floa
     return time.process_time() - before, writer.seconds, teacher.seconds
 
 
-def mirror_cpu(store: SweepStore) -> float:
-    """CPU seconds of the mirror's process over a sweep as it is."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if not start_mirror(store, tracking_uri(store, None), interval_seconds=3600.0).stop(timeout=600.0):
+@contextmanager
+def mirrored(store: SweepStore) -> Iterator[list[float]]:
+    """Have a mirror meanwhile, as a launch has one; the list then holds the CPU seconds of its process."""
+    before, used = children_cpu(), list[float]()
+    mirror = start_mirror(store, tracking_uri(store, None), interval_seconds=MIRROR_INTERVAL_SECONDS)
+    yield used
+    if not mirror.stop(timeout=600.0):
         sys.exit("the mirror did not come to its end")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    used.append(children_cpu() - before)
+
+
+def children_cpu() -> float:
+    """CPU seconds of the processes that this one started and waited for."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def family() -> dict[int, list[str]]:
@@ -121,94 +130,58 @@ def family() -> dict[int, list[str]]:
     return found
 
 
-def family_cpu() -> dict[int, float]:
-    """CPU seconds of this process and of each one below it, by process."""
-    ticks = os.sysconf("SC_CLK_TCK")
-    return {pid: sum(map(int, values[11:13])) / ticks for pid, values in family().items()}
-
-
-class FamilyWatch(threading.Thread):
-    """Looks often, as Ray lets its processes end without anybody asking what they used."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self._over = threading.Event()
-        self._before = family_cpu()
-        self._seen: dict[int, float] = {}
-        self._own = 0.0
-
-    def run(self) -> None:
-        """Look until told to end."""
-        while not self._over.wait(0.2):
-            self._seen |= family_cpu()
-        self._own = time.thread_time()
-
-    def end(self) -> float:
-        """CPU seconds of all processes since the beginning, less those of the looking."""
-        self._over.set()
-        self.join()
-        self._seen |= family_cpu()
-        used = sum(seconds - self._before.get(pid, 0.0) for pid, seconds in self._seen.items())
-        return used - self._own
-
-
-def around_on_ray(root: Path, updates: int) -> tuple[float, float]:
-    """CPU seconds of a trial on Ray, and of everything else meanwhile."""
-    spec = car_trial(updates)
-    store = SweepStore(root, f"ray-{updates}")
-    watch = FamilyWatch()
-    watch.start()
-    RayExecutor(num_cpus=1).run([spec], store, threading.Event())
-    everything = watch.end()
-    trial = store.trial(spec).record().cpu_seconds
-    return trial, everything - trial
-
-
 def bench_trial(root: Path, updates: int) -> None:
     torch.set_num_threads(1)
-    store, empty = SweepStore(root, "inline"), SweepStore(root, "empty")
-    trial, files, teacher = inline_trial(store, car_trial(updates))
-    mirrored = mirror_cpu(store) - mirror_cpu(empty)
+    with mirrored(SweepStore(root, "empty")) as of_nothing:
+        pass
+    store = SweepStore(root, "inline")
+    with mirrored(store) as of_trial:
+        trial, files, teacher = inline_trial(store, car_trial(updates))
     print(f"CarGoal2, {updates * STEPS_PER_UPDATE:,} steps: {trial:.1f} CPU s")
     show("its files, checkpoints and heartbeats", files / trial)
-    show("its points in MLflow", mirrored / trial)
+    show("MLflow", (of_trial[0] - of_nothing[0]) / trial)
     show("its teacher, inline", teacher / trial)
-    with local_cluster(num_cpus=1):
-        around_on_ray(root, 2)  # the first one also starts what all of them use
-        short, around_short = around_on_ray(root, max(3, updates // 10))
-        long, around_long = around_on_ray(root, updates)
-    show("Ray and the teacher service", (around_long - around_short) / (long - short))
 
 
 def show(label: str, share: float) -> None:
     print(f"  {label:40} {share:7.2%}", flush=True)
 
 
-def wall(work: Callable[[], object]) -> float:
-    before = time.monotonic()
-    work()
-    return time.monotonic() - before
-
-
 def bench_many(root: Path, trials: int) -> None:
     (root / "many.yaml").write_text(GRID.format(trials=trials))
 
-    def command(*arguments: str) -> float:
-        line = [sys.executable, "-m", "recrl.orchestrator.cli", *arguments]
-        return wall(lambda: subprocess.run(line, cwd=root, check=True, stdout=subprocess.DEVNULL))
+    def command(*arguments: str) -> list[tuple[float, str]]:
+        """Run it; the seconds after which each of its lines came, and its end as the last."""
+        line = [sys.executable, "-u", "-m", "recrl.orchestrator.cli", *arguments]
+        began = time.monotonic()
+        with subprocess.Popen(line, cwd=root, stdout=subprocess.PIPE, text=True) as process:
+            said = [(time.monotonic() - began, text.rstrip()) for text in process.stdout or ()]
+        if process.returncode:
+            sys.exit(f"{arguments[0]} ended with {process.returncode}")
+        return [*said, (time.monotonic() - began, "")]
 
-    planned = command("plan", "many.yaml")
-    launched = command("launch", "many.yaml", "--no-figures")
+    def show_wall(label: str, seconds: float) -> None:
+        print(f"  {label:40} {seconds:7.1f} s  {1e3 * seconds / trials:7.1f} ms a trial", flush=True)
+
+    show_wall("plan", command("plan", "many.yaml")[-1][0])
+    show_wall("launch, with Ray's start and MLflow", command("launch", "many.yaml", "--no-figures")[-1][0])
     store = SweepStore(root / "runs", "many")
     trial_cpu = sum(trial.record().cpu_seconds for trial in store.trials())
-    print(f"{trials} trials of {1e3 * trial_cpu / trials:.0f} CPU ms, on {os.cpu_count()} cores")
-    for label, seconds in (
-        ("plan", planned),
-        ("launch, with Ray's start and MLflow", launched),
-        ("status", command("status", "many")),
-        ("launch again, nothing to do", command("launch", "many.yaml", "--no-figures")),
-    ):
-        print(f"  {label:40} {seconds:7.1f} s  {1e3 * seconds / trials:7.1f} ms a trial")
+    print(f"  ({1e3 * trial_cpu / trials:.0f} CPU ms a trial, {os.cpu_count()} cores)", flush=True)
+    show_behind(store)
+    show_wall("status", command("status", "many")[-1][0])
+    for label in ("launch again, MLflow to catch up", "launch again, nothing to do"):
+        said = command("launch", "many.yaml", "--no-figures")
+        show_wall(label, said[-1][0])
+        for seconds, text in said[:-1]:
+            print(f"      {seconds:6.1f} s  {text[:80]}", flush=True)
+        show_behind(store)
+
+
+def show_behind(store: SweepStore) -> None:
+    """How many trials MLflow does not show yet."""
+    shown = len(list(store.mirror_folder.glob("*/trial-*.json")))
+    print(f"  ({len(store.trials()) - shown} trials not in MLflow yet)", flush=True)
 
 
 def main() -> None:
