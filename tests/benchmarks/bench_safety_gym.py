@@ -6,8 +6,10 @@ For every task, 16 environments under random actions, against the same 16 simula
 ``mj_step(model, data, 10)`` alone in a Python loop ("bare"); and one environment of ``gymnasium.make``. They
 take turns of a few steps, in one run on one core, so that a noisy machine hurts all alike. Times are CPU
 seconds of this process, lower quartiles over the turns; a share is the median over the turns of neighbouring
-times. With --threads: wall seconds, several threads against one, for us and for MuJoCo's batch alone. Resets
-are timed apart: an episode is 1,000 steps and one reset.
+times. With --threads: wall seconds, several threads against one, for us and for MuJoCo's batch alone; and
+several processes against one, in each of which MuJoCo alone steps simulations of its own: they share nothing,
+so their gain is what the machine's cores give when all are busy. Resets are timed apart: an episode is 1,000
+steps and one reset.
 
 In Button a gremlin is led: what it is tied to must move before every physics step, which ``mj_step`` with a
 count cannot do. So there are two bare speeds: "bare", the same call as elsewhere, in which the gremlin hangs
@@ -20,8 +22,11 @@ tie it only while the robot is near, and that is part of what is measured.
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import time
 from collections.abc import Callable
+from multiprocessing.queues import Queue
+from multiprocessing.synchronize import Barrier
 
 import gymnasium
 import mujoco
@@ -37,6 +42,8 @@ from recrl.environments.scene import PARKED
 NUM_ENVS = 16
 STEPS = 5
 """Steps of every environment in one repeat."""
+ROUNDS, TURN_SECONDS = 10, 0.4
+"""Turns of one process and of several, and the wall seconds of each."""
 # safety-gymnasium 1.0.0 on mujoco 2.3.7, environment steps/s on one core without and with resets, and bare
 # MuJoCo's in the same run: what the machine gives changes by the hour, so that its speed then counts.
 PEER = {"CarGoal2": (357, 243, 4961), "CarButton2": (320, 207, 3862), "CarPush2": (623, 337, 5450)}
@@ -178,6 +185,44 @@ def thread_gains(name: str, repeats: int, num_threads: int) -> tuple[float, floa
     return float(ours), float(theirs)
 
 
+def step_in_turns(
+    name: str, rank: int, rounds: int, barrier: Barrier, counts: Queue[tuple[bool, int, int]]
+) -> None:
+    """What one of several processes does: step alone if it is the first, then with all others."""
+    worlds = SafetyGymVectorEnv(name, NUM_ENVS)
+    worlds.reset(seed=rank)
+    bare = Bare(worlds.worlds)
+    for turn in range(rounds):
+        for together in (False, True):
+            barrier.wait()
+            if rank > 0 and not together:
+                continue
+            steps, end = 0, time.perf_counter() + TURN_SECONDS
+            while time.perf_counter() < end:
+                bare.steps()
+                steps += STEPS * NUM_ENVS
+            counts.put((together, turn, steps))
+
+
+def process_gain(name: str, rounds: int, num_processes: int) -> float:
+    """Steps that several processes of MuJoCo alone take, over those of one in the same time."""
+    context = multiprocessing.get_context("spawn")
+    barrier, counts = context.Barrier(num_processes), context.Queue()
+    workers = [
+        context.Process(target=step_in_turns, args=(name, rank, rounds, barrier, counts))
+        for rank in range(num_processes)
+    ]
+    for worker in workers:
+        worker.start()
+    taken = np.zeros((2, rounds))
+    for _ in range(rounds * (1 + num_processes)):
+        together, turn, steps = counts.get()
+        taken[int(together), turn] += steps
+    for worker in workers:
+        worker.join()
+    return float(np.median(taken[1] / taken[0]))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -209,7 +254,12 @@ def main() -> None:
             print(f"| {name}, led | {1 / led:,.0f} | | | {shares[2]:.2f} | | | | |")
         if arguments.threads:
             ours, theirs = thread_gains(name, arguments.repeats, arguments.threads)
-            print(f"  {name}: {arguments.threads} threads: {ours:.2f}x; MuJoCo alone: {theirs:.2f}x")
+            apart = process_gain(name, ROUNDS, arguments.threads)
+            print(
+                f"  {name}: {arguments.threads} threads: {ours:.2f}x; MuJoCo alone: {theirs:.2f}x, "
+                f"in {arguments.threads} processes: {apart:.2f}x",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":
