@@ -155,6 +155,9 @@ def test_many_rows_in_blocks_are_all_rows_at_once(monkeypatch: pytest.MonkeyPatc
 
 
 def test_blocks_cover_all_rows() -> None:
-    rows = list(range(1300))
-    assert [row for block in networks.blocks(1300) for row in rows[block]] == rows
+    for count, lengths in ((1, [1]), (1024, [1024]), (1300, [1024, 276]), (9000, [2250] * 4)):
+        rows = list(range(count))
+        parts = [rows[block] for block in networks.blocks(count)]
+        assert [len(part) for part in parts] == lengths
+        assert [row for part in parts for row in part] == rows
     assert len(networks.blocks(0)) == 1
