@@ -110,7 +110,7 @@ LESSONS = [
     *(Lesson(agent, "two-state", 200) for agent in STUDENTS),
     *(Lesson(agent, "two-state-2", 400) for agent in STUDENTS),
     *(Lesson(agent, "gates", 120, OPTIONS.get(agent, {})) for agent in STUDENTS),
-    *(Lesson(agent, "gates-2", 200, OPTIONS.get(agent, {})) for agent in STUDENTS),
+    *(Lesson(agent, "gates-2", 300, OPTIONS.get(agent, {})) for agent in STUDENTS),
 ]
 
 
