@@ -20,6 +20,7 @@ before the first trial. Leaves out growing with an elastic cluster beyond ``max_
 
 from __future__ import annotations
 
+import inspect
 import json
 import logging
 import os
@@ -80,14 +81,15 @@ WORKER = {
 
 # Ray's processes look after themselves up to ten times a second. A cluster of our own has one machine, no
 # objects to speak of, and nobody who reads its metrics; none of these settings tells that a process has died.
-SELDOM: Mapping[str, Any] = {
-    "enable_metrics_collection": False,
+# They go into Ray's environment, where a version that does not know one leaves it alone.
+SELDOM: Mapping[str, int] = {
+    "enable_metrics_collection": 0,
     "gcs_pull_resource_loads_period_milliseconds": 10_000,  # for an autoscaler
     "kill_idle_workers_interval_ms": 1_000,
     "local_fs_monitor_interval_ms": 10_000,  # before objects are spilled to disk
     "memory_monitor_refresh_ms": 2_000,
     "object_manager_timer_freq_ms": 1_000,
-    "prestart_worker_first_driver": False,  # a worker without work wakes a hundred times a second
+    "prestart_worker_first_driver": 0,  # a worker without work wakes a hundred times a second
     "raylet_check_gc_period_milliseconds": 10_000,
 }
 # Processes that ``ray start`` can leave out and ``ray.init`` cannot: one copies the workers' output to the
@@ -546,7 +548,8 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
         token_path = folder / "token"
         with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
             file.write(_token())
-        with _environment(QUIET | WORKER | {"RAY_AUTH_TOKEN_PATH": str(token_path)}):
+        seldom = {f"RAY_{name}": str(value) for name, value in SELDOM.items()}
+        with _environment(QUIET | WORKER | seldom | {"RAY_AUTH_TOKEN_PATH": str(token_path)}):
             for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
                 os.environ.pop(name, None)  # Ray looks at its mode only where it sets it itself
             with _connection(
@@ -556,7 +559,6 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
                 num_cpus=num_cpus,
                 include_dashboard=False,
                 object_store_memory=OBJECT_STORE_BYTES,
-                _system_config=dict(SELDOM),
                 _temp_dir=f"{folder}/ray",
             ):
                 yield
@@ -674,7 +676,8 @@ def _fewer_processes() -> Iterator[None]:
     """Start no process of LEFT_OUT; where a cluster is there already, none is started anyhow."""
     module: Any = ray._private.parameter
     whole = module.RayParams
-    module.RayParams = partial(whole, **LEFT_OUT)
+    known = inspect.signature(whole).parameters
+    module.RayParams = partial(whole, **{name: value for name, value in LEFT_OUT.items() if name in known})
     try:
         yield
     finally:
