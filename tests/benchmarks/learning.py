@@ -85,7 +85,7 @@ EXERCISES = {
     "two-state-2": Exercise("two-state-2", (5.0, 2.0), 512, 20),
     "gates": Exercise("rivergrid", (1.0,), 256, 60, {"map": GATES, "horizon": 60}),
     "gates-2": Exercise(
-        "rivergrid", (1.0, 0.5), 256, 60, {"map": GATES, "horizon": 60, "costs": ["river", "mud"]}
+        "rivergrid", (1.0, 0.5), 512, 60, {"map": GATES, "horizon": 60, "costs": ["river", "mud"]}
     ),
     "bandit": Exercise("continuous-bandit", (2.5,), 512, 20),
 }
