@@ -21,6 +21,7 @@ import ray
 from ray.exceptions import RayActorError
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.ray_executor import (
@@ -86,22 +87,16 @@ def assert_equal_bytes(specs: Sequence[TrialSpec], store: SweepStore, expected: 
 @contextmanager
 def once(condition: Callable[[], bool], act: Callable[[], object]) -> Iterator[None]:
     """Do something beside the body of the context, as soon as a condition holds."""
-    over = threading.Event()
 
-    def watch() -> None:
+    def watch(over: threading.Event) -> None:
         while not over.is_set():
             if condition():
                 act()
                 return
             over.wait(0.02)
 
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
+    with beside(watch, name="once"):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 @pytest.mark.usefixtures("cluster")
