@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from recrl.environments.plugins import resolve
+from recrl.teachers.annealed import AnnealedConfig, AnnealedTeacher
 from recrl.teachers.dynamic import DynamicConfig, DynamicTeacher
 from recrl.teachers.static import (
     DecayConfig,
@@ -59,6 +60,11 @@ TEACHERS: dict[str, TeacherKind] = {
         "CLiC_D: lower limits for a student that keeps them, noise for one that is stuck.",
         DynamicConfig,
         DynamicTeacher,
+    ),
+    "annealed": TeacherKind(
+        "Ours: noise in every update, slowly taken away, while the limit falls to d_d in equal ratios.",
+        AnnealedConfig,
+        AnnealedTeacher,
     ),
 }
 

@@ -25,6 +25,7 @@ def spec(name: str, **options: Any) -> TeacherSpec:
 
 def test_the_names() -> None:
     assert sorted(TEACHERS) == [
+        "annealed",
         "cosine",
         "dynamic",
         "exponential",
