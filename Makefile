@@ -1,6 +1,6 @@
 # make install   a virtual environment in .venv with everything at tested versions
 # make demo      install, run 20 RiverGrid trials, draw the figures: minutes on two cores
-# make test      install, run the tests
+# make test      install, run the tests, two at a time
 # make lint      install, check style and types
 # make chaos     install, kill whatever a sweep is made of for ten minutes: SECONDS=600 SEED=0
 # make storage-test   install, run a sweep on a cluster that shares an S3 server and no folder, and harm it: needs root, says so
@@ -24,7 +24,7 @@ demo: install
 	$(BIN)/recrl-sweep launch grids/demo.yaml
 
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: install
 	$(BIN)/ruff check .

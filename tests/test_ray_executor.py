@@ -10,7 +10,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -306,13 +306,17 @@ def test_only_this_user_can_read_the_clusters_token() -> None:
     assert stat.S_IMODE(token.parent.stat().st_mode) == 0o700
 
 
+def commands_running() -> Iterator[bytes]:
+    """The command line of every process, but of those that end meanwhile."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            yield path.read_bytes()
+
+
 @pytest.mark.usefixtures("cluster")
 def test_a_cluster_of_ours_has_no_process_that_serves_nobody() -> None:
-    commands = [
-        path.read_bytes()
-        for path in Path("/proc").glob("[0-9]*/cmdline")
-        if os.environ["RAY_AUTH_TOKEN_PATH"].removesuffix("token").encode() in path.read_bytes()
-    ]
+    folder = os.environ["RAY_AUTH_TOKEN_PATH"].removesuffix("token").encode()
+    commands = [command for command in commands_running() if folder in command]
     assert any(b"gcs_server" in command for command in commands)
     assert not any(name in command for command in commands for name in (b"log_monitor", b"monitor.py"))
 
