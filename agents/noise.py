@@ -8,7 +8,7 @@ free a saturated softmax: its gradients are about 1e-8.
 policy less random than it is. ``temperature`` divides the logits by 1 / (1 - eps), or multiplies the
 standard deviations by it.
 
-Letters: N observations, A actions, m action components, eps = eps_pi.
+Letters: U distinct observations, A actions, m action components, eps = eps_pi.
 """
 
 from __future__ import annotations
@@ -22,28 +22,34 @@ BISECTIONS = 60
 ROUNDING = 1e-12
 
 
-def off_greedy_mass(logits: Floats) -> float:
-    """Mean probability of not taking the most likely action, logits [N, A], in [0, 1 - 1/A]."""
+def off_greedy_mass(logits: Floats, weights: Floats) -> float:
+    """Mean probability of not taking the most likely action, in [0, 1 - 1/A].
+
+    Args:
+        logits: [U, A].
+        weights: share of the samples at each observation, [U], summing to 1.
+    """
     shifted = logits - logits.max(axis=1, keepdims=True)
-    return float(np.mean(1.0 - 1.0 / np.exp(shifted).sum(axis=1)))
+    return float(weights @ (1.0 - 1.0 / np.exp(shifted).sum(axis=1)))
 
 
-def matching_scale(logits: Floats, noise: float) -> float:
+def matching_scale(logits: Floats, weights: Floats, noise: float) -> float:
     """The factor s in [0, 1] on the logits at which the policy is as random as the eps-mixture.
 
     Solves off_greedy_mass(s logits) = (1 - eps) off_greedy_mass(logits) + eps (1 - 1/A), by bisection. The
     left side falls in s, so there is one solution, and s <= 1: noise never sharpens a policy.
 
     Args:
-        logits: of the present policy, [N, A].
+        logits: of the present policy, [U, A].
+        weights: share of the samples at each observation, [U], summing to 1.
         noise: eps in (0, 1].
     """
     num_actions = logits.shape[1]
-    target = (1.0 - noise) * off_greedy_mass(logits) + noise * (1.0 - 1.0 / num_actions)
+    target = (1.0 - noise) * off_greedy_mass(logits, weights) + noise * (1.0 - 1.0 / num_actions)
     low, high = 0.0, 1.0
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        if off_greedy_mass(middle * logits) >= target - ROUNDING:
+        if off_greedy_mass(middle * logits, weights) >= target - ROUNDING:
             low = middle
         else:
             high = middle

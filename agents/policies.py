@@ -20,6 +20,7 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from torch import Tensor
 
+from recrl.agents.batch import distinct_rows
 from recrl.agents.distributions import Categorical, Distribution, Gaussian
 from recrl.agents.networks import FlatParameters, NetworkForm, Scratch, TanhStack, blocks
 from recrl.agents.noise import matching_log_std, matching_scale, off_greedy_mass
@@ -195,14 +196,19 @@ class StochasticPolicy:
         return self._widen(noise, form)
 
     def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
+        distinct = distinct_rows(observations)
+        weights = np.full(len(observations), 1.0 / len(observations))
+        if distinct is not None:  # on a tabular task a sixteenth of them
+            first, row = distinct
+            observations, weights = observations[first], np.bincount(row) / len(observations)
         logits = self.outputs(observations).astype(np.float64)
-        scale = 1.0 - noise if form == "temperature" else matching_scale(logits, noise)
+        scale = 1.0 - noise if form == "temperature" else matching_scale(logits, weights, noise)
         self.stack.weights[-1].mul_(scale)
         self.stack.biases[-1].mul_(scale)
         return {
             "noise_scale": scale,
-            "randomness_before": off_greedy_mass(logits),
-            "randomness_after": off_greedy_mass(scale * logits),
+            "randomness_before": off_greedy_mass(logits, weights),
+            "randomness_after": off_greedy_mass(scale * logits, weights),
         }
 
     def _widen(self, noise: float, form: str) -> dict[str, float]:

@@ -77,17 +77,23 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
     methods = occurring(policies["method"])
     if not maps:
         return None
+    side_by_side = len(methods) == 1  # the maps; else each has lines of its own
     columns = min(MAX_COLUMNS, len(methods))
     lines = -(-len(methods) // columns)
+    rows = lines * len(maps)
+    if side_by_side:
+        rows = -(-len(maps) // MAX_COLUMNS)
+        columns = -(-len(maps) // rows)
     scale = LogNorm(vmin=0.1, vmax=max(options.horizon for _, options in maps.values()))
     with styles.context():
-        figure = Figure(figsize=(TEXT_WIDTH, 1.7 * lines * len(maps) + 0.3), layout="constrained")
-        grid = figure.subplots(lines * len(maps), columns, squeeze=False)
+        figure = Figure(figsize=(TEXT_WIDTH, 1.7 * rows + 0.3), layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.flat:
             axes.set_axis_off()
             axes.set(xticks=[], yticks=[])  # invisible ticks would be laid out all the same
-        for row, (task, (river_map, options)) in enumerate(maps.items()):
-            panels = grid[row * lines : (row + 1) * lines].flat
+        panels_of_a_map = 1 if side_by_side else lines * columns
+        for number, (task, (river_map, options)) in enumerate(maps.items()):
+            panels = grid.reshape(-1)[number * panels_of_a_map :][:panels_of_a_map]
             for axes, method in zip(panels, methods, strict=False):
                 chosen = policies[(policies["task"] == task) & (policies["method"] == method)]
                 if len(chosen):

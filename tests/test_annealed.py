@@ -1,6 +1,7 @@
 """The annealed curriculum: limits and noise of a short training, by hand."""
 
 import math
+from collections.abc import Sequence
 
 import pytest
 from pydantic import ValidationError
@@ -15,7 +16,7 @@ OPTIONS = {"measured_at": 0.1, "arrival": 0.5, "policy_noise": 0.4, "noise_hold"
 
 
 def lessons(
-    train: tuple[float, ...], deploy: tuple[float, ...], costs: list[list[tuple[float, ...]]]
+    train: tuple[float, ...], deploy: tuple[float, ...], costs: Sequence[Sequence[tuple[float, ...]]]
 ) -> list[Lesson]:
     """What a teacher says after each tenth of B, given the costs of the episodes that finished in it."""
     teacher = make_teacher(TeacherSpec("annealed", OPTIONS, CostLimits(train), CostLimits(deploy), 100))

@@ -152,18 +152,31 @@ def test_the_gradient_of_a_loss_agrees_with_finite_differences(space: Space[obje
 @pytest.mark.parametrize("noise", [0.01, 0.3, 1.0])
 def test_noise_makes_a_policy_as_random_as_its_mixture_with_a_uniform_one(noise: float) -> None:
     logits = np.array([[0.0, 30.0, 1.0], [5.0, 0.0, -4.0]])
-    mass = off_greedy_mass(logits)
+    weights = np.array([0.25, 0.75])
+    mass = off_greedy_mass(logits, weights)
     wanted = (1.0 - noise) * mass + noise * 2.0 / 3.0
-    assert off_greedy_mass(matching_scale(logits, noise) * logits) == pytest.approx(wanted, abs=1e-9)
+    scale = matching_scale(logits, weights, noise)
+    assert off_greedy_mass(scale * logits, weights) == pytest.approx(wanted, abs=1e-9)
 
 
 def test_off_greedy_mass_is_that_computed_by_hand() -> None:
     logits = np.log(np.array([[0.5, 0.25, 0.25], [0.1, 0.8, 0.1]]))
-    assert off_greedy_mass(logits) == pytest.approx((0.5 + 0.2) / 2.0)
+    assert off_greedy_mass(logits, np.array([0.3, 0.7])) == pytest.approx(0.3 * 0.5 + 0.7 * 0.2)
+
+
+def test_observations_that_repeat_count_as_often_as_they_do() -> None:
+    rows = random_rows().numpy()
+    repeated = np.concatenate([rows[[0] * 30], rows[[1] * 10]])
+    one, other = policy_for(THREE_ACTIONS, last_scale=5.0), policy_for(THREE_ACTIONS, last_scale=5.0)
+    masses = [off_greedy_mass(one.outputs(row[None]).astype(np.float64), np.ones(1)) for row in rows[:2]]
+    metrics = one.add_noise(0.3, repeated, "match-mixture")
+    assert metrics["randomness_before"] == pytest.approx(0.75 * masses[0] + 0.25 * masses[1])
+    jittered = repeated + np.random.default_rng(0).normal(0.0, 1e-7, repeated.shape).astype(np.float32)
+    assert other.add_noise(0.3, jittered, "match-mixture") == pytest.approx(metrics, rel=1e-4)
 
 
 def test_noise_never_sharpens_a_policy() -> None:
-    assert matching_scale(np.zeros((4, 3)), 0.3) == pytest.approx(1.0)
+    assert matching_scale(np.zeros((4, 3)), np.full(4, 0.25), 0.3) == pytest.approx(1.0)
     wide = np.log(np.array([10.0]))
     assert matching_log_std(wide, np.ones(1), 0.5) == pytest.approx(wide)
 

@@ -79,3 +79,19 @@ def test_a_student_without_a_table_has_no_map(river_sweep: Sweep) -> None:
 def test_other_finite_tasks_have_no_map(finished: Sweep) -> None:
     assert river_task(finished, "river-a") is None
     assert policy_maps(finished, "cpo") is None
+
+
+def test_maps_of_one_method_lie_side_by_side(river_sweep: Sweep) -> None:
+    other = river_sweep.policies.assign(
+        task=pd.Categorical(
+            ["river-b"] * len(river_sweep.policies),
+            river_sweep.policies["task"].cat.categories,
+            ordered=True,
+        )
+    )
+    policies = pd.concat([river_sweep.policies, other], ignore_index=True)
+    figure = policy_maps(dataclasses.replace(river_sweep, policies=policies), "cpo")
+    assert figure is not None
+    one, another = (axes for axes in figure.axes if axes.get_title())
+    assert one.get_subplotspec().get_gridspec().get_geometry() == (1, 2)  # type: ignore[union-attr]
+    assert [axes.texts[-1].get_text() for axes in (one, another)] == ["river-a", "river-b"]
