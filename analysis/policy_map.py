@@ -104,7 +104,8 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
             first = panels[0]
             first.text(-0.07, 0.5, task, transform=first.transAxes, rotation=90, ha="right", va="center")
         bar = figure.colorbar(ScalarMappable(scale, VISIT_COLOURS), ax=grid, shrink=0.6, aspect=30, pad=0.01)
-        bar.set_label("expected steps on the square, an episode", fontsize=6.0)
+        label = "expected steps on the square, an episode"
+        bar.set_label(label if rows > 1 else label.replace(" on", "\non"), fontsize=6.0)
         title = f"{agent}: final policies, sampled; the mean over runs, exactly computed"
         figure.suptitle(title, fontsize=7.0)
     return figure

@@ -11,8 +11,9 @@ while it goes on trying everything: stretches of river become shorter, until non
 not wait for the student; one that did so found nothing. As the noise ends, the student settles on the best
 way within d_d.
 
-It wants a student whose steps are measured by the KL divergence (``cpo``, ``trpo-lag``): Adam's steps are
-spent on the states that are visited most, and the dry way's are visited least.
+It is for ``cpo``. Its answer to a limit that cannot be kept does not grow with time, as the multipliers of
+Lagrangian students do until they stand still; and its steps are measured by the KL divergence, where Adam's
+are spent on the states that are visited most, and the dry way's are visited least.
 
     d = d_t                                    until the share ``measured_at`` of B
     d = d_d (d_s / d_d)^(1 - f)                after it, d_s the mean episode cost measured there
