@@ -9,6 +9,7 @@ costs are computed from the tables of the policy and the task (``exact.evaluate_
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,13 +78,7 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
     methods = occurring(policies["method"])
     if not maps:
         return None
-    side_by_side = len(methods) == 1  # the maps; else each has lines of its own
-    columns = min(MAX_COLUMNS, len(methods))
-    lines = -(-len(methods) // columns)
-    rows = lines * len(maps)
-    if side_by_side:
-        rows = -(-len(maps) // MAX_COLUMNS)
-        columns = -(-len(maps) // rows)
+    rows, columns, panels_of_a_map = _layout(len(maps), len(methods))
     scale = LogNorm(vmin=0.1, vmax=max(options.horizon for _, options in maps.values()))
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 1.7 * rows + 0.3), layout="constrained")
@@ -91,7 +86,6 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
         for axes in grid.flat:
             axes.set_axis_off()
             axes.set(xticks=[], yticks=[])  # invisible ticks would be laid out all the same
-        panels_of_a_map = 1 if side_by_side else lines * columns
         for number, (task, (river_map, options)) in enumerate(maps.items()):
             panels = grid.reshape(-1)[number * panels_of_a_map :][:panels_of_a_map]
             for axes, method in zip(panels, methods, strict=False):
@@ -104,11 +98,24 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
             first = panels[0]
             first.text(-0.07, 0.5, task, transform=first.transAxes, rotation=90, ha="right", va="center")
         bar = figure.colorbar(ScalarMappable(scale, VISIT_COLOURS), ax=grid, shrink=0.6, aspect=30, pad=0.01)
-        label = "expected steps on the square, an episode"
-        bar.set_label(label if rows > 1 else label.replace(" on", "\non"), fontsize=6.0)
+        gap = " " if rows > 1 else "\n"  # one row is lower than the label is long
+        bar.set_label(f"expected steps{gap}on the square, an episode", fontsize=6.0)
         title = f"{agent}: final policies, sampled; the mean over runs, exactly computed"
         figure.suptitle(title, fontsize=7.0)
     return figure
+
+
+def _layout(num_maps: int, num_methods: int) -> tuple[int, int, int]:
+    """Rows and columns of the grid of panels, and how many of them, one after the other, each map has.
+
+    Each map has lines of its own; if there is but one method, the maps lie side by side.
+    """
+    if num_methods == 1:
+        rows = math.ceil(num_maps / MAX_COLUMNS)
+        return rows, math.ceil(num_maps / rows), 1
+    columns = min(MAX_COLUMNS, num_methods)
+    lines = math.ceil(num_methods / columns)
+    return lines * num_maps, columns, lines * columns
 
 
 def river_task(sweep: Sweep, task: str) -> tuple[RiverMap, RiverGridOptions] | None:

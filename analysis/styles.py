@@ -63,9 +63,9 @@ STYLES = {
     "unconstrained": MethodStyle("#7a7a7a", (3.0, 1.2, 1.0, 1.2, 1.0, 1.2), "X"),
 }
 SPARE_STYLES = (
-    MethodStyle("#aa4499", (6.0, 1.2, 3.0, 1.2), "p"),
+    MethodStyle("#aa4499", (6.0, 1.2, 3.0, 1.2), "H"),
     MethodStyle("#56b4e9", (2.5, 1.0), ">"),
-    MethodStyle("#117733", (7.0, 1.5, 1.2, 1.5, 1.2, 1.5), "H"),
+    MethodStyle("#117733", (7.0, 1.5, 1.2, 1.5, 1.2, 1.5), "p"),
     MethodStyle("#b8a800", (1.0, 0.8), "h"),
     MethodStyle("#332288", (4.0, 2.5), "*"),
 )

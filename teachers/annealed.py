@@ -8,8 +8,8 @@ early, from what the noisy student costs to d_d.
 
 Once the limit is below what so noisy a policy can keep, the student pays for every cost that it can avoid
 while it goes on trying everything: stretches of river become shorter, until none is left. So the limit does
-not wait for the student; one that did so found nothing. As the noise ends, the student settles on the best
-way within d_d.
+not wait for the student; those that did found the dry way less often. As the noise ends, the student
+settles on the best way within d_d.
 
 It is for ``cpo``. Its answer to a limit that cannot be kept does not grow with time, as the multipliers of
 Lagrangian students do until they stand still; and its steps are measured by the KL divergence, where Adam's
@@ -120,16 +120,14 @@ def geometric(share: float, start: float, deploy_limit: float) -> float:
 def annealed_noise(p: float, config: AnnealedConfig) -> float:
     """The noise eps at the progress p: held, then falling in a straight line to 0.
 
-    >>> annealed_noise(0.7, AnnealedConfig(policy_noise=0.2, noise_hold=0.6, noise_end=0.8))
-    0.1
+    >>> annealed_noise(0.75, AnnealedConfig(policy_noise=0.5, noise_hold=0.5, noise_end=1.0))
+    0.25
     """
     if p < config.noise_hold:
         return config.policy_noise
     if p >= config.noise_end:
         return 0.0
-    return round(
-        config.policy_noise * (config.noise_end - p) / (config.noise_end - config.noise_hold), ndigits=12
-    )
+    return config.policy_noise * (config.noise_end - p) / (config.noise_end - config.noise_hold)
 
 
 class AnnealedTeacher:

@@ -42,7 +42,7 @@ class History:
         return [
             TeacherSpec(name, options, self.train_limits, self.deploy_limits, TRAIN_STEPS)
             for name, options in VARIANTS
-            if not (static_only and name in {"dynamic", "annealed"})
+            if not (static_only and name == "dynamic")
         ]
 
     def of_dimension(self, i: int) -> "History":
