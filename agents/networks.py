@@ -8,6 +8,10 @@ handful of operations on two vectors, a trust-region step is ``parameters += ste
 single array. With small networks and few rows the number of calls is what an update costs; with many rows the
 activations would be what it holds, so rows are evaluated in blocks.
 
+A layer's biases are the last row of its weights, and its inputs end in a column of ones. To add biases and to
+sum their slopes would each be a sweep over memory as large as the activations, and such sweeps are what a
+large update costs beside its products.
+
 Letters: C networks, U rows, n inputs, P parameters.
 """
 
@@ -28,6 +32,10 @@ from torch import Tensor
 # are all that is held, but each block reads all weights and adds to the whole gradient: 30,000 rows of 256
 # units take an eighth longer in 30 blocks than in four.
 BLOCK_ROWS, MOST_BLOCKS = 1024, 4
+# Rows of activations begin at multiples of so many numbers, which is where products are fastest.
+ALIGNMENT = 16
+# So few columns of a product are faster multiplied as rows.
+FEW_COLUMNS = 8
 
 # (1 - h^2) slope in one sweep over memory, into ``grad_input``; no public function does that.
 tanh_backward = torch.ops.aten.tanh_backward.grad_input
@@ -36,8 +44,8 @@ tanh_backward = torch.ops.aten.tanh_backward.grad_input
 def add_product(into: Tensor, left: Tensor, right: Tensor, *, keep: bool) -> None:
     """Write left^T right, [C, i, o], into memory, or add it to what the memory holds.
 
-    A single column (o = 1, as critics have) is written as the row right^T left: the same sums in the same
-    order, but MKL takes three times as long for columns of several matrices at once.
+    A few columns (o is 1 for critics, the size of an action for policies) are multiplied as the rows
+    right^T left: MKL takes two to three times as long for columns.
 
     Args:
         into: [C, i, o].
@@ -45,9 +53,10 @@ def add_product(into: Tensor, left: Tensor, right: Tensor, *, keep: bool) -> Non
         right: [C, U, o].
         keep: whether to add.
     """
-    if right.shape[2] == 1:
-        into, left, right = into.transpose(1, 2), right, left
-    if keep:
+    if right.shape[2] <= FEW_COLUMNS:
+        product = torch.bmm(right.transpose(1, 2), left).transpose(1, 2)
+        into.add_(product) if keep else into.copy_(product)
+    elif keep:
         into.baddbmm_(left.transpose(1, 2), right)
     else:
         torch.bmm(left.transpose(1, 2), right, out=into)
@@ -132,28 +141,44 @@ class FlatParameters:
             for tensor, end in zip(self.tensors, ends, strict=True)
         ]
 
-    def to_numpy(self) -> npt.NDArray[np.float32]:
-        """A copy of all parameters, [P]."""
-        return self.values.numpy(force=True).copy()
+    def to_numpy(self, vector: Tensor | None = None) -> npt.NDArray[np.float32]:
+        """A copy of all parameters, or of a vector that belongs to them, as it is saved, [P].
 
-    def load(self, values: npt.NDArray[np.float32]) -> None:
-        """Take over saved parameters, [P].
+        Saved is layer by layer first the weights of all networks, then their biases.
+        """
+        pieces = self.pieces(self.values if vector is None else vector)
+        parts = [part.reshape(-1) for piece in pieces for part in _saved_parts(piece)]
+        return torch.cat(parts).numpy(force=True)
+
+    def load(self, saved: npt.NDArray[np.float32], vector: Tensor | None = None) -> None:
+        """Take over what ``to_numpy`` gave, [P], as the parameters or into a vector that belongs to them.
 
         Raises:
             ValueError: they are of another network.
         """
-        if values.shape != tuple(self.values.shape):
+        if saved.shape != tuple(self.values.shape):
             raise ValueError(
-                f"the saved network has {values.size} parameters, this one {self.values.numel()}: "
+                f"the saved network has {saved.size} parameters, this one {self.values.numel()}: "
                 "was it built with other options?"
             )
-        self.values.copy_(torch.as_tensor(np.asarray(values, dtype=np.float32)))
+        pieces = self.pieces(self.values if vector is None else vector)
+        parts = [part for piece in pieces for part in _saved_parts(piece)]
+        values = torch.as_tensor(np.array(saved, dtype=np.float32))
+        flat = torch.split(values, [part.numel() for part in parts])
+        for part, numbers in zip(parts, flat, strict=True):
+            part.copy_(numbers.view(part.shape))
+
+
+def _saved_parts(piece: Tensor) -> list[Tensor]:
+    """The views of a tensor that are saved one after the other: of a layer, its weights and biases."""
+    return [piece[:, :-1], piece[:, -1:]] if piece.dim() == 3 else [piece]
 
 
 class Scratch:
     """Memory that is used again and again.
 
-    Asking the system for some megabytes anew costs as much as a product that fills them.
+    Asking the system for some megabytes anew costs as much as a product that fills them. A place is either
+    for ``tensor`` or for ``inputs``.
     """
 
     def __init__(self) -> None:
@@ -164,12 +189,24 @@ class Scratch:
         """Uninitialised memory; what was handed out at the same place before is overwritten."""
         view = self._views.get(place)
         if view is None or view.shape != shape:
-            size = math.prod(shape)
-            buffer = self._buffers.get(place)
-            if buffer is None or buffer.numel() < size:
-                buffer = self._buffers[place] = torch.empty(size)
-            view = self._views[place] = buffer[:size].view(shape)
+            view = self._views[place] = self._memory(place, math.prod(shape)).view(shape)
         return view
+
+    def inputs(self, place: int, num_networks: int, num_rows: int, width: int) -> Tensor:
+        """Uninitialised memory for a layer's inputs, [C, U, width + 1], but the last column holds ones."""
+        view = self._views.get(place)
+        if view is None or view.shape != (num_networks, num_rows, width + 1):
+            length = math.ceil((width + 1) / ALIGNMENT) * ALIGNMENT
+            memory = self._memory(place, num_networks * num_rows * length)
+            view = self._views[place] = memory.view(num_networks, num_rows, length)[..., : width + 1]
+            view[..., width] = 1.0
+        return view
+
+    def _memory(self, place: int, size: int) -> Tensor:
+        buffer = self._buffers.get(place)
+        if buffer is None or buffer.numel() < size:
+            buffer = self._buffers[place] = torch.empty(size)
+        return buffer[:size]
 
 
 class TanhStack:
@@ -180,32 +217,32 @@ class TanhStack:
     would spend more time on its book-keeping than these networks on their arithmetic.
 
     Args:
-        parameters: the block whose first ``2 num_layers`` tensors, shaped as ``shapes`` says, it uses.
+        parameters: the block whose first ``num_layers`` tensors, shaped as ``shapes`` says, it uses.
         num_layers: linear layers of each network.
+
+    Attributes:
+        layers: weights over biases, [C, in + 1, out], layer by layer.
+        weights: those rows of ``layers`` that are weights, [C, in, out].
+        biases: the others, [C, 1, out].
     """
 
     def __init__(self, parameters: FlatParameters, num_layers: int) -> None:
-        used = slice(0, 2 * num_layers)
-        self.weights, self.biases = parameters.tensors[used][0::2], parameters.tensors[used][1::2]
-        self._slopes = list(
-            zip(parameters.gradients[used][0::2], parameters.gradients[used][1::2], strict=True)
-        )
+        self.layers = parameters.tensors[:num_layers]
+        self.weights = [layer[:, :-1] for layer in self.layers]
+        self.biases = [layer[:, -1:] for layer in self.layers]
+        self._slopes = parameters.gradients[:num_layers]
         self._scratch = Scratch()
         self._slope_scratch = Scratch()
 
     @staticmethod
     def shapes(num_networks: int, sizes: Sequence[int]) -> list[tuple[int, ...]]:
-        """The shapes of the weights [C, in, out] and biases [C, 1, out], layer by layer.
+        """The shapes of weights over biases, [C, in + 1, out], layer by layer.
 
         Args:
             num_networks: C.
             sizes: widths from the inputs to the outputs.
         """
-        return [
-            shape
-            for inputs, outputs in itertools.pairwise(sizes)
-            for shape in ((num_networks, inputs, outputs), (num_networks, 1, outputs))
-        ]
+        return [(num_networks, inputs + 1, outputs) for inputs, outputs in itertools.pairwise(sizes)]
 
     def initialise(self, initialiser: Initialiser, last_scale: float, generator: torch.Generator) -> None:
         """Draw all weights; scale the last layer's by ``last_scale``; set the biases to 0."""
@@ -223,20 +260,24 @@ class TanhStack:
         return outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=1)
 
     def activations(self, rows: Tensor, scratch: Scratch | None = None) -> list[Tensor]:
-        """The inputs of every layer, then the outputs, each [C, U, width].
+        """The inputs of every layer, each [C, U, in + 1] with ones at the end, then the outputs, [C, U, out].
 
         Args:
             rows: [U, n], one block.
-            scratch: where the activations of hidden layers are kept; if None, in the stack's own, where the
-                next evaluation without one overwrites them.
+            scratch: where the inputs of layers are kept; if None, in the stack's own, where the next
+                evaluation without one overwrites them.
         """
         scratch = scratch or self._scratch
-        layers = [rows.expand(len(self.weights[0]), *rows.shape)]
-        for layer, (weight, bias) in enumerate(zip(self.weights[:-1], self.biases[:-1], strict=True)):
-            memory = scratch.tensor(layer, (*layers[0].shape[:2], weight.shape[2]))
-            layers.append(torch.baddbmm(bias, layers[-1], weight, out=memory).tanh_())
-        layers.append(torch.baddbmm(self.biases[-1], layers[-1], self.weights[-1]))
-        return layers
+        num_networks, (num_rows, width) = len(self.layers[0]), rows.shape
+        inputs = scratch.inputs(0, 1, num_rows, width)
+        inputs[0, :, :-1] = rows
+        kept = [inputs.expand(num_networks, -1, -1)]
+        for place, layer in enumerate(self.layers[:-1], start=1):
+            inputs = scratch.inputs(place, num_networks, num_rows, layer.shape[2])
+            torch.bmm(kept[-1], layer, out=inputs[..., :-1]).tanh_()
+            kept.append(inputs)
+        kept.append(torch.bmm(kept[-1], self.layers[-1]))
+        return kept
 
     def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
         """The derivative of the outputs along a change of the parameters: J times the change.
@@ -245,20 +286,20 @@ class TanhStack:
 
         Args:
             activations: as ``activations`` gave them at the present parameters.
-            change: dW, db of every layer in order, each of its parameter's shape.
+            change: dW over db of every layer in order, each of its layer's shape.
 
         Returns:
             [C, U, out].
         """
         memory = [
-            self._slope_scratch.tensor(layer, hidden.shape)
-            for layer, hidden in enumerate(activations[1:-1], start=1)
+            self._slope_scratch.tensor(layer, (*inputs.shape[:2], inputs.shape[2] - 1))
+            for layer, inputs in enumerate(activations[1:-1], start=1)
         ] + [torch.empty_like(activations[-1])]
-        moved = torch.baddbmm(change[1], activations[0], change[0], out=memory[0])
-        for layer in range(1, len(self.weights)):
-            tanh_backward(moved, activations[layer], grad_input=moved)
-            moved = torch.baddbmm(change[2 * layer + 1], moved, self.weights[layer], out=memory[layer])
-            moved.baddbmm_(activations[layer], change[2 * layer])
+        moved = torch.bmm(activations[0], change[0], out=memory[0])
+        for layer in range(1, len(self.layers)):
+            tanh_backward(moved, activations[layer][..., :-1], grad_input=moved)
+            moved = torch.bmm(moved, self.weights[layer], out=memory[layer])
+            moved.baddbmm_(activations[layer], change[layer])
         return moved
 
     def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
@@ -271,17 +312,13 @@ class TanhStack:
             slope: dL / d outputs, [C, U, out].
             add: to what the gradient block holds, as for the second and later blocks of rows; else replace.
         """
-        for layer in range(len(self.weights) - 1, -1, -1):
-            by_weight, by_bias = self._slopes[layer]
-            add_product(by_weight, activations[layer], slope, keep=add)
-            if add:
-                by_bias.add_(slope.sum(dim=1, keepdim=True))
-            else:
-                torch.sum(slope, dim=1, keepdim=True, out=by_bias)
+        for layer in range(len(self.layers) - 1, -1, -1):
+            add_product(self._slopes[layer], activations[layer], slope, keep=add)
             if layer > 0:
-                memory = self._slope_scratch.tensor(layer, activations[layer].shape)
+                hidden = activations[layer][..., :-1]
+                memory = self._slope_scratch.tensor(layer, tuple(hidden.shape))
                 slope = pull_through(slope, self.weights[layer], out=memory)
-                tanh_backward(slope, activations[layer], grad_input=slope)
+                tanh_backward(slope, hidden, grad_input=slope)
 
 
 class Adam:
@@ -322,15 +359,15 @@ class Adam:
     def state_dict(self) -> dict[str, Any]:
         """Both moments, [P], and the number of steps taken."""
         return {
-            "first_moment": self._first_moment.numpy(force=True).copy(),
-            "second_moment": self._second_moment.numpy(force=True).copy(),
+            "first_moment": self._parameters.to_numpy(self._first_moment),
+            "second_moment": self._parameters.to_numpy(self._second_moment),
             "steps": self._steps,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
-        self._first_moment.copy_(torch.as_tensor(np.asarray(state["first_moment"], dtype=np.float32)))
-        self._second_moment.copy_(torch.as_tensor(np.asarray(state["second_moment"], dtype=np.float32)))
+        self._parameters.load(np.asarray(state["first_moment"]), self._first_moment)
+        self._parameters.load(np.asarray(state["second_moment"]), self._second_moment)
         self._steps = int(state["steps"])
 
 

@@ -73,9 +73,9 @@ class StochasticPolicy:
             self._half_ranges = np.where(np.isfinite(half), half, 1.0)
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
         acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
-        layers = slice(0, 2 * len(self.stack.weights))
-        self._weights = [weight[0] for weight in acting[layers][0::2]]
-        self._biases = [bias[0] for bias in acting[layers][1::2]]
+        layers = [layer[0] for layer in acting[: len(self.stack.layers)]]
+        self._weights = [layer[:-1] for layer in layers]
+        self._biases = [layer[-1] for layer in layers]
         self._acting_log_std = acting[-1]
         self._scratch: list[Scratch] = []
         self._latest: _Latest | None = None
@@ -203,8 +203,7 @@ class StochasticPolicy:
             observations, weights = observations[first], np.bincount(row) / len(observations)
         logits = self.outputs(observations).astype(np.float64)
         scale = 1.0 - noise if form == "temperature" else matching_scale(logits, weights, noise)
-        self.stack.weights[-1].mul_(scale)
-        self.stack.biases[-1].mul_(scale)
+        self.stack.layers[-1].mul_(scale)
         return {
             "noise_scale": scale,
             "randomness_before": off_greedy_mass(logits, weights),
@@ -311,6 +310,6 @@ class FisherMetric:
         for number, (activations, distribution, weights) in enumerate(self._blocks):
             moved = stack.output_change(activations, change)[0]
             stack.pull_back(activations, (weights * distribution.fisher(moved))[None], add=number > 0)
-        if len(change) > 2 * len(stack.weights):
+        if len(change) > len(stack.layers):
             parameters.gradients[-1].copy_(2.0 * change[-1])  # the Fisher metric of log_std is 2
         return parameters.gradient + self._damping * vector

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from recrl.agents import networks
 from recrl.agents.networks import (
+    FEW_COLUMNS,
     INITIALISERS,
     Adam,
     Critics,
@@ -19,7 +20,8 @@ from recrl.agents.networks import (
     xavier,
 )
 
-SIZES = (3, 5, 4, 2)
+# One layer wider than what add_product multiplies as rows, the others not.
+SIZES = (3, FEW_COLUMNS + 2, 4, 2)
 
 
 @pytest.fixture
@@ -49,9 +51,9 @@ def one_by_one(flat: Tensor, parameters: FlatParameters, rows: Tensor) -> Tensor
     outputs = []
     for network in range(len(tensors[0])):
         hidden = rows
-        for layer in range(0, len(tensors), 2):
-            hidden = hidden @ tensors[layer][network] + tensors[layer + 1][network]
-            if layer < len(tensors) - 2:
+        for layer, tensor in enumerate(tensors):
+            hidden = hidden @ tensor[network, :-1] + tensor[network, -1]
+            if layer < len(tensors) - 1:
                 hidden = torch.tanh(hidden)
         outputs.append(hidden)
     return torch.stack(outputs)
@@ -135,14 +137,14 @@ def test_xavier_weights_are_uniform_within_their_bound() -> None:
 
 def test_parameters_of_another_network_are_refused() -> None:
     parameters, _ = stack_of(1)
-    message = "the saved network has 3 parameters, this one 54: was it built with other options\\?"
+    message = "the saved network has 3 parameters, this one 94: was it built with other options\\?"
     with pytest.raises(ValueError, match=message):
         parameters.load(np.zeros(3, dtype=np.float32))
 
 
 @pytest.mark.usefixtures("double_precision")
 def test_many_rows_in_blocks_are_all_rows_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    critics = Critics(3, 1, NetworkForm((5, 4), xavier), torch.Generator().manual_seed(0))
+    critics = Critics(3, 1, NetworkForm((FEW_COLUMNS + 2, 4), xavier), torch.Generator().manual_seed(0))
     rows, targets = random_rows(23), torch.randn(2, 23, generator=torch.Generator().manual_seed(1))
     weights = torch.full((23,), 1.0 / 23.0)
     found = []
@@ -161,3 +163,28 @@ def test_blocks_cover_all_rows() -> None:
         assert [len(part) for part in parts] == lengths
         assert [row for part in parts for row in part] == rows
     assert len(networks.blocks(0)) == 1
+
+
+def test_saved_are_layer_by_layer_the_weights_of_all_networks_then_their_biases() -> None:
+    parameters, stack = stack_of(2)
+    pairs = zip(stack.weights, stack.biases, strict=True)
+    expected = np.concatenate([tensor.reshape(-1).numpy() for pair in pairs for tensor in pair])
+    assert parameters.to_numpy().tobytes() == expected.tobytes()
+    other, _ = stack_of(2, seed=7)
+    other.load(parameters.to_numpy())
+    assert torch.equal(other.values, parameters.values)
+
+
+def test_a_restored_adam_goes_on_with_the_same_steps() -> None:
+    parameters, _ = stack_of(2)
+    optimiser = Adam(parameters, 0.01)
+    parameters.gradient.normal_(generator=torch.Generator().manual_seed(0))
+    optimiser.step()
+    other, _ = stack_of(2, seed=7)
+    resumed = Adam(other, 0.01)
+    other.load(parameters.to_numpy())
+    resumed.load_state_dict(optimiser.state_dict())
+    other.gradient.copy_(parameters.gradient)
+    for adam in (optimiser, resumed):
+        adam.step()
+    assert torch.equal(other.values, parameters.values)

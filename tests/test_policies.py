@@ -108,11 +108,11 @@ def divergence_of(policy: StochasticPolicy, flat: Tensor, rows: Tensor, weights:
     tensors = policy.parameters.pieces(flat)
     hidden = rows
     for layer in range(3):
-        hidden = hidden @ tensors[2 * layer][0] + tensors[2 * layer + 1][0]
+        hidden = hidden @ tensors[layer][0, :-1] + tensors[layer][0, -1]
         if layer < 2:
             hidden = torch.tanh(hidden)
     new = (
-        Categorical(torch.log_softmax(hidden, dim=1)) if len(tensors) == 6 else Gaussian(hidden, tensors[-1])
+        Categorical(torch.log_softmax(hidden, dim=1)) if len(tensors) == 3 else Gaussian(hidden, tensors[-1])
     )
     return mean_divergence(policy.distribution(rows), new, weights)
 
