@@ -7,13 +7,14 @@ the aim is at most 60 ms to collect it and learn from it. Then on a batch of dis
 numbers with 2 continuous actions, networks of 256 x 256 units, under both presets: ``recommended`` is to
 take at most a fifth of ``paper``'s time, and ``paper`` at most 1.3 times its bound.
 
-The bound is the time of the matrix products of the networks alone, at a rate measured just before and after:
-once that of products of the networks' own shapes into memory that is there already (``bare``), once the rate
-that this machine reaches on a product of two 1024 x 1024 matrices (``square``). Products that the
-algorithm asks for are counted, by hand: not those that an implementation may do besides.
+The bound is the time of the matrix products of the networks alone, at a rate measured meanwhile: once that of
+products of the networks' own shapes into memory that is there already (``bare``), once the rate that this
+machine reaches on a product of two 1024 x 1024 matrices, just before and after (``square``). Products that
+the algorithm asks for are counted, by hand: not those that an implementation may do besides.
 
-A machine's rate changes by a third from second to second, with its neighbours and its clock. So the passes
-that ``paper`` consists of are measured once more by themselves, in turn with the bare products of a pass.
+A machine's rate changes by a third from second to second, with its neighbours and its clock. So an update is
+interrupted at each of its steps of Adam by the bare products of one pass, whose time is not counted as its
+own; and the passes that ``paper`` consists of are measured once more by themselves, in turn with bare ones.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -102,13 +104,6 @@ def bare_pass(rows: int) -> Callable[[], object]:
     return products
 
 
-def bare_flops_a_millisecond(rows: int) -> float:
-    """Floating-point operations a millisecond in a bare pass."""
-    products = bare_pass(rows)
-    flops = pass_flops(rows, (NUM_OBSERVATIONS, *HIDDEN, 1))
-    return flops / float(np.median([milliseconds(products) for _ in range(7)]))
-
-
 def forward_flops(rows: float, sizes: tuple[int, ...]) -> float:
     """Of one evaluation of a network: a product a layer."""
     return sum(2.0 * rows * inputs * outputs for inputs, outputs in pairwise(sizes))
@@ -175,11 +170,21 @@ def measure_large(agent_name: str, preset: str, samples: int) -> tuple[float, fl
     metrics: dict[str, float] = {}
     costs = rollout.costs.sum(axis=0)
     rows = min(config.minibatch_size or samples, samples)
-    rates = [np.array([bare_flops_a_millisecond(rows), flops_a_millisecond()])]
-    spent = milliseconds(lambda: metrics.update(agent.update(rollout, costs, LARGE_LIMITS)))
-    rates.append(np.array([bare_flops_a_millisecond(rows), flops_a_millisecond()]))
-    bare, square = update_flops(config, metrics, samples) / np.mean(rates, axis=0) / 1e3
-    return spent / 1e3, bare, square, metrics["policy_steps"]
+    products, step = bare_pass(rows), Adam.step
+    products()
+    turns: list[float] = []
+
+    def step_and_pause(optimiser: Adam) -> None:
+        step(optimiser)
+        turns.append(milliseconds(products))
+
+    square_rates = [flops_a_millisecond()]
+    with patch.object(Adam, "step", step_and_pause):
+        spent = milliseconds(lambda: metrics.update(agent.update(rollout, costs, LARGE_LIMITS))) - sum(turns)
+    square_rates.append(flops_a_millisecond())
+    bare_rate = pass_flops(rows, (NUM_OBSERVATIONS, *HIDDEN, 1)) / float(np.mean(turns))
+    flops = update_flops(config, metrics, samples) / 1e3
+    return spent / 1e3, flops / bare_rate, flops / float(np.mean(square_rates)), metrics["policy_steps"]
 
 
 def passes_in_turn(samples: int, rounds: int) -> dict[str, list[float]]:
