@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 
 STOP_QUESTION_SECONDS = 0.5
 HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats, at least
+FIRST_WORD_SILENCES = 4  # that a process may take besides until it first speaks of its trial
 LONGEST_PAUSE_SECONDS = 0.5  # in which nobody asks Ray whether a trial has ended
 PAUSE_SHARE = 0.01  # of the time since a trial last began or ended
 CONNECT_SECONDS = 5.0
@@ -362,20 +363,25 @@ class _Silence:
     """Ends the processes of trials that hang, so that Tune starts these trials again.
 
     Silence is measured on this process's clock, from when it last saw a heartbeat change: the clocks of the
-    nodes need not agree. A process that was given a trial is not silent before it first speaks of it: it may
-    take long to import torch on a busy machine, and what is on disk until then is an earlier attempt's.
+    nodes need not agree. A process that was given a trial has more time, ``FIRST_WORD_SILENCES``, until it
+    first speaks of it: it may take long to import torch on a busy machine. What is on disk until then is an
+    earlier attempt's.
     """
 
     def __init__(self, store: SweepStore, seconds: float, storage: RemoteSweep | None) -> None:
         self._store = store
         self._seconds = seconds
+        self._first_word_seconds = FIRST_WORD_SILENCES * seconds
         self._storage = storage
         self._heard: dict[str, tuple[tuple[int, float], float]] = {}
+        self._before: dict[str, tuple[int, float]] = {}
         self._looked_at = float("-inf")
 
     def begin(self, trial: Any) -> None:
         """A process is given one of Tune's trials."""
-        self._heard[trial.trial_id] = (_sign_of(self._store.trial(_spec_of(trial)).record()), float("inf"))
+        sign = _sign_of(self._store.trial(_spec_of(trial)).record())
+        self._before[trial.trial_id] = sign
+        self._heard[trial.trial_id] = (sign, time.monotonic() + self._first_word_seconds)
 
     def end(self, trials: Sequence[Any]) -> None:
         """End those of Tune's trials whose recrl trial runs without a heartbeat."""
@@ -394,12 +400,14 @@ class _Silence:
             record = self._store.trial(spec).record()
             sign = _sign_of(record)
             last, heard_at = self._heard.get(trial.trial_id, (None, now))
+            has_spoken = sign != self._before.get(trial.trial_id)
             if sign != last:
-                self._heard[trial.trial_id] = (sign, now)
-            elif now - heard_at > self._seconds and record.status is TrialState.RUNNING:
+                self._heard[trial.trial_id] = (sign, now + (0.0 if has_spoken else self._first_word_seconds))
+                continue
+            if now - heard_at > self._seconds and (record.status is TrialState.RUNNING or not has_spoken):
                 self._heard[trial.trial_id] = (sign, float("inf"))  # once for a silence
                 logger.warning("%s: no sign of work for %.0f seconds", spec.title, self._seconds)
-                _end_process(record, trial.temporary_state.ray_actor)
+                _end_process(record if has_spoken else None, trial.temporary_state.ray_actor)
 
 
 def _sign_of(record: TrialRecord) -> tuple[int, float]:
@@ -422,9 +430,14 @@ def pause_seconds(quiet_seconds: float) -> float:
     return min(PAUSE_SHARE * quiet_seconds, LONGEST_PAUSE_SECONDS)
 
 
-def _end_process(record: TrialRecord, actor: Any) -> None:
-    """Kill a trial's process: directly where it is here, because one that is stopped serves no request."""
-    if record.host == socket.gethostname() and _is_worker(record.pid):
+def _end_process(record: TrialRecord | None, actor: Any) -> None:
+    """Kill a trial's process: directly where it is here, because one that is stopped serves no request.
+
+    Args:
+        record: what the process wrote of itself, if it did.
+        actor: Ray's handle of it, if there is one.
+    """
+    if record is not None and record.host == socket.gethostname() and _is_worker(record.pid):
         os.kill(record.pid, signal.SIGKILL)
     elif actor is not None:
         ray.kill(actor)

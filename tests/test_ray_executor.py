@@ -21,6 +21,7 @@ import ray
 from ray.exceptions import RayActorError
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.orchestrator import ray_executor
 from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
@@ -366,6 +367,30 @@ def test_a_process_is_silent_only_after_it_has_spoken_of_its_trial(tmp_path: Pat
     finally:
         process.kill()
         process.wait()
+
+
+def test_a_process_that_never_speaks_of_its_trial_is_ended_by_ray_after_a_longer_silence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    tune_trial = SimpleNamespace(
+        trial_id="1",
+        status="RUNNING",
+        config={"spec": json.dumps(LONG.to_json())},
+        temporary_state=SimpleNamespace(ray_actor="its actor"),
+    )
+    ended: list[Any] = []
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(ray_executor, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(ray, "kill", ended.append)
+    silence = _Silence(store, 100.0, None)
+    silence.begin(tune_trial)
+    found = []
+    for clock.now in (101.0, 490.0, 501.0, 510.0, 2000.0):
+        silence.end([tune_trial])
+        found.append(len(ended))
+    assert found == [0, 0, 1, 1, 1]
+    assert ended == ["its actor"]
 
 
 def test_a_stop_file_tells_its_own_run_and_all_earlier_ones(tmp_path: Path) -> None:
