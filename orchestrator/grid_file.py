@@ -189,8 +189,8 @@ class Resources(_Written):
         default=300.0,
         ge=5.0,
         le=1e7,
-        description="A trial that uses no processor for so long hangs: it is started again from its last "
-        "checkpoint. Wall seconds (ours).",
+        description="A trial that uses no processor for so long hangs (five times so long before its process "
+        "first speaks of it): it is started again from its last checkpoint. Wall seconds (ours).",
     )
 
 

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 STOP_QUESTION_SECONDS = 0.5
 HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats, at least
-FIRST_WORD_SILENCES = 4  # that a process may take besides until it first speaks of its trial
+FIRST_WORD_SILENCES = 5  # as long as so many a process may be silent before it first speaks of its trial
 LONGEST_PAUSE_SECONDS = 0.5  # in which nobody asks Ray whether a trial has ended
 PAUSE_SHARE = 0.01  # of the time since a trial last began or ended
 CONNECT_SECONDS = 5.0
@@ -363,15 +363,14 @@ class _Silence:
     """Ends the processes of trials that hang, so that Tune starts these trials again.
 
     Silence is measured on this process's clock, from when it last saw a heartbeat change: the clocks of the
-    nodes need not agree. A process that was given a trial has more time, ``FIRST_WORD_SILENCES``, until it
-    first speaks of it: it may take long to import torch on a busy machine. What is on disk until then is an
-    earlier attempt's.
+    nodes need not agree. A process that was given a trial may be silent for longer,
+    ``FIRST_WORD_SILENCES``, before it first speaks of it: it may take long to import torch on a busy machine.
+    What is on disk until then is an earlier attempt's.
     """
 
     def __init__(self, store: SweepStore, seconds: float, storage: RemoteSweep | None) -> None:
         self._store = store
         self._seconds = seconds
-        self._first_word_seconds = FIRST_WORD_SILENCES * seconds
         self._storage = storage
         self._heard: dict[str, tuple[tuple[int, float], float]] = {}
         self._before: dict[str, tuple[int, float]] = {}
@@ -381,7 +380,7 @@ class _Silence:
         """A process is given one of Tune's trials."""
         sign = _sign_of(self._store.trial(_spec_of(trial)).record())
         self._before[trial.trial_id] = sign
-        self._heard[trial.trial_id] = (sign, time.monotonic() + self._first_word_seconds)
+        self._heard[trial.trial_id] = (sign, time.monotonic())
 
     def end(self, trials: Sequence[Any]) -> None:
         """End those of Tune's trials whose recrl trial runs without a heartbeat."""
@@ -400,13 +399,14 @@ class _Silence:
             record = self._store.trial(spec).record()
             sign = _sign_of(record)
             last, heard_at = self._heard.get(trial.trial_id, (None, now))
-            has_spoken = sign != self._before.get(trial.trial_id)
             if sign != last:
-                self._heard[trial.trial_id] = (sign, now + (0.0 if has_spoken else self._first_word_seconds))
+                self._heard[trial.trial_id] = (sign, now)
                 continue
-            if now - heard_at > self._seconds and (record.status is TrialState.RUNNING or not has_spoken):
+            has_spoken = sign != self._before.get(trial.trial_id)
+            patience = self._seconds * (1 if has_spoken else FIRST_WORD_SILENCES)
+            if now - heard_at > patience and (record.status is TrialState.RUNNING or not has_spoken):
                 self._heard[trial.trial_id] = (sign, float("inf"))  # once for a silence
-                logger.warning("%s: no sign of work for %.0f seconds", spec.title, self._seconds)
+                logger.warning("%s: no sign of work for %.0f seconds", spec.title, patience)
                 _end_process(record if has_spoken else None, trial.temporary_state.ray_actor)
 
 
