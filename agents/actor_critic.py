@@ -133,6 +133,7 @@ class ActorCritic:
         self._critic_optimiser = Adam(critics.parameters, config.critic_learning_rate)
         self._rule = rule
         self._generator = generator
+        self._noisy = False
         self._form = (
             TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
         )
@@ -166,6 +167,7 @@ class ActorCritic:
         """
         with self._on_its_device():
             metrics = self._learn(rollout, episode_costs, limits)
+        self._noisy = False
         self._policy.publish()
         require_finite("policy parameters", self._policy.parameters.to_numpy())
         require_finite("critic parameters", self._critics.parameters.to_numpy())
@@ -180,7 +182,9 @@ class ActorCritic:
         )
         costs, values = self._form.judge(rollout, episode_costs, limits)
         advantages, targets = self._estimate(rollout, costs, batch)
-        constraints = Constraints.measure(rollout, len(episode_costs), values, limits, self._cmdp.horizon)
+        constraints = Constraints.measure(
+            rollout, len(episode_costs), values, limits, self._cmdp.horizon, noisy=self._noisy
+        )
         experience = Experience.of(self._policy, batch, advantages, constraints)
         return {
             **improve_and_measure(self._rule, self._policy, experience, self._generator),
@@ -248,6 +252,7 @@ class ActorCritic:
         """Make the policy more random once; see ``recrl.agents.noise``."""
         with self._on_its_device():
             metrics = self._policy.add_noise(noise, observations, self._config.noise_form)
+        self._noisy = True
         self._policy.publish()
         require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
         return metrics
@@ -258,6 +263,7 @@ class ActorCritic:
             "policy": self._policy.parameters.to_numpy(),
             "critics": self._critics.parameters.to_numpy(),
             "generator": self._generator.bit_generator.state,
+            "noisy": self._noisy,
             **{name: part.state_dict() for name, part in self._parts.items()},
         }
 
@@ -267,6 +273,7 @@ class ActorCritic:
         self._policy.publish()
         self._critics.parameters.load(state["critics"])
         self._generator.bit_generator.state = state["generator"]
+        self._noisy = bool(state.get("noisy", False))  # earlier checkpoints lack it
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
 

@@ -162,8 +162,12 @@ class MultiplierConfig(StudentConfig):
     multiplier_derivative: NonNegative = Field(default=0.0, description="K_D of the PID rule (ours).")
     multiplier_maximum: Positive = Field(
         default=1000.0,
-        description="The largest multiplier that projected ascent and PID give; the integral of PID does not "
-        "grow while its other terms alone reach it (ours; anti-wind-up).",
+        description="The largest multiplier that projected ascent and PID give (ours; anti-wind-up).",
+    )
+    multiplier_waits: bool = Field(
+        default=False,
+        description="Sum up no violation that the teacher's noise may have caused: in an update from samples "
+        "of a policy with added noise the integral of PID stays, and the other rules' multipliers (ours).",
     )
     multiplier_reset: bool = Field(
         default=False,

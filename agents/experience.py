@@ -31,22 +31,31 @@ class Constraints:
             limit, [k]; -inf where the limit is infinite, NaN where no episode finished.
         episode_length: mean steps of an episode, above 0: environment steps over finished episodes; NaN if
             none finished.
+        noisy: whether noise was added to the policy that collected them.
     """
 
     limits: Floats
     gaps: Floats
     episode_length: float
+    noisy: bool = False
 
     @classmethod
     def measure(
-        cls, rollout: Rollout, num_episodes: int, values: Floats, limits: Floats, horizon: int | None
+        cls,
+        rollout: Rollout,
+        num_episodes: int,
+        values: Floats,
+        limits: Floats,
+        horizon: int | None,
+        *,
+        noisy: bool = False,
     ) -> Constraints:
         """Compare the constrained values of E finished episodes, [k], with the limits, [k]."""
         if num_episodes == 0:
-            return cls(limits, np.full_like(limits, np.nan), float("nan"))
+            return cls(limits, np.full_like(limits, np.nan), float("nan"), noisy)
         length = rollout.rewards.size / num_episodes
         # A rollout that ends few of the episodes it carries on would make them look longer than they can be.
-        return cls(limits, values - limits, min(length, horizon or length))
+        return cls(limits, values - limits, min(length, horizon or length), noisy)
 
     @property
     def known(self) -> bool:

@@ -116,13 +116,12 @@ def pid(
 ) -> dict[str, Floats]:
     """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
 
-    I <- clip(I + K_I min(gap, max(d, 1)), 0, maximum), and not above I where K_P gap + I >= maximum;
+    I <- clip(I + K_I min(gap, max(d, 1)), 0, maximum);
     lambda = clip(K_P gap + I + K_D max(0, gap - last gap), 0, maximum).
 
     The derivative acts only on growing violations, as in the source. The integral is held within what the
-    multiplier itself can be, and it does not grow while the multiplier is at its maximum without it
-    (conditional integration), so that neither a long satisfied nor a long hopeless constraint winds it up;
-    it includes its gain, so that a changed K_I does not make lambda jump.
+    multiplier itself can be, so that neither a long satisfied nor a long hopeless constraint winds it up; it
+    includes its gain, so that a changed K_I does not make lambda jump.
 
     The gap that is summed up is held, too. An episode costs at least 0, so it is never further than d below
     the limit, but an untrained policy may be any distance above it: what ten updates of a cost of 50 sum up
@@ -143,8 +142,6 @@ def pid(
     gap = np.where(active, gaps, 0.0)
     rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
     summed = np.clip(state["integral"] + integral * np.minimum(gap, limit_units(limits)), 0.0, maximum)
-    saturated = proportional * gap + state["integral"] >= maximum
-    summed = np.where(saturated, np.minimum(summed, state["integral"]), summed)
     output = np.clip(proportional * gap + summed + derivative * rise, 0.0, maximum)
     return {
         "multipliers": np.where(active, output, 0.0),

@@ -13,6 +13,7 @@ from recrl.agents.agent import Agent, Rollout
 from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
 from recrl.agents.config import AscentConfig
 from recrl.agents.errors import DivergedError
+from recrl.agents.lagrange import STARTS
 from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.environments.cmdp import Floats
 from recrl.environments.registry import make_vector
@@ -158,6 +159,23 @@ def test_noise_returns_the_same_metrics_and_keeps_the_student_learning(agent: st
     keys = {tuple(lessons.agent.add_noise(noise, rows)) for noise in (0.1, 1.0)}
     assert keys == {("noise_scale", "randomness_before", "randomness_after")}
     assert math.isfinite(lessons.update()["kl"])
+
+
+@pytest.mark.parametrize("rule", STARTS)
+def test_a_student_that_waits_sums_up_no_violation_of_a_noisy_policy(rule: str) -> None:
+    options = {
+        **{"multiplier_rule": rule, "multiplier_initial": 0.5, "multiplier_proportional": 0.0},
+        "multiplier_waits": True,
+    }
+    lessons, resumed = (Lessons("ppo-lag", "two-state", options) for _ in range(2))
+    rollout, _ = lessons.collect()
+    lessons.agent.add_noise(0.1, rollout.observations.reshape(-1, rollout.observations.shape[-1]))
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    violated = 0.1
+    assert [student.update(violated)["multiplier_0"] for student in (lessons, resumed)] == pytest.approx(
+        [0.5] * 2
+    )
+    assert lessons.update(violated)["multiplier_0"] > 0.5
 
 
 @every_agent

@@ -75,20 +75,6 @@ def test_pid_does_not_wind_up() -> None:
     assert state["multipliers"].tolist() == [1.0, 1.0]
 
 
-def test_the_integral_waits_while_the_multiplier_is_at_its_maximum_without_it() -> None:
-    gains = {"proportional": 3.0, "integral": 0.1, "derivative": 0.0, "maximum": 3.0}
-    state, limits = start_pid(1, 0.0), np.array([4.0])
-    for _ in range(100):
-        state = pid(state, np.array([2.0]), limits, **gains)
-        assert (state["multipliers"].item(), state["integral"].item()) == (3.0, 0.0)
-    state = pid(state, np.array([0.5]), limits, **gains)
-    assert state["multipliers"].item() == pytest.approx(3.0 * 0.5 + 0.1 * 0.5)
-    state = pid(state, np.array([0.99]), limits, **gains)  # 2.97 and the integral's 0.05 are more than 3
-    assert (state["multipliers"].item(), state["integral"].item()) == pytest.approx((3.0, 0.05))
-    state = pid(state, np.array([-0.2]), limits, **gains)
-    assert state["integral"].item() == pytest.approx(0.03)
-
-
 def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates() -> None:
     gains = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
     state, limits = start_pid(3, 1.0), np.array([5.0, 2.0, 0.0])

@@ -67,6 +67,13 @@ def test_without_a_finished_episode_the_multiplier_stays() -> None:
     assert improvement(rule, policy, batch, unknown)["multiplier_0"] == 0.7
 
 
+def test_a_pid_that_waits_still_answers_a_noisy_policys_violation_itself() -> None:
+    policy, rule, batch = fresh(multiplier_waits=True)
+    gaps = (Constraints(np.array([5.0]), np.array([2.5]), 10.0, noisy) for noisy in (True, True, False))
+    found = [improvement(rule, policy, batch, gap)["multiplier_0"] for gap in gaps]
+    assert found == pytest.approx([0.5 * 1.0, 0.5 * 1.0, 0.5 * 1.0 + 0.5 * 0.1])
+
+
 @pytest.mark.parametrize("rule", ["projected", "softplus-adam", "pid"])
 def test_no_limit_is_no_penalty(rule: str) -> None:
     metrics = improved(-math.inf, math.inf, multiplier_rule=rule, multiplier_initial=2.0)
