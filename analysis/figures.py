@@ -94,10 +94,13 @@ def curricula(sweep: Sweep) -> Figure:
         grid = figure.subplots(len(cells), len(agents), squeeze=False, sharey="row")
         for row, (task, i) in zip(grid, cells, strict=True):
             for axes, agent in zip(row, agents, strict=True):
-                trials = _of(sweep.trials, task, agent)
-                if len(trials):
-                    _curriculum_panel(axes, trials, _of(updates, task, agent), look, i)
-                    axes.set_title(panels.panel_title(trials, _of(updates, task, agent)), loc="left", pad=3.0)
+                trials, run = _of(sweep.trials, task, agent), _of(updates, task, agent)
+                if len(run):
+                    _curriculum_panel(axes, trials, run, look, i)
+                    axes.set_title(panels.panel_title(trials, run), loc="left", pad=3.0)
+                else:
+                    axes.set_title(f"{task}: nothing run yet", loc="left", pad=3.0)
+                    axes.set_xticks([])
             row[0].set_ylabel("cost limit" if sweep.num_costs == 1 else f"limit of cost {i + 1}")
         for axes, agent in zip(grid[0], agents, strict=True):
             axes.set_title(f"{agent}\n{axes.get_title(loc='left')}", loc="left", pad=3.0)

@@ -267,13 +267,21 @@ def drawn_columns(columns: Iterable[str]) -> list[str]:
 
 
 def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
-    """Labels without duplicates: those of ``first`` in its order, then the others by name.
+    """Labels without duplicates: those of ``first`` in its order, then the others by name, numbers by size.
 
     >>> ordered(["dynamic", "mine", "none", "dynamic"], METHOD_ORDER)
     ['none', 'dynamic', 'mine']
+    >>> ordered(["map-10", "map-9"], ())
+    ['map-9', 'map-10']
     """
     present = set(labels)
-    return [label for label in first if label in present] + sorted(present - set(first))
+    return [label for label in first if label in present] + sorted(present - set(first), key=_numbers_by_size)
+
+
+def _numbers_by_size(label: str) -> tuple[list[str | int], str]:
+    """A key to sort by: texts and whole numbers by turns."""
+    parts = re.split(r"([0-9]+)", label)
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], label
 
 
 def occurring(labels: pd.Series) -> list[str]:

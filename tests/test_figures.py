@@ -82,6 +82,13 @@ def test_curricula_show_every_run_and_the_mean(finished: Sweep) -> None:
     assert max(line.get_linewidth() for line in dynamic) > 3 * min(line.get_linewidth() for line in dynamic)
 
 
+def test_a_students_task_that_has_not_run_has_an_empty_panel_of_limits(finished: Sweep) -> None:
+    missing = (finished.updates["task"] == "river-a") & (finished.updates["agent"] == "cpo")
+    rest = dataclasses.replace(finished, updates=finished.updates[~missing])
+    titles = [axes.get_title(loc="left") for axes in figures.curricula(rest).axes]
+    assert [title for title in titles if "nothing run yet" in title] == ["cpo\nriver-a: nothing run yet"]
+
+
 def test_infinite_limits_are_marked(made_up_sweep: Callable[..., SweepStore]) -> None:
     store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none", "unconstrained"])
     panel = figures.curricula(frames.load(store)).axes[0]
