@@ -94,10 +94,10 @@ def curricula(sweep: Sweep) -> Figure:
         grid = figure.subplots(len(cells), len(agents), squeeze=False, sharey="row")
         for row, (task, i) in zip(grid, cells, strict=True):
             for axes, agent in zip(row, agents, strict=True):
-                trials, run = _of(sweep.trials, task, agent), _of(updates, task, agent)
-                if len(run):
-                    _curriculum_panel(axes, trials, run, look, i)
-                    axes.set_title(panels.panel_title(trials, run), loc="left", pad=3.0)
+                trials, rows = _of(sweep.trials, task, agent), _of(updates, task, agent)
+                if len(rows):
+                    _curriculum_panel(axes, trials, rows, look, i)
+                    axes.set_title(panels.panel_title(trials, rows), loc="left", pad=3.0)
                 else:
                     axes.set_title(f"{task}: nothing run yet", loc="left", pad=3.0)
                     axes.set_xticks([])
