@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.frames import KEY, TRIAL, Sweep, TrialFacts, assemble, drawn_columns
+from recrl.analysis.frames import ROWS, TRIAL, Sweep, TrialFacts, assemble, drawn_columns
 from recrl.orchestrator.archives import UNREADABLE, unpacked
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -33,7 +33,6 @@ from recrl.orchestrator.store import write_atomically
 SUFFIX = ".zip"
 FORMAT = 1
 DIGITS = 6
-FRAMES = ("phases", "updates", "evaluations", "events", "policies")
 ROUNDED = ("updates", "policies")
 MAX_BYTES = 512 * 2**20  # unpacked; about 50 times the largest sweep so far
 LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: zip knows none before
@@ -49,14 +48,11 @@ def save(sweep: Sweep, path: Path) -> Path:
     Raises:
         RecrlError: nobody would read it back, as it is too large.
     """
-    positions = {key: position for position, key in enumerate(_keys(sweep))}
     members = {"sweep.json": json.dumps(_told(sweep), indent=1, allow_nan=False) + "\n"}
-    for name in FRAMES:
-        frame: pd.DataFrame = getattr(sweep, name)
-        kept = frame[drawn_columns(map(str, frame))] if name == "updates" else frame
-        of = [positions[key] for key in zip(*(frame[label] for label in KEY), strict=True)]
-        rows = kept.drop(columns=list(KEY))
-        rows.insert(0, TRIAL, of)
+    for name in ROWS:
+        rows = sweep.rows(name)
+        if name == "updates":
+            rows = rows[[TRIAL, *drawn_columns(map(str, rows))]]
         members[f"{name}.csv"] = (_rounded(rows) if name in ROUNDED else rows).to_csv(
             index=False, lineterminator="\n"
         )
@@ -78,12 +74,12 @@ def load(path: Path) -> Sweep:
     Raises:
         RecrlError: the file is not there, is none, or unpacks to more than MAX_BYTES.
     """
-    names = ("sweep.json", *(f"{name}.csv" for name in FRAMES))
+    names = ("sweep.json", *(f"{name}.csv" for name in ROWS))
     try:
         with zipfile.ZipFile(path) as archive:
             sweep, *frames = unpacked(archive, names, max_bytes=MAX_BYTES)
         told = json.loads(sweep)
-        rows = {name: pd.read_csv(io.BytesIO(data)) for name, data in zip(FRAMES, frames, strict=True)}
+        rows = {name: pd.read_csv(io.BytesIO(data)) for name, data in zip(ROWS, frames, strict=True)}
     except UNREADABLE as error:
         raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({error})") from error
     found = told.get("format") if isinstance(told, dict) else None
@@ -96,14 +92,6 @@ def load(path: Path) -> Sweep:
         grid=told["grid"],
         notes=told["notes"],
     )
-
-
-def _keys(sweep: Sweep) -> list[tuple[Any, ...]]:
-    """KEY of every trial, in the order of ``Sweep.facts``; a method's label may carry its group."""
-    by_id = {
-        row[0]: tuple(row[1:]) for row in sweep.trials[["trial_id", *KEY]].itertuples(index=False, name=None)
-    }
-    return [by_id[it.spec.trial_id] for it in sweep.facts]
 
 
 def _told(sweep: Sweep) -> dict[str, Any]:

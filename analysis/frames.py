@@ -80,6 +80,7 @@ PHASE_COLUMNS = ("phase", "episodes", "steps", "episode_return", "episode_return
 PHASE_COST_COLUMNS = (("cost", ""), ("cost", "_std"), ("cost", "_total"), ("excess", "_total"))
 EVENT_COLUMNS = ("update", "end_step", "event")
 TRIAL = "trial"  # in rows given to ``assemble``: the position of the trial they are of
+ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the frames that are given to it
 
 # The students' metrics that figures and tables read; MLflow and the compact file give no others.
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
@@ -150,6 +151,20 @@ class Sweep:
     def agent_options(self) -> Mapping[str, Mapping[str, Any]]:
         """The options of every student, by its label."""
         return {it.spec.agent.label: it.spec.agent.options for it in self.facts}
+
+    def rows(self, name: str) -> pd.DataFrame:
+        """One of the frames ROWS as ``assemble`` takes it: TRIAL, a position in ``facts``, instead of KEY."""
+        frame: pd.DataFrame = getattr(self, name)
+        of = [self._positions[key] for key in zip(*(frame[label] for label in KEY), strict=True)]
+        rows = frame.drop(columns=list(KEY))
+        rows.insert(0, TRIAL, np.array(of, dtype=np.int64))
+        return rows
+
+    @cached_property
+    def _positions(self) -> Mapping[tuple[Any, ...], int]:
+        """The position in ``facts`` of every trial, by its KEY; a method's label may carry its group."""
+        keys = {row[0]: row[1:] for row in self.trials[["trial_id", *KEY]].itertuples(index=False, name=None)}
+        return {keys[it.spec.trial_id]: position for position, it in enumerate(self.facts)}
 
 
 def load(store: SweepStore) -> Sweep:

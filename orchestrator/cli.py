@@ -97,6 +97,7 @@ def parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     _add_figures(commands)
     _add_export(commands)
+    _add_merge(commands)
     _add_bound(commands)
     _add_replay(commands)
     _add_ui(commands)
@@ -165,7 +166,7 @@ def _parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser
 
 def _command(commands: Commands, name: str, summary: str) -> argparse.ArgumentParser:
     command = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
-    if name != "validate":
+    if name not in ("validate", "merge"):  # these read only the files that they are given
         command.add_argument(
             "--root", type=_folder, default=Path("runs"), help="the folder of all sweeps (default: runs)"
         )
@@ -293,6 +294,18 @@ def _add_export(commands: Commands) -> None:
     export.add_argument(
         "--to", type=Path, metavar="FILE.zip", help="by default the sweep's name, in this folder"
     )
+
+
+def _add_merge(commands: Commands) -> None:
+    merge = _command(commands, "merge", "join files that export wrote, of a sweep that ran in several places")
+    merge.add_argument(
+        "parts",
+        type=Path,
+        nargs="+",
+        metavar="FILE.zip",
+        help="the first gives the name; of a trial that several have, the one that got furthest is taken",
+    )
+    merge.add_argument("--to", type=Path, metavar="FILE.zip", required=True, help="what to write")
 
 
 def _add_bound(commands: Commands) -> None:

@@ -30,7 +30,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid
 from recrl.orchestrator.plan import Plan, estimate, make_plan, select, trials_at_once
 from recrl.orchestrator.refresh import refreshing
-from recrl.orchestrator.spec import Choice
+from recrl.orchestrator.spec import Choice, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
 from recrl.orchestrator.store import SweepStore, TrialStore
 from recrl.orchestrator.sweep import (
@@ -278,9 +278,28 @@ def run_export(arguments: argparse.Namespace, console: Console) -> ExitCode:
     from recrl.analysis import compact  # noqa: PLC0415  (imports pandas)
 
     sweep, _ = _source(arguments)
-    path = compact.save(sweep, arguments.to or Path(f"{sweep.name}{compact.SUFFIX}"))
-    _say(console, f"{_short(path)}: {len(sweep.trials)} trials, {path.stat().st_size / 1000:,.0f} kB")
+    _say_file(compact.save(sweep, arguments.to or Path(f"{sweep.name}{compact.SUFFIX}")), sweep, console)
     return ExitCode.OK
+
+
+def run_merge(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Join compact files into one."""
+    from recrl.analysis import compact, merging  # noqa: PLC0415  (imports pandas)
+
+    for path in arguments.parts:
+        if path.suffix != compact.SUFFIX:
+            raise RecrlError(f"{path}: merge joins files that export wrote (.zip): recrl-sweep export {path}")
+    sweep = merging.merge([compact.load(path) for path in arguments.parts])
+    _say_file(compact.save(sweep, arguments.to), sweep, console)
+    for note in sweep.notes:
+        _say(console, note)
+    return ExitCode.OK
+
+
+def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
+    complete = sum(trial.status is TrialState.COMPLETE for trial in sweep.facts)
+    size = f"{path.stat().st_size / 1000:,.0f} kB"
+    _say(console, f"{_short(path)}: {len(sweep.facts)} trials, {complete} of them complete, {size}")
 
 
 def _source(arguments: argparse.Namespace) -> tuple[Sweep, Path]:
@@ -640,6 +659,7 @@ COMMANDS: Mapping[str, Command] = {
     "evaluate": run_evaluate,
     "figures": run_figures,
     "export": run_export,
+    "merge": run_merge,
     "bound": run_bound,
     "replay": run_replay,
     "ui": run_ui,
