@@ -98,6 +98,11 @@ class StudentConfig(BaseModel):
     target_kl: Positive = Field(
         default=0.01, description="Size of the trust region, mean KL in nats an update (paper)."
     )
+    noisy_target_kl: Positive | None = Field(
+        default=None,
+        description="target_kl of an update from samples of a policy to which the teacher added noise, which "
+        "has to be undone beside what is learnt; null for target_kl (ours).",
+    )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",
         description="What policy noise does: make the policy as random as its mixture with a uniform one, or "
@@ -107,6 +112,12 @@ class StudentConfig(BaseModel):
         default=True,
         description="Evaluate networks once for each distinct observation of a rollout; exact, only faster.",
     )
+
+    def in_update(self, *, noisy: bool) -> Self:
+        """The settings of one update: target_kl is noisy_target_kl where the policy had added noise."""
+        if not noisy or self.noisy_target_kl is None:
+            return self
+        return self.model_copy(update={"target_kl": self.noisy_target_kl})
 
     @model_validator(mode="before")
     @classmethod

@@ -99,6 +99,7 @@ def constrained_step(
         The step's metrics; ``multiplier_i`` are in standard deviations of the reward's advantages.
     """
     constraints = experience.constraints
+    config = config.in_update(noisy=constraints.noisy)
     multipliers = np.full_like(constraints.limits, NAN)
     if not constraints.known:
         stayed = {"policy_steps": 0.0, "case": NAN, "line_search_steps": NAN, "step_norm": 0.0}

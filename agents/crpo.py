@@ -106,7 +106,8 @@ class ConstraintRectifiedPolicyOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one step up the reward or down a violated cost, unless nothing is known of the constraints."""
-        config, constraints = self._config, experience.constraints
+        constraints = experience.constraints
+        config = self._config.in_update(noisy=constraints.noisy)
         if not constraints.known:
             stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
             return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}

@@ -91,7 +91,8 @@ class FirstOrderConstrainedOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
-        config, start = self._config, policy.parameters.values.clone()
+        config = self._config.in_update(noisy=experience.constraints.noisy)
+        start = policy.parameters.values.clone()
         multipliers = self._multipliers.answer(experience.constraints)
         rewards, costs = scaled_advantages(experience.advantages, "reward-scaled")
         objective = partial(

@@ -49,6 +49,7 @@ def step_up(
     Returns:
         The step's metrics.
     """
+    config = config.in_update(noisy=experience.constraints.noisy)
     model = LocalModel(policy, experience, objective[:, None])
     metric = model.metric(config, generator)
     gradient = model.gradients()[0]

@@ -115,9 +115,7 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     def finish(after: SweepProgress) -> None:
         shown.close()
         if arguments.figures and not stop.is_set() and after.counts[Standing.COMPLETE]:
-            from recrl.analysis import frames  # noqa: PLC0415  (imports pandas)
-
-            _draw(frames.load(store), store.figures_folder, console)
+            _draw_at_end(store, console)
         if not stop.is_set():
             _film(grid, after, store, stop, console)
 
@@ -530,6 +528,22 @@ def _draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", w
 
     (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])
     _say(console, f"Figures    {_short(folder)}")
+
+
+def _draw_at_end(store: SweepStore, console: Console) -> None:
+    """Draw a launch's figures; a mistake in drawing them is told, as the trials are run and MLflow waits."""
+    from recrl.analysis import frames  # noqa: PLC0415  (imports pandas)
+
+    try:
+        _draw(frames.load(store), store.figures_folder, console)
+    except (RecrlError, OSError):
+        raise
+    except Exception as error:
+        logger.debug("figures of %s", store.name, exc_info=True)
+        _say(
+            console, f"Figures    not all are drawn ({type(error).__name__}: {error}), by a mistake in recrl"
+        )
+        _say(console, f"           for its traceback: recrl-sweep figures {store.name}")
 
 
 def _film(

@@ -179,6 +179,28 @@ def test_a_student_that_waits_sums_up_no_violation_of_a_noisy_policy(rule: str) 
 
 
 @every_agent
+@pytest.mark.parametrize("task", ["two-state", "continuous-bandit"])
+def test_noise_changes_the_trust_region_of_its_update_alone(agent: str, task: str) -> None:
+    """Two updates, the first after noise, are those of students that had its radius and then their own."""
+    wide, narrow = {"target_kl": 0.02}, {"target_kl": 0.0005}
+    student = Lessons(agent, task, {**narrow, "noisy_target_kl": 0.02})
+    for options in (wide, narrow):
+        other = Lessons(agent, task, options)
+        state = student.agent.state_dict()
+        other.agent.load_state_dict(state)
+        rollout, episodes = student.collect()
+        if options is wide:
+            observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
+            for each in (student, other):
+                each.agent.add_noise(0.1, observations)
+        costs = episode_costs(episodes, 1)
+        metrics = [each.agent.update(rollout, costs, each.limits()) for each in (student, other)]
+        assert metrics[0] == pytest.approx(metrics[1], rel=0, abs=0, nan_ok=True)
+        assert flattened(student.agent.state_dict()) == flattened(other.agent.state_dict())
+    assert metrics[0]["kl"] < 0.002
+
+
+@every_agent
 def test_the_paper_preset_learns_with_the_same_metrics(agent: str) -> None:
     paper = Lessons(agent, "continuous-bandit", {"preset": "paper"})
     assert set(paper.update()) == set(Lessons(agent, "continuous-bandit").update())

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from recrl.analysis import figures
 from recrl.orchestrator.cli import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import parse_grid
@@ -53,6 +54,7 @@ def _python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def test_help_and_validate_import_nothing_heavy(folder: Path, arguments: list[str]) -> None:
     code = f"""
 import sys
+from recrl.analysis import figures
 from recrl.orchestrator.cli import main
 try:
     code = main({arguments!r})
@@ -132,6 +134,25 @@ def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert capsys.readouterr().out == "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
 
     assert main(["figures", "small", "--sketch"]) == ExitCode.OK
+
+
+def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mistaken(*_: object, **__: object) -> None:
+        raise KeyError("river")
+
+    monkeypatch.setattr(figures, "curricula", mistaken)
+    assert main(["launch", "grid.yaml", *INLINE[:-1]]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert (
+        "Figures    not all are drawn (KeyError: 'river'), by a mistake in recrl\n"
+        "           for its traceback: recrl-sweep figures small\n"
+        "Results    runs/small\n"
+        "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
+    ) in out
+    with pytest.raises(KeyError, match="river"):
+        main(["figures", "small"])
 
 
 def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
