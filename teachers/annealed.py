@@ -14,8 +14,8 @@ settles on the best way within d_d.
 It is for ``cpo``. Its answer to a limit that cannot be kept does not grow with time, as the multipliers of
 Lagrangian students do until they stand still; and its steps are measured by the KL divergence, where Adam's
 are spent on the states that are visited most, and the dry way's are visited least. ``ppo-lag`` needs a low
-``multiplier_maximum``, ``multiplier_waits`` and a large ``noisy_target_kl``. The latter makes ``cpo`` settle, too,
-but explore less (results/rivergrid/README.md).
+``multiplier_maximum``, ``multiplier_waits`` and a large ``noisy_target_kl``. The latter makes ``cpo`` settle,
+too, but explore less (results/rivergrid/README.md).
 
     d = d_t                                    until the share ``measured_at`` of B
     d = d_d (d_s / d_d)^(1 - f)                after it, d_s the mean episode cost measured there
