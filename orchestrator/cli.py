@@ -143,7 +143,7 @@ def main(given: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.errno not in NO_ROOM:
             raise
-        where = error.filename or arguments.root
+        where = error.filename or getattr(arguments, "root", None) or arguments.to
         print(f"recrl-sweep: {where}: {error.strerror}; what was saved stays", file=sys.stderr)
         return ExitCode.CANNOT_RUN
 
@@ -292,7 +292,7 @@ def _add_export(commands: Commands) -> None:
     export = _command(commands, "export", "write one small file that figures and tables can be drawn from")
     _add_source(export)
     export.add_argument(
-        "--to", type=Path, metavar="FILE.zip", help="by default the sweep's name, in this folder"
+        "--to", type=_zip_file, metavar="FILE.zip", help="by default the sweep's name, in this folder"
     )
 
 
@@ -305,7 +305,7 @@ def _add_merge(commands: Commands) -> None:
         metavar="FILE.zip",
         help="the first gives the name; of a trial that several have, the one that got furthest is taken",
     )
-    merge.add_argument("--to", type=Path, metavar="FILE.zip", required=True, help="what to write")
+    merge.add_argument("--to", type=_zip_file, metavar="FILE.zip", required=True, help="what to write")
 
 
 def _add_bound(commands: Commands) -> None:
@@ -419,6 +419,14 @@ def _folder(text: str) -> Path:
             f"store is given by --storage, got {text!r}"
         )
     return Path(text)
+
+
+def _zip_file(text: str) -> Path:
+    """What export and merge write: all commands tell it from a sweep's name by its ending."""
+    path = Path(text)
+    if path.suffix != ".zip" or path.is_dir():
+        raise argparse.ArgumentTypeError(f"must be a file that ends with .zip, got {text!r}")
+    return path
 
 
 def _at_least_one(text: str) -> int:

@@ -108,3 +108,18 @@ def test_a_sweep_that_is_no_file_is_a_sentence(tmp_path: Path, capsys: pytest.Ca
         "recrl-sweep: my-sweep: merge joins files that export wrote (.zip): recrl-sweep export my-sweep\n"
     )
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["merge", "export"])
+@pytest.mark.parametrize("name", ["all", "folder.zip"])
+def test_what_is_written_is_a_zip_file(
+    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder.zip").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        main([command, "one.zip", "--to", str(tmp_path / name)])
+    assert ended.value.code == ExitCode.WRONG_INPUT
+    assert (
+        f"argument --to: must be a file that ends with .zip, got '{tmp_path / name}'"
+        in capsys.readouterr().err
+    )
