@@ -46,7 +46,7 @@ def save(sweep: Sweep, path: Path) -> Path:
         path: of the file; its folder is made if it is not there.
 
     Raises:
-        RecrlError: nobody would read it back, as it is too large.
+        RecrlError: nobody would read it back, as it is too large, or its folder cannot be made.
     """
     members = {"sweep.json": json.dumps(_told(sweep), indent=1, allow_nan=False) + "\n"}
     for name in ROWS:
@@ -63,7 +63,10 @@ def save(sweep: Sweep, path: Path) -> Path:
     with zipfile.ZipFile(data, "w") as archive:
         for name, text in members.items():
             archive.writestr(zipfile.ZipInfo(name, LONG_AGO), text, zipfile.ZIP_LZMA)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, FileNotFoundError, NotADirectoryError) as error:
+        raise RecrlError(f"{path}: its folder cannot be made ({error.strerror})") from error
     write_atomically(path, data.getvalue())
     return path
 

@@ -82,6 +82,10 @@ EVENT_COLUMNS = ("update", "end_step", "event")
 TRIAL = "trial"  # in rows given to ``assemble``: the position of the trial they are of
 ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the frames that are given to it
 
+# Notes of ``assemble`` say one of these.
+DOUBLES = "groups of trials have these labels but different settings"
+UNKNOWN_OPTIMUM = "the optimum is unknown here, because"
+
 # The students' metrics that figures and tables read; MLflow and the compact file give no others.
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
 
@@ -249,15 +253,20 @@ def assemble(
     return Sweep(
         name=name,
         trials=keys.put_before(pd.DataFrame(rows), TRIAL_COLUMNS),
-        phases=keys.put_before(phases, (*PHASE_COLUMNS, *phase_columns)),
-        updates=keys.put_before(updates, (*UPDATE_COLUMNS, *cost_columns, *limit_columns)),
-        evaluations=keys.put_before(evaluations, (*EVALUATION_COLUMNS, *cost_columns)),
+        phases=keys.put_before(phases, PHASE_COLUMNS, phase_columns),
+        updates=keys.put_before(updates, UPDATE_COLUMNS, (*cost_columns, *limit_columns)),
+        evaluations=keys.put_before(evaluations, EVALUATION_COLUMNS, cost_columns),
         events=keys.put_before(events, EVENT_COLUMNS),
         policies=keys.put_before(policies, ("state",)),
         facts=tuple(facts),
         grid=grid,
         notes=tuple(dict.fromkeys((*notes, *doubles, *unknown))),
     )
+
+
+def is_made_again(note: str) -> bool:
+    """Whether ``assemble`` made a note from the trials, and will from others if it is still true."""
+    return DOUBLES in note or UNKNOWN_OPTIMUM in note
 
 
 def joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
@@ -316,10 +325,16 @@ class _Keys:
     labels: Mapping[str, pd.Categorical[str]]
     seeds: npt.NDArray[np.int64]
 
-    def put_before(self, rows: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
-        """The rows sorted by KEY, behind KEY instead of TRIAL; ``columns`` exist even if there is no row."""
+    def put_before(
+        self, rows: pd.DataFrame, columns: Sequence[str], of_costs: Sequence[str] = ()
+    ) -> pd.DataFrame:
+        """The rows sorted by KEY, behind KEY instead of TRIAL.
+
+        ``columns`` exist even if there is no row, ``of_costs`` also where no trial with so many has one.
+        """
         if not len(rows):
-            rows = pd.DataFrame(columns=[TRIAL, *columns], dtype=float).astype({TRIAL: np.int64})
+            rows = pd.DataFrame(columns=[TRIAL, *columns, *of_costs], dtype=float).astype({TRIAL: np.int64})
+        rows = rows.assign(**{name: math.nan for name in of_costs if name not in rows})
         codes = [self.labels[name].codes for name in GROUP]
         rank = np.empty(len(self.seeds), dtype=np.int64)
         rank[np.lexsort((self.seeds, *reversed(codes)))] = np.arange(len(rank))
@@ -342,8 +357,7 @@ def _keys(specs: Sequence[TrialSpec]) -> tuple[_Keys, list[str]]:
     for spec, group in zip(specs, identities, strict=True):
         groups.setdefault(_labels(spec), set()).add(group)
     notes = [
-        f"{' '.join(labels)}: {len(found)} groups of trials have these labels but different settings; "
-        f"they are kept apart as {labels[2]} [...]"
+        f"{' '.join(labels)}: {len(found)} {DOUBLES}; they are kept apart as {labels[2]} [...]"
         for labels, found in sorted(groups.items())
         if len(found) > 1
     ]
@@ -377,7 +391,7 @@ def _optima(specs: Sequence[TrialSpec]) -> tuple[list[float], list[str]]:
             optimum = optimal_return(task.name, task.options, spec.deploy_limits)
         except UnknownNameError as error:
             optimum = None
-            notes[task.label] = f"{task.label}: the optimum is unknown here, because {error}"
+            notes[task.label] = f"{task.label}: {UNKNOWN_OPTIMUM} {error}"
         optima.append(math.nan if optimum is None else optimum)
     return optima, list(notes.values())
 

@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.frames import ROWS, TRIAL, Sweep, TrialFacts, assemble
+from recrl.analysis.frames import ROWS, TRIAL, Sweep, TrialFacts, assemble, is_made_again
 from recrl.orchestrator.spec import TrialState
 
 OUTCOMES = ("phases", "evaluations")  # the frames that every source has unrounded
@@ -23,9 +23,9 @@ NAMED = 3  # trials that a note names, at most
 def merge(parts: Sequence[Sweep]) -> Sweep:
     """All trials of some sweeps, each once, as the part has it that got furthest with it.
 
-    A complete trial is further than any other; else steps count, and of equals the first part is taken. Two
-    parts can have completed a trial with different outcomes, as other machines and versions round
-    differently; then a note says so.
+    A complete trial is further than any other, a begun one than one that waits; else steps count, and of
+    equals the first part is taken. Two parts can have completed a trial with different outcomes, as other
+    machines and versions round differently; then a note says so.
 
     Args:
         parts: at least one. The first gives the name and the grid file; its trials come first, then those
@@ -40,17 +40,20 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
         trial_id: max(numbers, key=lambda number: _reached(trials[number][trial_id]))
         for trial_id, numbers in having.items()
     }
+    notes = [note for part in parts for note in part.notes if not is_made_again(note)]
+    if len({part.grid for part in parts if part.grid}) > 1:
+        notes.append("the parts have different grid files; the first part's is kept")
     return assemble(
         parts[0].name,
         [trials[number][trial_id] for trial_id, number in taken.items()],
         **{name: _taken(parts, name, taken) for name in ROWS},
-        grid=parts[0].grid,
-        notes=[*(note for part in parts for note in part.notes), *_disagreements(parts, having)],
+        grid=next((part.grid for part in parts if part.grid), ""),
+        notes=[*notes, *_disagreements(parts, having)],
     )
 
 
-def _reached(trial: TrialFacts) -> tuple[bool, int]:
-    return trial.status is TrialState.COMPLETE, trial.env_steps
+def _reached(trial: TrialFacts) -> tuple[bool, int, bool]:
+    return trial.status is TrialState.COMPLETE, trial.env_steps, trial.status is not TrialState.WAITING
 
 
 def _taken(parts: Sequence[Sweep], name: str, taken: Mapping[str, int]) -> pd.DataFrame:

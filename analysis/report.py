@@ -249,7 +249,8 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str
         shown.append(("What the paper says of these maps, in deployment", claims.claims_table(weighed)))
     for i, costs in enumerate(bounds):
         which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
-        shown.append((f"Cumulative cost of training beside its bounds{which}", bound_table(costs)))
+        if len(costs):
+            shown.append((f"Cumulative cost of training beside its bounds{which}", bound_table(costs)))
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
     written += [
         tables.write_csv(rows, folder / "outcomes.csv"),

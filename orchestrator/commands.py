@@ -286,7 +286,7 @@ def run_merge(arguments: argparse.Namespace, console: Console) -> ExitCode:
 
     for path in arguments.parts:
         if path.suffix != compact.SUFFIX:
-            raise RecrlError(f"{path}: merge joins files that export wrote (.zip): recrl-sweep export {path}")
+            raise RecrlError(f"{path}: merge joins files that export wrote (.zip): recrl-sweep export SWEEP")
     sweep = merging.merge([compact.load(path) for path in arguments.parts])
     _say_file(compact.save(sweep, arguments.to), sweep, console)
     for note in sweep.notes:

@@ -1,16 +1,17 @@
 """Parts of a sweep that ran in several places: joined, they are the sweep that ran in one."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from recrl.analysis import compact, frames
-from recrl.analysis.frames import Sweep
+from recrl.analysis import compact, frames, report
+from recrl.analysis.frames import Sweep, TrialFacts
 from recrl.analysis.merging import merge
 from recrl.orchestrator.cli import main
+from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.spec import TrialState
 from tests.conftest import MadeUpSweep
@@ -30,6 +31,14 @@ def part(tmp_path: Path) -> Part:
         return frames.load(MadeUpSweep(**{**SMALL, **fields}).write(tmp_path, name))  # type: ignore[arg-type]
 
     return write
+
+
+def without_rows(trials: Sequence[TrialFacts]) -> Sweep:
+    """A part whose trials have learnt nothing yet."""
+    none = pd.DataFrame()
+    return frames.assemble(
+        "part", trials, phases=none, updates=none, evaluations=none, events=none, policies=none
+    )
 
 
 def assert_equal(one: Sweep, other: Sweep) -> None:
@@ -76,6 +85,46 @@ def test_parts_of_other_numbers_of_costs_join(part: Part) -> None:
     assert merged.updates.loc[merged.updates["task"] == "b", "cost_1"].notna().all()
 
 
+def test_a_trial_that_failed_before_its_first_step_is_further_than_one_that_waits(part: Part) -> None:
+    failed = part("failed")
+    facts = [
+        dataclasses.replace(it, status=TrialState.FAILED, error="no luck", env_steps=0) for it in failed.facts
+    ]
+    waiting = [dataclasses.replace(it, status=TrialState.WAITING, env_steps=0) for it in failed.facts]
+    merged = merge([without_rows(of) for of in (waiting, facts)])
+    assert {trial.error for trial in merged.facts} == {"no luck"}
+
+
+def test_figures_need_no_row_of_the_trials_with_most_costs(part: Part, tmp_path: Path) -> None:
+    unstarted = part("two", tasks=("b",), num_costs=2)
+    waiting = [dataclasses.replace(it, status=TrialState.WAITING, env_steps=0) for it in unstarted.facts]
+    merged = merge([part("one"), without_rows(waiting)])
+    assert merged.num_costs == 2
+    assert merged.updates["limit_1"].isna().all()
+    assert report.draw(merged, tmp_path / "figures")
+
+
+def test_notes_that_are_no_longer_true_are_left_out(part: Part) -> None:
+    parts = [part(f"limit-{limit}", deploy_limit=limit) for limit in (3.0, 4.0, 5.0)]
+    notes = merge([merge(parts[:2]), parts[2]]).notes
+    assert {note.split(": ")[1].split()[0] for note in notes} == {"3"}
+    assert len(notes) == 4  # one a student and method
+
+
+def test_parts_of_different_grids_are_named(part: Part) -> None:
+    one, two = (dataclasses.replace(part(name), grid=f"name: {name}") for name in ("one", "two"))
+    merged = merge([one, two])
+    assert merged.notes == ("the parts have different grid files; the first part's is kept",)
+    assert merged.grid == "name: one"
+    assert merge([dataclasses.replace(one, grid=""), two]).grid == "name: two"
+
+
+def test_a_folder_that_cannot_be_made_is_a_sentence(part: Part, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecrlError, match=r"all\.zip: its folder cannot be made \(File exists\)"):
+        compact.save(part(), tmp_path / "file" / "all.zip")
+
+
 def test_trials_completed_alike_in_two_parts_need_no_note(part: Part) -> None:
     assert merge([part("one"), part("two")]).notes == ()
 
@@ -105,7 +154,7 @@ def test_the_command_writes_one_file(part: Part, tmp_path: Path, capsys: pytest.
 def test_a_sweep_that_is_no_file_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["merge", "my-sweep", "--to", str(tmp_path / "all.zip")]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err == (
-        "recrl-sweep: my-sweep: merge joins files that export wrote (.zip): recrl-sweep export my-sweep\n"
+        "recrl-sweep: my-sweep: merge joins files that export wrote (.zip): recrl-sweep export SWEEP\n"
     )
     assert not list(tmp_path.iterdir())
 
