@@ -39,6 +39,14 @@ STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
 }
 
 
+def _is_unset(value: object) -> bool:
+    """Whether an option that came after sweeps were run has the value with which nothing is as it came.
+
+    It is then left out of what a trial is known by: so an older version's sweep goes on under a newer one.
+    """
+    return not value
+
+
 class StudentConfig(BaseModel):
     """Settings that all students with a policy and 1 + k critics share."""
 
@@ -100,6 +108,7 @@ class StudentConfig(BaseModel):
     )
     noisy_target_kl: Positive | None = Field(
         default=None,
+        exclude_if=_is_unset,
         description="target_kl of an update from samples of a policy to which the teacher added noise, which "
         "has to be undone beside what is learnt; null for target_kl (ours).",
     )
@@ -177,6 +186,7 @@ class MultiplierConfig(StudentConfig):
     )
     multiplier_waits: bool = Field(
         default=False,
+        exclude_if=_is_unset,
         description="Sum up no violation that the teacher's noise may have caused: in an update from samples "
         "of a policy with added noise the integral of PID stays, and the other rules' multipliers (ours).",
     )
