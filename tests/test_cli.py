@@ -54,7 +54,6 @@ def _python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def test_help_and_validate_import_nothing_heavy(folder: Path, arguments: list[str]) -> None:
     code = f"""
 import sys
-from recrl.analysis import figures
 from recrl.orchestrator.cli import main
 try:
     code = main({arguments!r})
