@@ -40,7 +40,7 @@ STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
 
 
 def _is_unset(value: object) -> bool:
-    """Whether an option that came after sweeps were run has the value with which nothing is as it came.
+    """Whether an option that came after sweeps had been run has the value with which it changes nothing.
 
     It is then left out of what a trial is known by: so an older version's sweep goes on under a newer one.
     """
