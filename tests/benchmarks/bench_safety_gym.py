@@ -4,12 +4,13 @@ python tests/benchmarks/bench_safety_gym.py [--tasks CarGoal2 ...] [--repeats 10
 
 For every task, 16 environments under random actions, against the same 16 simulations stepped by
 ``mj_step(model, data, 10)`` alone in a Python loop ("bare"); and one environment of ``gymnasium.make``. They
-take turns of a few steps, in one run on one core, so that a noisy machine hurts all alike. Times are CPU
-seconds of this process, lower quartiles over the turns; a share is the median over the turns of neighbouring
-times. With --threads: wall seconds, several threads against one, for us and for MuJoCo's batch alone; and
-several processes against one, in each of which MuJoCo alone steps simulations of its own: they share nothing,
-so their gain is what the machine's cores give when all are busy. Resets are timed apart: an episode is 1,000
-steps and one reset.
+take turns of 80 steps, all the same, in one run on one core, so that a noisy machine hurts all alike. Times
+are CPU seconds of this process, lower quartiles over the turns; a share is the median over the turns of
+neighbouring times. With --threads: wall seconds, several threads against one, for us and for MuJoCo's batch
+alone; and several processes against one, in each of which MuJoCo alone steps simulations of its own: they
+share nothing, so their gain is what the machine's cores give when all are busy. What threads lose, they lose
+once a step, in waking up and waiting for the last; so their gain is also measured with 64 environments.
+Resets are timed apart: an episode is 1,000 steps and one reset.
 
 In Button a gremlin is led: what it is tied to must move before every physics step, which ``mj_step`` with a
 count cannot do. So there are two bare speeds: "bare", the same call as elsewhere, in which the gremlin hangs
@@ -39,7 +40,7 @@ from recrl.environments.safety_tasks import HORIZON, SAFETY_TASKS, SUBSTEPS
 from recrl.environments.safety_worlds import SafetyWorlds
 from recrl.environments.scene import PARKED
 
-NUM_ENVS = 16
+NUM_ENVS, MANY_ENVS = 16, 64
 STEPS = 5
 """Steps of every environment in one repeat."""
 ROUNDS, TURN_SECONDS = 10, 0.4
@@ -130,13 +131,12 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
             batch.step(actions)
 
     def steps_of_single() -> None:
-        for action in generator.uniform(-1.0, 1.0, (4 * STEPS, 2)):
+        for action in generator.uniform(-1.0, 1.0, (STEPS * NUM_ENVS, 2)):
             _, _, terminated, truncated, _ = single.step(action)
             if terminated or truncated:
                 single.reset()
 
     turns = [steps_of_batch, steps_of_single, *(rival.steps for rival in rivals)]
-    counts = [STEPS * NUM_ENVS, 4 * STEPS, *(STEPS * NUM_ENVS for _ in rivals)]
     clock = time.process_time
     times = np.full((4, repeats), np.nan)
     for _ in range(10):  # vases fall asleep
@@ -147,29 +147,29 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
             batch.reset()
             for rival in rivals:
                 rival.restart(batch.worlds)
-        for row, (turn, count) in enumerate(zip(turns, counts, strict=True)):
-            times[row, repeat] = timed(turn, clock) / count
+        for row, turn in enumerate(turns):
+            times[row, repeat] = timed(turn, clock) / (STEPS * NUM_ENVS)
     reset = [timed(lambda: resets.restart(np.arange(NUM_ENVS)), clock) / NUM_ENVS for _ in range(8)]
     shares = np.median([times[2] / times[0], times[2] / times[1], times[3] / times[0]], axis=1)
     return np.append(np.quantile(times, 0.25, axis=1), np.quantile(reset, 0.25)), shares
 
 
-def thread_gains(name: str, repeats: int, num_threads: int) -> tuple[float, float]:
+def thread_gains(name: str, num_envs: int, repeats: int, num_threads: int) -> tuple[float, float]:
     """Wall seconds of a step on one thread over those on several, medians over neighbouring turns.
 
     Returns:
         our gain, and that of MuJoCo's batch, which steps the same model and computes nothing of ours: what
         the machine's cores have to give.
     """
-    batches = [SafetyGymVectorEnv(name, NUM_ENVS, num_threads=number) for number in (1, num_threads)]
-    alone = [SafetyGymVectorEnv(name, NUM_ENVS, num_threads=number) for number in (1, num_threads)]
+    batches = [SafetyGymVectorEnv(name, num_envs, num_threads=number) for number in (1, num_threads)]
+    alone = [SafetyGymVectorEnv(name, num_envs, num_threads=number) for number in (1, num_threads)]
     generator = np.random.default_rng(0)
     for batch in (*batches, *alone):
         batch.reset(seed=0)
     controls = mujoco.mjtState.mjSTATE_CTRL
     times = np.zeros((4, repeats))
     for repeat in range(repeats):
-        drawn = generator.uniform(-1.0, 1.0, (STEPS, NUM_ENVS, 2))
+        drawn = generator.uniform(-1.0, 1.0, (STEPS, num_envs, 2))
         for row, batch in enumerate((*batches, *alone)):
             simulations = batch.worlds.simulations
             control = simulations.state(controls, (2,))
@@ -253,11 +253,15 @@ def main() -> None:
         if SAFETY_TASKS[name].gremlins.number:
             print(f"| {name}, led | {1 / led:,.0f} | | | {shares[2]:.2f} | | | | |")
         if arguments.threads:
-            ours, theirs = thread_gains(name, arguments.repeats, arguments.threads)
+            few, many = (
+                thread_gains(name, number, arguments.repeats, arguments.threads)
+                for number in (NUM_ENVS, MANY_ENVS)
+            )
             apart = process_gain(name, ROUNDS, arguments.threads)
             print(
-                f"  {name}: {arguments.threads} threads: {ours:.2f}x; MuJoCo alone: {theirs:.2f}x, "
-                f"in {arguments.threads} processes: {apart:.2f}x",
+                f"  {name}: {arguments.threads} threads: {few[0]:.2f}x; MuJoCo alone: {few[1]:.2f}x, "
+                f"in {arguments.threads} processes: {apart:.2f}x; "
+                f"N = {MANY_ENVS}: {many[0]:.2f}x; MuJoCo alone: {many[1]:.2f}x",
                 flush=True,
             )
 
