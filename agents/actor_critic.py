@@ -185,7 +185,8 @@ class ActorCritic:
         constraints = Constraints.measure(
             rollout, len(episode_costs), values, limits, self._cmdp.horizon, noisy=self._noisy
         )
-        experience = Experience.of(self._policy, batch, advantages, constraints)
+        num_envs = rollout.rewards.shape[1]
+        experience = Experience.of(self._policy, batch, advantages, constraints, num_envs)
         return {
             **improve_and_measure(self._rule, self._policy, experience, self._generator),
             **indexed("cost_gap", constraints.gaps),

@@ -340,11 +340,22 @@ class IPOConfig(AscentConfig):
     )
 
 
-class CPOConfig(TrustRegionConfig):
+class LinearisedConstraintConfig(TrustRegionConfig):
+    """Settings of students that hold a step to linearised constraints."""
+
+    cross_fitting: bool = Field(
+        default=False,
+        exclude_if=_is_unset,
+        description="Judge what a step does to a cost on samples that did not choose it, and let a violation "
+        "count for more as far as less is confirmed; for large networks, as on Safety Gym (ours).",
+    )
+
+
+class CPOConfig(LinearisedConstraintConfig):
     """Settings of ``cpo``, constrained policy optimisation."""
 
 
-class PCPOConfig(TrustRegionConfig):
+class PCPOConfig(LinearisedConstraintConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""
 
 

@@ -117,7 +117,7 @@ class ConstraintRectifiedPolicyOptimisation:
         mended = most_violated(constraints.gaps, spreads, config.tolerance)
         active = ActiveConstraints.of(constraints)
         model = LocalModel(policy, experience, centred)
-        problem, solved = linearise(model, active, config, generator)
+        problem, solved = linearise(model, active, model.metric(config, generator), config)
         multipliers = np.zeros_like(constraints.limits)
         if mended is None:
             solution = step_up(problem, config)

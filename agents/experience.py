@@ -1,6 +1,6 @@
 """What a student knows after a rollout: its samples, what they were worth, and how the constraints stand.
 
-Letters: N samples, k costs, D decisions, E finished episodes, j of the k limits are finite.
+Letters: N samples, B environments, k costs, D decisions, E finished episodes, j of the k limits are finite.
 """
 
 from __future__ import annotations
@@ -92,6 +92,7 @@ class Experience:
         old_log_probs: log pi_old(a | s) of the batch's decisions, [D].
         advantages: raw estimates for the reward, then each cost, of all samples of the rollout, [N, 1 + k].
         constraints: limits and gaps.
+        num_envs: B; sample i of the rollout is of environment i mod B.
     """
 
     batch: LearningBatch
@@ -99,15 +100,21 @@ class Experience:
     old_log_probs: Tensor
     advantages: Floats
     constraints: Constraints
+    num_envs: int = 1
 
     @classmethod
     def of(
-        cls, policy: StochasticPolicy, batch: LearningBatch, advantages: Floats, constraints: Constraints
+        cls,
+        policy: StochasticPolicy,
+        batch: LearningBatch,
+        advantages: Floats,
+        constraints: Constraints,
+        num_envs: int = 1,
     ) -> Experience:
         """The experience of a policy that has not moved since it collected the samples."""
         old = policy.distribution(batch.rows)
         log_probs = old.log_prob(batch.actions, batch.decision_rows)
-        return cls(batch, old, log_probs, advantages, constraints)
+        return cls(batch, old, log_probs, advantages, constraints, num_envs)
 
     def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
         """Minibatches without end, as ``LearningBatch.parts`` makes them; itself where there is one part."""

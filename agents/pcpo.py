@@ -31,6 +31,7 @@ from recrl.agents.cpo_dual import (
     StepProblem,
     projection_weights,
 )
+from recrl.agents.cross_fitting import KeptShares
 from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
 from recrl.environments.cmdp import CMDPSpec
@@ -64,17 +65,23 @@ def projected_step(problem: StepProblem) -> DualSolution:
 class ProjectionBasedConstrainedPolicyOptimisation:
     """The rule of ``pcpo``; a ``recrl.agents.actor_critic.PolicyRule``."""
 
-    def __init__(self, config: PCPOConfig) -> None:
+    def __init__(self, config: PCPOConfig, num_costs: int) -> None:
         self._config = config
-        self.parts: dict[str, Stateful] = {}
+        self._kept = KeptShares(num_costs) if config.cross_fitting else None
+        self.parts: dict[str, Stateful] = {"kept_shares": self._kept} if self._kept else {}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one projected step, unless nothing is known about the constraints."""
-        return constrained_step(policy, experience, projected_step, self._config, generator)
+        return constrained_step(policy, experience, projected_step, self._config, generator, kept=self._kept)
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """A fresh PCPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))
+    return fresh_student(
+        cmdp,
+        config,
+        seed,
+        lambda _: ProjectionBasedConstrainedPolicyOptimisation(config, cmdp.num_costs),
+    )

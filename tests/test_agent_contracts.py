@@ -271,6 +271,22 @@ def test_a_bound_on_the_worst_episodes_returns_the_same_metrics_and_resumes(agen
     assert repr(resumed.agent.update(rollout, none_finished, lessons.limits())) == repr(expected)
 
 
+@pytest.mark.parametrize("agent", ["cpo", "pcpo"])
+@every_task
+def test_a_student_that_judges_its_steps_resumes_bit_for_bit(agent: str, task: str) -> None:
+    options = {"cross_fitting": True}
+    lessons, resumed = Lessons(agent, task, options), Lessons(agent, task, options)
+    keys = {tuple(sorted(lessons.update(limit))) for limit in (FINITE, math.inf, 0.0)}
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    rollout, episodes = lessons.collect()
+    for costs in (episode_costs(episodes, lessons.num_costs), np.empty((0, lessons.num_costs))):
+        expected = lessons.agent.update(rollout, costs, lessons.limits())
+        assert repr(resumed.agent.update(rollout, costs, lessons.limits())) == repr(expected)
+        keys.add(tuple(sorted(expected)))
+    assert len(keys) == 1
+    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
+
+
 def held_bytes() -> int:
     """What all live tensors take."""
     gc.collect()
