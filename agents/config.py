@@ -347,7 +347,8 @@ class LinearisedConstraintConfig(TrustRegionConfig):
         default=False,
         exclude_if=_is_unset,
         description="Judge what a step does to a cost on samples that did not choose it, and let a violation "
-        "count for more as far as less is confirmed; for large networks, as on Safety Gym (ours).",
+        "count for more as far as less is confirmed; where observations are many and noisy, as on Safety Gym "
+        "(ours).",
     )
 
 

@@ -5,8 +5,8 @@ how far it falls, b.w. That promise is too good: with b = beta + noise,
 
     E[b.H^-1 b] = beta.H^-1 beta + tr(H^-1 Cov b),
 
-and the second term, which no other sample confirms, is what is left if the advantages are pure noise. With a
-network of thousands of parameters and some thousand samples it is by far the larger one
+and the second term, which no other sample confirms, is what is left if the advantages are pure noise. Where
+observations hardly repeat and advantages are noisy it is by far the larger one
 (``tests/benchmarks/held_out.py``; on CarGoal2 with 8,000 samples more than nine tenths). A student that takes
 the promise at its word believes that one step mends any violation, spends the rest of its trust region on the
 reward, and stays where it is: above its limit.
@@ -18,10 +18,12 @@ the halves' shares n_A + n_B = 1:
 
     b_A.H^-1 b_B = (b.H^-1 b - e.H^-1 e) / (4 n_A n_B).
 
-It is noisy, so both sides are averaged over updates before they are divided: the share of the promise that is
-kept. A violation c then counts as c / share.
+That holds for an exact H^-1; conjugate gradients that stop early are not quite linear in what they solve
+for. It is noisy, so both sides are averaged over updates before they are divided: the share of the promise
+that is kept. A violation c then counts as c / share.
 
-Letters: N samples, B environments, k costs, j of them limited.
+Letters: N samples, B environments, k costs, j of them limited. The products are squares of cost per step,
+per nat.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ SMALLEST_SHARE = 1e-3
 def halves(num_samples: int, num_envs: int) -> Floats:
     """+1 for the samples of the first half of the environments, -1 for those of the second, [N].
 
-    With a single environment, for the first and second half of its time.
+    With a single environment, for the first and second half of its time, which are not quite independent.
 
     Args:
         num_samples: N, a multiple of B; sample i is of environment i mod B.
@@ -64,12 +66,17 @@ def confirmed(promised: Floats, contrasts: Floats, signs: Floats) -> Floats:
     Args:
         promised: b.H^-1 b, [j].
         contrasts: e.H^-1 e, [j].
-        signs: of ``halves``, [N], both present.
+        signs: of ``halves``, [N].
+
+    Returns:
+        b_A.H^-1 b_B, [j]; 0 where there is but one sample, so that there is no other half.
 
     >>> confirmed(np.array([5.0]), np.array([3.0]), np.array([1.0, -1.0]))
     array([2.])
     """
     first = float(np.mean(signs > 0.0))
+    if first in {0.0, 1.0}:
+        return np.zeros_like(promised)
     return np.asarray((promised - contrasts) / (4.0 * first * (1.0 - first)))
 
 
@@ -89,7 +96,7 @@ class KeptShares:
 
         Args:
             index: the costs that have a limit, [j].
-            promised: b.H^-1 b of each, [j].
+            promised: b.H^-1 b of each, at least 0, [j].
             confirmed: what the other half confirms, [j].
 
         Returns:

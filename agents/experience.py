@@ -100,7 +100,7 @@ class Experience:
     old_log_probs: Tensor
     advantages: Floats
     constraints: Constraints
-    num_envs: int = 1
+    num_envs: int
 
     @classmethod
     def of(
@@ -109,7 +109,7 @@ class Experience:
         batch: LearningBatch,
         advantages: Floats,
         constraints: Constraints,
-        num_envs: int = 1,
+        num_envs: int,
     ) -> Experience:
         """The experience of a policy that has not moved since it collected the samples."""
         old = policy.distribution(batch.rows)

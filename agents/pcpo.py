@@ -13,7 +13,8 @@ for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far f
 too: the paper bounds the damage, here the step is scaled back into the trust region. Then it is shortened by
 ``cpo``'s line search, which the paper leaves out.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, k
+If no episode finished, nothing is known about the constraints and the policy stays. With ``cross_fitting`` c
+is what steps that keep a share of their promises have to promise, and nu grows with it. Letters: N samples, k
 costs, P parameters.
 """
 

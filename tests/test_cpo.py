@@ -45,7 +45,7 @@ def improve(
         np.array(limits or [10.0, 10.0]), np.array(gaps), math.nan if math.isnan(gaps[0]) else LENGTH
     )
     rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA), num_costs=2)
-    experience = Experience.of(policy, batch, advantages, constraints)
+    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
     old = StochasticPolicy(3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0))
     moved = old.distribution(batch.rows).divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]

@@ -7,17 +7,20 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 
-from recrl.agents.actor_critic import improve_and_measure
+from recrl.agents.actor_critic import fresh_student, improve_and_measure
 from recrl.agents.batch import LearningBatch
+from recrl.agents.collect import Collector, episode_costs
 from recrl.agents.config import CPOConfig, PCPOConfig
-from recrl.agents.cpo import ConstrainedPolicyOptimisation
+from recrl.agents.cpo import ConstrainedPolicyOptimisation, LocalModel
 from recrl.agents.cpo_dual import StepCase
 from recrl.agents.cross_fitting import MEMORY, SMALLEST_SHARE, KeptShares, confirmed, halves
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.pcpo import ProjectionBasedConstrainedPolicyOptimisation
 from recrl.agents.policies import StochasticPolicy
+from recrl.agents.trust_region import conjugate_gradient
 from recrl.environments.cmdp import Floats
+from recrl.environments.registry import make_vector
 
 LENGTH = 10.0
 
@@ -56,6 +59,10 @@ def test_the_promise_is_too_good_by_the_noise_and_the_confirmation_is_not() -> N
     kept = confirmed(promised, contrasts, signs)
     for found, expected in ((promised, 0.05 + 3 / num_samples), (kept, 0.05)):
         assert abs(found.mean() - expected) < 4.0 * found.std() / np.sqrt(rounds)
+
+
+def test_a_single_sample_confirms_nothing() -> None:
+    assert confirmed(np.array([2.0]), np.array([2.0]), halves(1, 1)).tolist() == [0.0]
 
 
 def test_shares_are_ratios_of_averages_within_their_bounds() -> None:
@@ -120,6 +127,60 @@ def test_where_both_halves_agree_the_step_is_the_same(name: str, gap: float) -> 
     assert judged.pop("kept_share_0") == pytest.approx(1.0, abs=1e-5)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert judged == pytest.approx(plain, rel=1e-2, abs=1e-4)
+
+
+@pytest.mark.parametrize("compact", [False, True])
+def test_the_share_is_that_of_the_cost_that_has_a_limit(compact: bool) -> None:
+    """Of two costs the second alone is limited; halves of one and two environments, each by itself."""
+    policy, _, _ = sampled(noise=True)
+    generator = np.random.default_rng(1)
+    observations = generator.integers(0, 4, size=(99, 3)).astype(np.float32)
+    actions = policy.sample(observations, generator)
+    liked = (actions - 1.0) + generator.normal(size=99)
+    advantages = np.stack([generator.normal(size=99), generator.normal(size=99), liked], axis=1)
+    advantages -= advantages.mean(axis=0)
+    batch = LearningBatch.gather(observations, actions, compact=compact)
+    assert (batch.row_of_sample is not None) == compact
+    constraints = Constraints(np.array([np.inf, 5.0]), np.array([-np.inf, 1.0]), LENGTH)
+    experience = Experience.of(policy, batch, advantages, constraints, num_envs=3)
+    config = CPOConfig(cross_fitting=True, conjugate_gradient_steps=200, metric_samples=None)
+    signs = halves(99, 3)
+    own = [
+        LocalModel(policy, experience, advantages[:, 2:] * which[:, None]).gradients()[0]
+        for which in (np.ones(99), (signs > 0) * 3.0, (signs < 0) * 1.5)
+    ]
+    metric = LocalModel(policy, experience, advantages).metric(config, generator)
+    solved = [conjugate_gradient(metric, each, iterations=200) for each in own]
+    expected = float(own[1] @ solved[2]) / float(own[0] @ solved[0])
+    rule = ConstrainedPolicyOptimisation(config, num_costs=2)
+    metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
+    assert np.isnan(metrics["kept_share_0"])
+    assert 0.01 < expected < 0.99
+    assert metrics["kept_share_1"] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("num_envs", [2, 5])
+def test_a_rule_knows_which_samples_are_of_one_environment(num_envs: int) -> None:
+    seen: list[Experience] = []
+
+    class Looking(ConstrainedPolicyOptimisation):
+        def improve(
+            self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+        ) -> dict[str, float]:
+            seen.append(experience)
+            return super().improve(policy, experience, generator)
+
+    environments = make_vector("continuous-bandit", num_envs)
+    student = fresh_student(
+        environments.cmdp, CPOConfig(), np.random.SeedSequence(0), lambda _: Looking(CPOConfig(), num_costs=1)
+    )
+    collector = Collector(environments, num_steps=8)
+    collector.reset(seed=0)
+    rollout, episodes = collector.collect(student, np.random.default_rng(0))
+    student.update(rollout, episode_costs(episodes, 1), np.array([1.0]))
+    assert [each.num_envs for each in seen] == [num_envs]
+    actions = seen[0].batch.actions.numpy().reshape(-1, 1)
+    np.testing.assert_array_equal(actions[1::num_envs], rollout.actions[:, 1].reshape(-1, 1))
 
 
 def test_a_limit_that_is_kept_is_taken_as_it_is() -> None:

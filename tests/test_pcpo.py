@@ -128,7 +128,7 @@ def improved(
     before, old = policy.parameters.to_numpy(), policy.distribution(batch.rows)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), length)
-    experience = Experience.of(policy, batch, advantages, constraints)
+    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
     metrics = improve_and_measure(rule_of(name, 2), policy, experience, np.random.default_rng(0))
     moved = old.divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]
     metrics["kl"] = float(torch.dot(batch.row_weights, moved))

@@ -53,7 +53,7 @@ def improved(
     policy, batch, advantages = sampled(space)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), length)
-    experience = Experience.of(policy, batch, advantages, constraints)
+    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
     metrics = improve_and_measure(rule_of(name, policy), policy, experience, np.random.default_rng(0))
     return metrics, policy.parameters.to_numpy().astype(np.float64)
 
@@ -86,7 +86,7 @@ def test_with_a_temperature_a_step_is_as_long_as_the_gain_is_large_up_to_the_tru
 ) -> None:
     def stepped(size: float, temperature: float) -> float:
         policy, batch, advantages = sampled(space)
-        experience = Experience.of(policy, batch, advantages, UNKNOWN)
+        experience = Experience.of(policy, batch, advantages, UNKNOWN, num_envs=1)
         objective = size * (advantages[:, 0] - advantages[:, 0].mean())
         generator = np.random.default_rng(0)
         config = TRPOConfig(target_kl=DELTA)
@@ -105,7 +105,7 @@ def test_where_no_action_is_better_trpo_stays() -> None:
     policy, batch, advantages = sampled(SPACES[0])
     before = policy.parameters.to_numpy()
     constraints = Constraints(np.array([1.0]), np.array([0.0]), 10.0)
-    experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints)
+    experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints, num_envs=1)
     metrics = improve_and_measure(rule_of("trpo", policy), policy, experience, np.random.default_rng(0))
     np.testing.assert_array_equal(policy.parameters.to_numpy(), before)
     assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
@@ -129,7 +129,7 @@ def climbed(**options: object) -> tuple[float, bool, set[int]]:
     metrics = climb(
         policy,
         Adam(policy.parameters, 0.01),
-        Experience.of(policy, batch, advantages, UNKNOWN),
+        Experience.of(policy, batch, advantages, UNKNOWN, num_envs=1),
         objective,
         config=PPOConfig.model_validate(options),
         generator=np.random.default_rng(0),

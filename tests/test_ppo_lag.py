@@ -36,7 +36,7 @@ def fresh(**options: object) -> tuple[StochasticPolicy, PPOLagrangian, LearningB
 def improvement(
     rule: PPOLagrangian, policy: StochasticPolicy, batch: LearningBatch, constraints: Constraints
 ) -> dict[str, float]:
-    experience = Experience.of(policy, batch, ADVANTAGES, constraints)
+    experience = Experience.of(policy, batch, ADVANTAGES, constraints, num_envs=1)
     return improve_and_measure(rule, policy, experience, np.random.default_rng(0))
 
 
