@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from recrl.agents.agent import Rollout
-from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
+from recrl.agents.collect import Collector, episode_costs
 from recrl.agents.constraint_forms import (
     MeanCost,
     TailCost,
@@ -187,19 +187,23 @@ def test_the_gradient_of_the_cvar_is_that_of_the_tail_costs() -> None:
 
 
 def last_third(agent_name: str, options: dict[str, Any], limit: float, updates: int) -> Floats:
-    """The wear of the episodes of the last third of learning on ``two-state``, and their returns, [E, 2]."""
+    """The wear of an update's episodes, and their returns, in the last third of learning on ``two-state``.
+
+    Returns:
+        [updates, episodes, 2].
+    """
     environments = make_vector("two-state", NUM_ENVS)
     agent = make_agent(agent_name, environments.cmdp, options, np.random.SeedSequence(0))
     collector = Collector(environments, num_steps=20)
     collector.reset(seed=0)
     generator = np.random.default_rng(0)
-    kept: list[FinishedEpisode] = []
+    kept: list[list[tuple[float, float]]] = []
     for update in range(updates):
         rollout, episodes = collector.collect(agent, generator)
         agent.update(rollout, episode_costs(episodes, 1), np.array([limit]))
         if update >= updates * 2 / 3:
-            kept += episodes
-    return np.array([(episode.costs[0], episode.episode_return) for episode in kept])
+            kept.append([(episode.costs[0], episode.episode_return) for episode in episodes])
+    return np.array(kept)
 
 
 @pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
@@ -208,8 +212,11 @@ def test_a_student_finds_the_best_policy_whose_cvar_is_within_the_limit(agent: s
     options = {"constraint": "cvar", "cvar_level": level, "cost_trace_decay": 1.0}
     outcome = last_third(agent, options, limit, 150)
     hasty = brentq(lambda share: exact_cvar(share, level) - limit, 0.01, 0.99)
-    wear, returns = outcome.T
+    wear, returns = outcome[..., 0], outcome[..., 1]
     assert hasty * 9.0 < limit - 1.0  # a bound on the mean would allow much more
     assert float(wear.mean()) == pytest.approx(hasty * 9.0, abs=0.25)
     assert float(returns.mean()) == pytest.approx(9.0 + hasty * 9.0, abs=0.3)
-    assert float(conditional_value_at_risk(wear[:, None], level)[0]) == pytest.approx(limit, abs=0.3)
+    # Of each policy by itself: the CVaR of all their episodes together is that of a mixture, which has longer
+    # tails the more the policies differ, and no policy's limit is on it.
+    shares = np.clip(wear.mean(axis=1) / 9.0, 1e-3, 1.0 - 1e-3)
+    assert np.mean([exact_cvar(share, level) for share in shares]) == pytest.approx(limit, abs=0.25)
