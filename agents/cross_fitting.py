@@ -8,7 +8,7 @@ how far it falls, b.w. That promise is too good: with b = beta + noise,
 and the second term, which no other sample confirms, is what is left if the advantages are pure noise. Where
 observations hardly repeat and advantages are noisy it is by far the larger one
 (``tests/benchmarks/held_out.py``; on CarGoal2 with 8,000 samples more than nine tenths). A student that takes
-the promise at its word believes that one step mends any violation, spends the rest of its trust region on the
+the promise at its word believes that one step mends most violations, spends the rest of its trust region on the
 reward, and stays where it is: above its limit.
 
 So the environments are parted into two halves whose samples are independent given the policy, with gradients
@@ -19,8 +19,8 @@ the halves' shares n_A + n_B = 1:
     b_A.H^-1 b_B = (b.H^-1 b - e.H^-1 e) / (4 n_A n_B).
 
 That holds for an exact H^-1; conjugate gradients that stop early are not quite linear in what they solve
-for. It is noisy, so both sides are averaged over updates before they are divided: the share of the promise
-that is kept. A violation c then counts as c / share.
+for. Single products are noisy, so both are averaged over updates, b_A.H^-1 b_B and b.H^-1 b, before one is
+divided by the other: the share of the promise that is kept. A violation c then counts as c / share.
 
 Letters: N samples, B environments, k costs, j of them limited. The products are squares of cost per step,
 per nat.
