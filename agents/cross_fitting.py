@@ -8,8 +8,8 @@ how far it falls, b.w. That promise is too good: with b = beta + noise,
 and the second term, which no other sample confirms, is what is left if the advantages are pure noise. Where
 observations hardly repeat and advantages are noisy it is by far the larger one
 (``tests/benchmarks/held_out.py``; on CarGoal2 with 8,000 samples more than nine tenths). A student that takes
-the promise at its word believes that one step mends most violations, spends the rest of its trust region on the
-reward, and stays where it is: above its limit.
+the promise at its word believes that one step mends most violations, spends the rest of its trust region on
+the reward, and stays where it is: above its limit.
 
 So the environments are parted into two halves whose samples are independent given the policy, with gradients
 b_A and b_B. What one half's direction does on the other is unbiased, E[b_A.H^-1 b_B] = beta.H^-1 beta (H held
