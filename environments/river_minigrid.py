@@ -28,11 +28,13 @@ from recrl.environments.cmdp import Floats
 from recrl.environments.river_grid import (
     FORWARD,
     GOAL_REWARD,
-    HEADINGS,
     HORIZON,
     STEP_REWARD,
     CostName,
+    ObservationName,
     RiverGridOptions,
+    river_observations,
+    state_index,
     task_map,
 )
 from recrl.environments.river_maps import GOAL, MAPS, MUD, RIVER, WALL, Cell, RiverMap, parse_map
@@ -76,6 +78,7 @@ class RiverGridEnv(MiniGridEnv):
         drawing: the map, see ``recrl.environments.river_maps``.
         max_steps: H, steps after which an episode is truncated.
         costs: the cost functions, in order.
+        observation: what is seen, ``coordinates`` or ``pose``.
         **minigrid: MiniGrid's own, such as ``render_mode``.
     """
 
@@ -85,10 +88,12 @@ class RiverGridEnv(MiniGridEnv):
         *,
         max_steps: int = HORIZON,
         costs: Sequence[CostName] = ("river",),
+        observation: ObservationName = "coordinates",
         **minigrid: Any,
     ) -> None:
         self.river_map = parse_map(drawing)
         self.cost_names = tuple(costs)
+        self._observations = river_observations(self.river_map, observation)
         super().__init__(
             mission_space=MissionSpace(mission_func=mission),
             width=self.river_map.width,
@@ -97,8 +102,7 @@ class RiverGridEnv(MiniGridEnv):
             **{"highlight": False, "tile_size": TILE_PIXELS, **minigrid},
         )
         self.action_space = Discrete(3)
-        size = self.river_map.width + self.river_map.height + HEADINGS
-        self.observation_space = Box(0.0, 1.0, (size,), np.float32)
+        self.observation_space = Box(0.0, 1.0, self._observations.shape[1:], np.float32)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one step; ``info["cost"]`` is float64 [k]."""
@@ -109,11 +113,12 @@ class RiverGridEnv(MiniGridEnv):
         return observation, reward, terminated, truncated and not terminated, {"cost": self._costs(action)}
 
     def gen_obs(self) -> npt.NDArray[np.float32]:
-        """One-hot x, one-hot y, one-hot heading."""
-        observation = np.zeros(self.width + self.height + HEADINGS, np.float32)
+        """What is seen from where the agent is, a new array."""
         x, y = self.agent_pos
-        observation[[x, self.width + y, self.width + self.height + self.agent_dir]] = 1.0
-        return observation
+        seen: npt.NDArray[np.float32] = self._observations[
+            state_index(self.river_map, int(x), int(y), int(self.agent_dir))
+        ]
+        return seen.copy()
 
     def _gen_grid(self, width: int, height: int) -> None:
         self.grid = river_minigrid(self.river_map)
@@ -128,7 +133,11 @@ class RiverGridEnv(MiniGridEnv):
 def draw_river_grid(name: str, options: RiverGridOptions) -> RiverGridEnv:
     """A RiverGrid task that draws itself, for the registry of tasks."""
     return RiverGridEnv(
-        str(task_map(name, options)), max_steps=options.horizon, costs=options.costs, render_mode="rgb_array"
+        str(task_map(name, options)),
+        max_steps=options.horizon,
+        costs=options.costs,
+        observation=options.observation,
+        render_mode="rgb_array",
     )
 
 
