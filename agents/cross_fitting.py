@@ -91,18 +91,18 @@ class KeptShares:
         self._promised = np.zeros(num_costs)
         self._confirmed = np.zeros(num_costs)
 
-    def learn(self, index: npt.NDArray[np.int64], promised: Floats, confirmed: Floats) -> Floats:
+    def learn(self, index: npt.NDArray[np.int64], promised: Floats, found: Floats) -> Floats:
         """Take in one update.
 
         Args:
             index: the costs that have a limit, [j].
             promised: b.H^-1 b of each, at least 0, [j].
-            confirmed: what the other half confirms, [j].
+            found: what the other half confirms of it, [j].
 
         Returns:
             Their shares, in [SMALLEST_SHARE, 1], [j]; 1 where nothing was ever promised.
         """
-        for sums, values in ((self._promised, promised), (self._confirmed, confirmed)):
+        for sums, values in ((self._promised, promised), (self._confirmed, found)):
             sums[index] = MEMORY * sums[index] + values
         whole = self._promised[index]
         shares = np.divide(self._confirmed[index], whole, out=np.ones_like(whole), where=whole > 0.0)
