@@ -7,17 +7,19 @@ of the river's cost plus a bonus on each state's entropy, by natural gradient st
 
     theta <- (1 - eta) theta + eta w / tau,   w = argmin_w E_visits[(A - phi w)^2],   A = A_r - price A_c
 
-with phi the features of (state, action) in which its logits are linear, centred under its policy. Where every
-pose has features of its own, w is A itself (mirror descent); with ``coordinates``, one-hot x, y and heading,
-what is learnt of one tile is learnt of its row and column. Printed: return / cost / share of episodes that
-reach the goal, exact, over the task's 200 steps, and whether the policy is within 0.2 of J*(0) at a cost of
-at most 0.05 once its temperature tau, which falls in equal ratios, is at its end. "Linear": whether logits
-linear in the coordinates could walk the best dry way at all (a linear program).
+with phi the features of (state, action) in which its logits are linear, centred under its policy; where it
+hardly goes it hardly learns. With ``pose`` every (x, y, heading) has features of its own, and w is A itself;
+with ``coordinates``, one-hot x, y and heading, what is learnt of a tile is learnt of its row and column.
+Printed: return / cost / share of episodes that reach the goal, exact, over the task's 200 steps, and whether
+the policy is within 0.2 of J*(0) at a cost of at most 0.05 once its temperature tau, which falls in equal
+ratios, is at its end. "Linear": whether logits linear in the coordinates could walk the best dry way at all
+(a linear program).
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import linprog
@@ -27,7 +29,6 @@ from recrl.environments.exact import evaluate_policy, solve_by_lagrangian
 from recrl.environments.finite_cmdp import FiniteCMDP
 from recrl.environments.river_grid import (
     HORIZON,
-    ObservationName,
     RiverGridGeneratedOptions,
     river_cmdp,
     river_observations,
@@ -35,7 +36,9 @@ from recrl.environments.river_grid import (
 
 ITERATIONS, STEP, DISCOUNT = 400, 0.05, 0.99
 FIRST_TEMPERATURE, LAST_TEMPERATURE = 1.0, 0.02
-RIDGE = 1e-6
+RIDGE = 1e-6  # share of the trace
+Direction = Callable[[Floats, Floats, Floats], Floats]
+"""Of policy [S, A], advantages [S, A] and visits [S]: the logits phi w, [S, A], for the w above."""
 
 
 def advantages(model: FiniteCMDP, policy: Floats, worth: Floats) -> tuple[Floats, Floats]:
@@ -59,18 +62,30 @@ def softmax(logits: Floats) -> Floats:
     return shares
 
 
-def direction(features: Floats, policy: Floats, advantage: Floats, visits: Floats) -> Floats:
-    """The logits phi w, [S, A], for the w above; features are the states', [S, n], for each action anew."""
-    size, actions = features.shape[1], policy.shape[1]
-    # phi(s, a) = f(s) x (e_a - pi(. | s)), [S, A, n A]
-    centred = np.eye(actions)[None] - policy[:, None, :]
-    phi = (features[:, None, :, None] * centred[:, :, None, :]).reshape(-1, size * actions)
-    weights = (visits[:, None] * policy).reshape(-1)
-    gram = phi.T @ (weights[:, None] * phi)
-    target = phi.T @ (weights * advantage.reshape(-1))
-    solution = np.linalg.solve(gram + RIDGE * np.trace(gram) * np.eye(len(gram)), target)
-    logits: Floats = features @ solution.reshape(size, actions)
-    return logits
+def by_pose(policy: Floats, advantage: Floats, visits: Floats) -> Floats:
+    """Each state has logits of its own: a system of A equations a state."""
+    spread = np.einsum("sa,ab->sab", policy, np.eye(policy.shape[1])) - policy[:, :, None] * policy[:, None]
+    gram = visits[:, None, None] * spread
+    ridge = RIDGE * np.trace(gram, axis1=1, axis2=2).sum() * np.eye(policy.shape[1])
+    target = (visits[:, None] * policy * advantage)[:, :, None]
+    return np.asarray(np.linalg.solve(gram + ridge, target)[:, :, 0], np.float64)
+
+
+def by_features(features: Floats) -> Direction:
+    """Logits linear in what is seen of a state, [S, n]."""
+
+    def direction(policy: Floats, advantage: Floats, visits: Floats) -> Floats:
+        size, actions = features.shape[1], policy.shape[1]
+        # phi(s, a) = f(s) x (e_a - pi(. | s)), [S, A, n A]
+        centred = np.eye(actions)[None] - policy[:, None, :]
+        phi = (features[:, None, :, None] * centred[:, :, None, :]).reshape(-1, size * actions)
+        weights = (visits[:, None] * policy).reshape(-1)
+        gram = phi.T @ (weights[:, None] * phi)
+        target = phi.T @ (weights * advantage.reshape(-1))
+        solution = np.linalg.solve(gram + RIDGE * np.trace(gram) * np.eye(len(gram)), target)
+        return np.asarray(features @ solution.reshape(size, actions), np.float64)
+
+    return direction
 
 
 def linear(model: FiniteCMDP, features: Floats) -> bool:
@@ -92,26 +107,24 @@ def linear(model: FiniteCMDP, features: Floats) -> bool:
     return bool(solution.status == 0)
 
 
-def train(map_seed: int, observation: ObservationName, price: float) -> tuple[float, float, float, bool]:
-    """Return, cost, share of episodes at the goal, and whether the optimum is found, of the last policy."""
-    river_map = RiverGridGeneratedOptions(map_seed=map_seed).river_map()
-    model = river_cmdp(river_map, costs=("river",), horizon=HORIZON)
-    features = river_observations(river_map, observation).astype(np.float64)
+def train(model: FiniteCMDP, direction: Direction, price: float) -> Floats:
+    """The last policy, [S, A]."""
     worth = model.rewards - price * model.costs[:, :, 0]
     logits = np.zeros((model.num_states, model.num_actions))
     for temperature in np.geomspace(FIRST_TEMPERATURE, LAST_TEMPERATURE, ITERATIONS):
         policy = softmax(logits)
         advantage, visits = advantages(model, policy, worth)
-        if observation == "coordinates":
-            advantage = direction(features, policy, advantage, visits)
-        logits = (1.0 - STEP) * logits + STEP / temperature * advantage
-    policy = softmax(logits)
-    value = evaluate_policy(model, policy)
-    arriving = model.terminal[model.successors[:, :, 0]]
+        logits = (1.0 - STEP) * logits + STEP / temperature * direction(policy, advantage, visits)
+    return softmax(logits)
+
+
+def report(model: FiniteCMDP, policy: Floats) -> str:
+    """Return / cost / share of episodes at the goal, and whether this is the optimum for a limit of 0."""
+    value, best = evaluate_policy(model, policy), solve_by_lagrangian(model, CostLimits((0.0,)))
     cost = float(value.costs[0])
-    best = solve_by_lagrangian(model, CostLimits((0.0,))).episode_return
-    found = value.episode_return >= best - 0.2 and cost <= 0.05
-    return value.episode_return, cost, float(value.visits[arriving].sum()), found
+    share = float(value.visits[model.terminal[model.successors[:, :, 0]]].sum())
+    found = value.episode_return >= best.episode_return - 0.2 and cost <= 0.05
+    return f"{value.episode_return:.2f} / {cost:.2f} / {share:.2f}{' found' if found else ''}"
 
 
 def main() -> None:
@@ -125,16 +138,12 @@ def main() -> None:
     for map_seed in arguments.maps:
         river_map = RiverGridGeneratedOptions(map_seed=map_seed).river_map()
         model = river_cmdp(river_map, costs=("river",), horizon=HORIZON)
-        expressible = linear(model, river_observations(river_map, "coordinates").astype(np.float64))
+        coordinates = river_observations(river_map, "coordinates").astype(np.float64)
+        expressible = "yes" if linear(model, coordinates) else "no"
         for price in (3.0, 10.0):
-            cells = []
-            for observation in ("pose", "coordinates"):
-                episode_return, cost, share, found = train(map_seed, observation, price)
-                cells.append(f"{episode_return:.2f} / {cost:.2f} / {share:.2f}{' found' if found else ''}")
-            print(
-                f"| {map_seed} | {'yes' if expressible else 'no'} | {price:g} | {' | '.join(cells)} |",
-                flush=True,
-            )
+            directions = (by_pose, by_features(coordinates))
+            cells = " | ".join(report(model, train(model, each, price)) for each in directions)
+            print(f"| {map_seed} | {expressible} | {price:g} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":
