@@ -134,6 +134,7 @@ class ActorCritic:
         self._rule = rule
         self._generator = generator
         self._noisy = False
+        self._temperature = 0.0
         self._form = (
             TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
         )
@@ -167,7 +168,7 @@ class ActorCritic:
         """
         with self._on_its_device():
             metrics = self._learn(rollout, episode_costs, limits)
-        self._noisy = False
+        self._noisy, self._temperature = False, 0.0
         self._policy.publish()
         require_finite("policy parameters", self._policy.parameters.to_numpy())
         require_finite("critic parameters", self._critics.parameters.to_numpy())
@@ -187,6 +188,8 @@ class ActorCritic:
         )
         num_envs = rollout.rewards.shape[1]
         experience = Experience.of(self._policy, batch, advantages, constraints, num_envs)
+        if self._temperature > 0.0:
+            experience = experience.with_entropy(self._temperature)
         return {
             **improve_and_measure(self._rule, self._policy, experience, self._generator),
             **indexed("cost_gap", constraints.gaps),
@@ -258,6 +261,10 @@ class ActorCritic:
         require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
         return metrics
 
+    def reward_entropy(self, temperature: float) -> None:
+        """In the next update, count the entropy of the policy as reward; see ``Experience.with_entropy``."""
+        self._noisy, self._temperature = True, temperature
+
     def state_dict(self) -> dict[str, Any]:
         """Parameters, generator, and the state of every part."""
         return {
@@ -265,6 +272,7 @@ class ActorCritic:
             "critics": self._critics.parameters.to_numpy(),
             "generator": self._generator.bit_generator.state,
             "noisy": self._noisy,
+            "temperature": self._temperature,
             **{name: part.state_dict() for name, part in self._parts.items()},
         }
 
@@ -274,7 +282,8 @@ class ActorCritic:
         self._policy.publish()
         self._critics.parameters.load(state["critics"])
         self._generator.bit_generator.state = state["generator"]
-        self._noisy = bool(state.get("noisy", False))  # earlier checkpoints lack it
+        self._noisy = bool(state.get("noisy", False))  # earlier checkpoints lack both
+        self._temperature = float(state.get("temperature", 0.0))
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
 

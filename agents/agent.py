@@ -83,6 +83,15 @@ class InvertedPolicy(Policy, Protocol):
         ...
 
 
+@runtime_checkable
+class EntropySeeker(Protocol):
+    """A student to whom the entropy of its policy can be made worth something; agents may be it."""
+
+    def reward_entropy(self, temperature: float) -> None:
+        """In the next update, count each nat of the policy's entropy as so much reward, above 0, a step."""
+        ...
+
+
 class Agent(Policy, Protocol):
     """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
 

@@ -58,7 +58,17 @@ from recrl.orchestrator.store import (
 KEY = ("task", "agent", "method", "seed")
 GROUP = ("task", "agent", "method")
 AGENT_ORDER = ("ppo-lag", "cpo")
-METHOD_ORDER = ("none", "linear", "cosine", "exponential", "dynamic", "annealed", "step", "unconstrained")
+METHOD_ORDER = (
+    "none",
+    "linear",
+    "cosine",
+    "exponential",
+    "dynamic",
+    "annealed",
+    "cooling",
+    "step",
+    "unconstrained",
+)
 TRIAL_COLUMNS = (
     "trial_id",
     "group",

@@ -59,13 +59,14 @@ STYLES = {
     "exponential": MethodStyle("#009e73", (1.4, 1.2), "v"),
     "dynamic": MethodStyle("#d55e00", (), "D", 1.5),
     "annealed": MethodStyle("#882255", (6.0, 1.2, 3.0, 1.2), "<"),
+    "cooling": MethodStyle("#44aa99", (4.0, 1.0, 1.0, 1.0), ">"),
     "step": MethodStyle("#cc79a7", (8.0, 2.0), "P"),
     "unconstrained": MethodStyle("#7a7a7a", (3.0, 1.2, 1.0, 1.2, 1.0, 1.2), "X"),
 }
 SPARE_STYLES = (
     MethodStyle("#aa4499", (6.0, 1.2, 3.0, 1.2), "H"),
-    MethodStyle("#56b4e9", (2.5, 1.0), ">"),
-    MethodStyle("#117733", (7.0, 1.5, 1.2, 1.5, 1.2, 1.5), "p"),
+    MethodStyle("#56b4e9", (2.5, 1.0), "p"),
+    MethodStyle("#117733", (7.0, 1.5, 1.2, 1.5, 1.2, 1.5), "d"),
     MethodStyle("#b8a800", (1.0, 0.8), "h"),
     MethodStyle("#332288", (4.0, 2.5), "*"),
 )

@@ -23,11 +23,11 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from recrl.agents.agent import Agent, DiscretePolicy
+from recrl.agents.agent import Agent, DiscretePolicy, EntropySeeker
 from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Floats, Phase
+from recrl.environments.cmdp import EpisodeStats, Floats, Phase
 from recrl.environments.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
@@ -37,7 +37,7 @@ from recrl.orchestrator.provenance import collect as collect_provenance
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import TrialStore, TrialWriter, write_json
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, Teacher
+from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, last_lesson
 
 COMMIT_SECONDS = 20.0
 HEARTBEAT_SECONDS = 2.0
@@ -134,6 +134,7 @@ class Trial:
                 "update_seconds": round(time.process_time() - clock, 6),
                 **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
                 **{f"limit_{i}": limit for i, limit in enumerate(lesson.limits)},
+                **self._shown_temperature(lesson),
                 **metrics,
             }
         )
@@ -186,10 +187,9 @@ class Trial:
         return episodes
 
     def _next_lesson(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
-        """Ask the teacher, or enter deployment; apply the policy noise it wants."""
+        """Ask the teacher, or enter deployment; apply the policy noise and the temperature it wants."""
         if self.phase is Phase.DEPLOYMENT:
-            if self._lesson.limits != self.spec.deploy_limits or self._lesson.policy_noise:
-                self._lesson = Lesson(self.spec.deploy_limits)
+            self._lesson = Lesson(self.spec.deploy_limits)
             return
         measured = self._teacher_state.get("start_limits")
         report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
@@ -200,6 +200,17 @@ class Trial:
             flat = observations.reshape(-1, observations.shape[-1])
             done = self._agent.add_noise(self._lesson.policy_noise, flat)
             self._event("policy noise", policy_noise=self._lesson.policy_noise, **done)
+        if self._lesson.temperature > 0.0:
+            if not isinstance(self._agent, EntropySeeker):
+                raise TypeError(
+                    f"method {self.spec.method.name} needs an agent that has reward_entropy, "
+                    f"{self.spec.agent.name} has not; choose another of the two"
+                )
+            self._agent.reward_entropy(self._lesson.temperature)
+
+    def _shown_temperature(self, lesson: Lesson) -> dict[str, float]:
+        """The temperature, for teachers that have one."""
+        return {"temperature": lesson.temperature} if "temperature" in self._teacher_state else {}
 
     def _event(self, name: str, **details: Any) -> None:
         event = {"update": self.update, "end_step": self.env_steps, "event": name, **details}
@@ -214,6 +225,7 @@ class Trial:
             "lesson": {
                 "limits": self._lesson.limits.to_json(),
                 "policy_noise": self._lesson.policy_noise,
+                "temperature": self._lesson.temperature,
             },
             "teacher": dict(self._teacher_state),
             "agent": self._agent.state_dict(),
@@ -226,7 +238,7 @@ class Trial:
         self.update = tree["update"]
         self.env_steps = tree["env_steps"]
         self._episodes = tree["episodes"]
-        self._lesson = Lesson(CostLimits.from_json(tree["lesson"]["limits"]), tree["lesson"]["policy_noise"])
+        self._lesson = last_lesson(tree["lesson"])
         self._teacher_state = tree["teacher"]
         self._agent.load_state_dict(tree["agent"])
         self._environments.load_state_dict(tree["environments"])

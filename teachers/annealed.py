@@ -115,6 +115,8 @@ def geometric(share: float, start: float, deploy_limit: float) -> float:
     if share >= 1.0 or start <= deploy_limit:
         return deploy_limit
     end = max(deploy_limit, SMALLEST_RATIO * start)
+    if end == 0.0:  # so small a start has no thousandth
+        return deploy_limit
     limit = end * math.exp((1.0 - share) * math.log(start / end))
     return min(start, max(deploy_limit, limit))  # against rounding
 

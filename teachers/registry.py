@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from recrl.environments.plugins import resolve
 from recrl.teachers.annealed import AnnealedConfig, AnnealedTeacher
+from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
 from recrl.teachers.dynamic import DynamicConfig, DynamicTeacher
 from recrl.teachers.static import (
     DecayConfig,
@@ -65,6 +66,11 @@ TEACHERS: dict[str, TeacherKind] = {
         "Ours: noise in every update, slowly taken away, while the limit falls to d_d in equal ratios.",
         AnnealedConfig,
         AnnealedTeacher,
+    ),
+    "cooling": TeacherKind(
+        "Ours: entropy is worth a reward that falls to 0, and the limit, relaxed as far, falls with it.",
+        CoolingConfig,
+        CoolingTeacher,
     ),
 }
 

@@ -11,6 +11,7 @@ p = env steps / B in [0, 1] the progress, k the number of costs.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -30,12 +31,17 @@ class Lesson:
         limits: the cost limits d, [k].
         policy_noise: eps_pi in [0, 1], noise to add to the student's policy once, before it collects
             the next batch (Algorithm 2, line 9); 0 for none.
+        temperature: what a nat of the policy's entropy is worth in the update from the next batch, in the
+            task's reward, at least 0; only students that ``reward_entropy`` can be taught so.
     """
 
     limits: CostLimits
     policy_noise: float = 0.0
+    temperature: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.temperature < math.inf:
+            raise ValueError(f"temperature must be finite and at least 0, got {self.temperature}")
         if not 0.0 <= self.policy_noise <= 1.0:
             raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
 
@@ -120,8 +126,8 @@ class Teacher(Protocol):
 
 
 # What follows is shared by the teachers of this package. Their states hold at least ``update``, the last
-# update seen (0 before the first), and the last lesson as ``limits`` and ``policy_noise``: a repeated
-# question is answered from the state alone.
+# update seen (0 before the first), and the last lesson as ``limits``, ``policy_noise`` and, if it has one,
+# ``temperature``: a repeated question is answered from the state alone.
 
 
 def progress(env_steps: int, train_steps: int) -> float:
@@ -150,4 +156,8 @@ def already_seen(state: TeacherState, report: ProgressReport) -> bool:
 
 def last_lesson(state: TeacherState) -> Lesson:
     """The lesson that ``state`` was returned with."""
-    return Lesson(CostLimits.from_json(state["limits"]), float(state["policy_noise"]))
+    return Lesson(
+        CostLimits.from_json(state["limits"]),
+        float(state["policy_noise"]),
+        float(state.get("temperature", 0.0)),
+    )

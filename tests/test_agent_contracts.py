@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from recrl.agents.agent import Agent, Rollout
+from recrl.agents.agent import Agent, EntropySeeker, Rollout
 from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
 from recrl.agents.config import AscentConfig
 from recrl.agents.errors import DivergedError
@@ -159,6 +159,31 @@ def test_noise_returns_the_same_metrics_and_keeps_the_student_learning(agent: st
     keys = {tuple(lessons.agent.add_noise(noise, rows)) for noise in (0.1, 1.0)}
     assert keys == {("noise_scale", "randomness_before", "randomness_after")}
     assert math.isfinite(lessons.update()["kl"])
+
+
+@every_agent
+@every_task
+def test_entropy_that_is_rewarded_rises_in_one_update_and_survives_a_checkpoint(
+    agent: str, task: str
+) -> None:
+    plain, warm, resumed = (Lessons(agent, task, {"compaction": False}) for _ in range(3))
+    for student in (plain, warm, resumed):
+        assert isinstance(student.agent, EntropySeeker)
+        for _ in range(2):
+            student.update()
+    warm.agent.reward_entropy(1e4)  # type: ignore[attr-defined]  # asserted above
+    resumed.agent.load_state_dict(decode(encode(warm.agent.state_dict()), source="memory"))
+    kept = 1000.0  # a student that recovers from a violation looks at nothing else
+    entropies = [student.update(kept)["entropy"] for student in (plain, warm, resumed)]
+    assert entropies[1] > entropies[0]
+    assert entropies[2] == entropies[1]
+    cooled = Lessons(agent, task, {"compaction": False})
+    cooled.agent.load_state_dict(warm.agent.state_dict())
+    assert warm.agent.state_dict()["temperature"] == 0.0
+    rollout, episodes = warm.collect()
+    costs = episode_costs(episodes, warm.num_costs)
+    updates = [each.agent.update(rollout, costs, each.limits()) for each in (warm, cooled)]
+    assert repr(updates[0]) == repr(updates[1])
 
 
 @pytest.mark.parametrize("rule", STARTS)

@@ -55,6 +55,7 @@ def test_a_limit_of_0_is_met_by_a_step_at_the_end() -> None:
     assert geometric(0.5, 10.0, 0.0) == pytest.approx(10.0 / math.sqrt(1000.0))
     assert geometric(0.999999, 10.0, 0.0) == pytest.approx(0.01, rel=1e-4)
     assert geometric(1.0, 10.0, 0.0) == 0.0
+    assert geometric(0.0, 5e-324, 0.0) == 0.0
 
 
 @pytest.mark.parametrize(("start", "deploy"), [(0.0, 0.0), (3.0, 3.0), (math.inf, math.inf), (1.0, math.inf)])

@@ -26,6 +26,7 @@ def spec(name: str, **options: Any) -> TeacherSpec:
 def test_the_names() -> None:
     assert sorted(TEACHERS) == [
         "annealed",
+        "cooling",
         "cosine",
         "dynamic",
         "exponential",
