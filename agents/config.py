@@ -110,7 +110,7 @@ class StudentConfig(BaseModel):
         default=None,
         exclude_if=_is_unset,
         description="target_kl of an update from samples of a policy to which the teacher added noise, which "
-        "has to be undone beside what is learnt; null for target_kl (ours).",
+        "has to be undone beside what is learnt, or in which it rewards entropy; null for target_kl (ours).",
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",
@@ -123,7 +123,7 @@ class StudentConfig(BaseModel):
     )
 
     def in_update(self, *, noisy: bool) -> Self:
-        """The settings of one update: target_kl is noisy_target_kl where the policy had added noise."""
+        """The settings of one update: target_kl is noisy_target_kl under noise or rewarded entropy."""
         if not noisy or self.noisy_target_kl is None:
             return self
         return self.model_copy(update={"target_kl": self.noisy_target_kl})

@@ -31,7 +31,7 @@ class Constraints:
             limit, [k]; -inf where the limit is infinite, NaN where no episode finished.
         episode_length: mean steps of an episode, above 0: environment steps over finished episodes; NaN if
             none finished.
-        noisy: whether noise was added to the policy that collected them.
+        noisy: whether the teacher added noise to the policy that collected them, or rewards its entropy.
     """
 
     limits: Floats

@@ -5,7 +5,7 @@ Metrics are drawn against environment steps and sorted into the UI's chart secti
     train/return, train/cost_0            means over the episodes of an update, training phase
     train/episodes                        how many those are
     deploy/return, deploy/cost_0, ...     the same, deployment phase
-    curriculum/limit_0, curriculum/noise  what the teacher set
+    curriculum/limit_0, curriculum/noise  what the teacher set; curriculum/temperature if it has one
     student/<name>                        what the student reported: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
     summary/deploy_return, ..._cost_0     mean over the episodes of the deployment phase; once, at the end
@@ -140,7 +140,7 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
     for column in row.keys() - set(UPDATE_COLUMNS):
         if re.fullmatch(r"cost_\d+", column):
             values[f"{section}/{column}"] = float(row[column])
-        elif re.fullmatch(r"limit_\d+", column):
+        elif re.fullmatch(r"limit_\d+|temperature", column):
             values[f"curriculum/{column}"] = float(row[column])
         else:
             values[f"student/{_safe(column)}"] = float(row[column])

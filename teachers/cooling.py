@@ -11,9 +11,10 @@ temperature is high, and both arrive together.
     d = min(d_t, d_d (1 + relaxation h))
     tau = temperature h             reward per nat, in the update after the lesson
 
-With a fixed temperature and a table of logits the constrained problem has one solution (entropy makes the
-occupancy measures' problem strictly concave), which moves continuously as temperature and limit fall: the
-student follows it. What a student sees must let it: see ``observation: pose`` of RiverGrid.
+Where nothing is left to learn at a temperature, log pi(a | s) is the advantage over the temperature, up to a
+constant: ``Experience.with_entropy``. It needs a student to whom every observation can be worth something of
+its own (``observation: pose`` of RiverGrid), and whose price for a violation can rise until no way through it
+pays (``ppo-lag`` as it is, or with a ``multiplier_maximum`` above that price; ``cpo``).
 
 Letters: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
 environment steps, p in [0, 1] the share of B that is used up, k the number of costs.

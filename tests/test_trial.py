@@ -9,13 +9,14 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from recrl.agents.registry import AGENTS
+from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialStore
@@ -184,6 +185,30 @@ def test_methods_of_a_seed_start_alike(undisturbed: TrialStore, tmp_path: Path) 
     pd.testing.assert_frame_equal(
         undisturbed.episodes().loc[first, columns], other.episodes().loc[first, columns]
     )
+
+
+def test_what_entropy_was_worth_is_recorded_and_ends_with_the_heat(tmp_path: Path) -> None:
+    spec = replace(SPEC, method=Choice("cooling", {"temperature": 2.0, "cooled": 0.5}))
+    updates = run(tmp_path, spec).updates()
+    # 19 updates of training; what the teacher says after an update counts in the next. The first has none.
+    expected = [0.0, *(2.0 * max(0.0, 1.0 - update / 9.5) for update in range(1, 20))]
+    assert updates["temperature"].tolist() == pytest.approx(expected)
+    assert updates["limit_0"].tolist() == pytest.approx([7.5, *(3.0 + 2.25 * each for each in expected[1:])])
+    assert "temperature" not in run(tmp_path).updates()
+
+
+def test_a_student_whose_entropy_cannot_be_rewarded_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_it(*arguments: Any) -> SimpleNamespace:
+        agent = make_agent(*arguments)
+        return SimpleNamespace(act=agent.act, update=agent.update, state_dict=agent.state_dict)
+
+    monkeypatch.setattr("recrl.orchestrator.trial.make_agent", without_it)
+    spec = replace(SPEC, method=Choice("cooling"))
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=never) is TrialState.FAILED
+    assert "method cooling needs an agent that has reward_entropy, ppo-lag has not" in store.record().error
 
 
 def test_both_frozen_policies_are_evaluated(undisturbed: TrialStore) -> None:
