@@ -88,7 +88,11 @@ class EntropySeeker(Protocol):
     """A student to whom the entropy of its policy can be made worth something; agents may be it."""
 
     def reward_entropy(self, temperature: float) -> None:
-        """In the next update, count each nat of the policy's entropy as so much reward, above 0, a step."""
+        """Count entropy as reward in the next update, and in that one alone.
+
+        Args:
+            temperature: what a nat is worth, in the task's reward per step, above 0.
+        """
         ...
 
 

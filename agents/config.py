@@ -187,8 +187,9 @@ class MultiplierConfig(StudentConfig):
     multiplier_waits: bool = Field(
         default=False,
         exclude_if=_is_unset,
-        description="Sum up no violation that the teacher's noise may have caused: in an update from samples "
-        "of a policy with added noise the integral of PID stays, and the other rules' multipliers (ours).",
+        description="Sum up no violation that the teacher may have caused: in an update from samples of a "
+        "policy with added noise, or in which it rewards entropy, the integral of PID stays, and the other "
+        "rules' multipliers (ours).",
     )
     multiplier_reset: bool = Field(
         default=False,

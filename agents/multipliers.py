@@ -1,8 +1,8 @@
 """The Lagrange multipliers of a student: a rule of ``recrl.agents.lagrange``, its state, and when it moves.
 
 If no episode finished, nothing is known about the constraints and the multipliers stay. A cost whose limit is
-infinite has the multiplier 0. With ``multiplier_waits`` nothing is summed up while the policy is noisy: a
-violation that the student could not have avoided would have to be undone later, update by update.
+infinite has the multiplier 0. With ``multiplier_waits`` nothing is summed up while the teacher adds noise or
+rewards entropy: what the student could not have avoided would have to be undone later, update by update.
 
 Letters: k costs.
 """
