@@ -1,4 +1,4 @@
-"""Python functions compiled to machine code, which MuJoCo runs on its own threads.
+"""Python functions compiled to machine code, which step MuJoCo's simulations, on threads where wanted.
 
 Numba compiles them when they are first imported, which takes some seconds, and keeps the result beside their
 file (where nobody may write there: in the user's cache folder, see Numba's NUMBA_CACHE_DIR) until that file
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -20,12 +21,24 @@ from typing import Any, ParamSpec, TypeVar
 import mujoco
 import numba
 import numpy as np
-from numba.core import types
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+
+CALL = np.dtype(
+    [
+        ("index", np.int64),  # which simulation
+        ("first", np.int64),  # the parts of the work to do now: from here
+        ("last", np.int64),  # to before here
+        ("argument", np.int64),  # an address, which the function is given
+    ],
+    align=True,
+)
+"""What a function for ``Simulations.apply`` is called with, besides MuJoCo's model and data."""
 
 
 @functools.cache
@@ -48,6 +61,11 @@ mj_getState: Any = types.ExternalFunction(  # noqa: N816  # MuJoCo's name
     "mj_getState", types.void(_ADDRESS, _ADDRESS, _ADDRESS, types.int32)
 )
 
+mjb_apply: Any = types.ExternalFunction(
+    "mjb_apply",
+    types.int32(_ADDRESS, _ADDRESS, types.int32, _ADDRESS, _ADDRESS, types.int32),
+)
+
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """A function that compiled ones may call, and become part of; Python may, too."""
@@ -57,7 +75,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
 
 def compiled_for_batch(function: Callable[[int, int, int, int], None]) -> Any:
-    """A function for ``Simulations.apply``: of addresses of model and data, index, address of an argument."""
+    """A function for ``Simulations.apply``: of addresses of model and data, 0, address of a ``CALL``."""
     signature = types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
     return kept(functools.partial(numba.cfunc, signature), function)
 
@@ -68,10 +86,13 @@ def compiled_for_arrays(function: Callable[Parameters, Result]) -> Callable[Para
     return call
 
 
-def compiled_for_python(function: Callable[[int], bool]) -> Callable[[int], bool]:
-    """A function of an address that Python calls often: Numba takes no time to look at the argument."""
-    signature = types.boolean(_ADDRESS)
-    call: Callable[[int], bool] = kept(functools.partial(numba.cfunc, signature), function).ctypes
+def compiled_for_python(function: Callable[Parameters, bool]) -> Callable[Parameters, bool]:
+    """A function of whole numbers, such as addresses, that Python calls often.
+
+    Numba takes no time to look at the arguments, and other Python threads go on meanwhile.
+    """
+    signature = types.boolean(*(types.int64,) * function.__code__.co_argcount)
+    call: Callable[Parameters, bool] = kept(functools.partial(numba.cfunc, signature), function).ctypes
     return call
 
 
@@ -92,6 +113,53 @@ def array_at(kind: Any) -> Any:
         return carray(pointer(address), size)  # type: ignore[call-arg]
 
     return view
+
+
+def instruction(function: Callable[..., Any]) -> Any:
+    """A function that compiled ones may call; ``function`` says with which instructions."""
+    return intrinsic(function)
+
+
+@instruction
+def load(_context: Any, address: Any) -> Any:
+    """The whole number at an address, as other threads have left it, and all that they wrote before it."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.load_atomic(_number_at(builder, arguments[0]), "seq_cst", 8)
+
+    return types.int64(address), generate
+
+
+@instruction
+def swap(_context: Any, address: Any, value: Any) -> Any:
+    """Write a whole number at an address, for other threads to see, as all that was written before it.
+
+    Returns:
+        what was there.
+    """
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.atomic_rmw("xchg", _number_at(builder, arguments[0]), arguments[1], "seq_cst")
+
+    return types.int64(address, value), generate
+
+
+@instruction
+def pause(_context: Any) -> Any:
+    """Let a moment pass, in a loop that waits for another thread; cheap for the processor's core."""
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        if platform.machine() in {"x86_64", "AMD64"}:
+            insert: Any = cgutils.get_or_insert_function
+            signature = ir.FunctionType(ir.VoidType(), ())
+            builder.call(insert(builder.module, signature, "llvm.x86.sse2.pause"), ())
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+def _number_at(builder: Any, address: Any) -> Any:
+    return builder.inttoptr(address, ir.IntType(64).as_pointer())
 
 
 def kept(compiler: Any, function: Any) -> Any:

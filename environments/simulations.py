@@ -1,14 +1,16 @@
 """Many MuJoCo simulations of one model, stepped together, that can be saved and restored exactly.
 
-This is MuJoCo's own batch (``mjbatch.h``, MuJoCo 4) through its C interface. MuJoCo's Python class
-``mujoco.batch.Batch`` lacks one thing: which bodies sleep is not part of a state row, and the class offers no
-way to put it back. Here ``load`` does, so that a simulation with sleeping bodies continues to the last bit.
+Each is a batch of MuJoCo's (``mjbatch.h``, MuJoCo 4) with one simulation, through its C interface; threads
+share the batches out (``recrl.environments.thread_pool``). MuJoCo's Python class ``mujoco.batch.Batch`` lacks
+one thing besides: which bodies sleep is not part of a state row, and the class offers no way to put it back.
+Here ``load`` does, so that a simulation with sleeping bodies continues to the last bit.
 
 Letters: B simulations; n numbers in a state row.
 """
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import functools
 import weakref
@@ -21,6 +23,7 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.machine_code import mujoco_library
+from recrl.environments.thread_pool import SIMULATION, ThreadPool
 
 Integers = npt.NDArray[np.int32]
 Ids = Sequence[int] | npt.NDArray[np.intp] | None
@@ -53,6 +56,7 @@ def _library() -> Any:
             (pointer, integer, ctypes.POINTER(_Config), ctypes.c_char_p, integer),
         ),
         "mjb_deleteBatch": (None, (pointer,)),
+        "mjb_setModels": (None, (pointer, pointer)),
         "mjb_nstate": (integer, (pointer,)),
         "mjb_state": (pointer, (pointer,)),
         "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
@@ -60,7 +64,6 @@ def _library() -> Any:
         "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
         "mjb_forward": (integer, (pointer, pointer, integer, integer)),
         "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
-        "mjb_status": (pointer, (pointer,)),
         "mjb_error": (ctypes.c_char_p, (pointer, integer)),
         "mjb_getData": (None, (pointer, integer, pointer)),
         "mjb_apply": (integer, (pointer, pointer, integer, pointer, pointer, integer)),
@@ -95,51 +98,56 @@ class Simulations:
     """
 
     def __init__(self, model: mujoco.MjModel, number: int, *, num_threads: int = 1) -> None:
+        if number < 1:
+            raise ValueError(f"there must be at least one simulation, got {number}")
         self.model = model
         self.number = number
         self._library = _library()
-        config = _Config(nthread=num_threads, persistent=True)
-        reason = ctypes.create_string_buffer(1000)
-        self._batch = self._library.mjb_makeBatch(
-            model._address, number, ctypes.byref(config), reason, len(reason)
+        self._own_model = copy.copy(model)
+        self._models = ctypes.c_void_p(self._own_model._address)
+        self._batches = [self._make_batch() for _ in range(number)]
+        self._delete = weakref.finalize(
+            self, _delete, self._library, self._batches, (self._own_model, self._models)
         )
-        if not self._batch:
-            raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
-        self._delete = weakref.finalize(self, self._library.mjb_deleteBatch, self._batch)
         self._data = mujoco.MjData(model)
         self._everyone: Integers = np.arange(number, dtype=np.int32)
-        self._everyone_address = self._everyone.ctypes.data
-        self.rows: Floats = self._view(
-            self._library.mjb_state(self._batch),
-            np.float64,
-            (number, self._library.mjb_nstate(self._batch)),
-        )
-        counters = self._view(self._library.mjb_warning(self._batch), np.int32, (number, _NUM_WARNINGS, 2))
-        self._warnings: Integers = counters[:, :, 1]
+        size = self._library.mjb_nstate(self._batches[0])
+        addresses = [self._library.mjb_state(batch) for batch in self._batches]
+        self._states = [_view(address, np.float64, (size,)) for address in addresses]
+        self._warnings = [
+            _view(self._library.mjb_warning(batch), np.int32, (_NUM_WARNINGS, 2)) for batch in self._batches
+        ]
+        self.rows: Floats = np.array(self._states)
+        records = np.zeros(number, SIMULATION)
+        records["batch"], records["state"] = self._batches, addresses
+        records["row"] = [row.ctypes.data for row in self.rows]
+        self._records = records
+        self._threads = ThreadPool(records, size, num_threads)
         self.stopped = np.zeros(number, np.bool_)
         self.any_stopped = False
 
     def state(self, component: mujoco.mjtState, shape: tuple[int, ...]) -> Floats:
         """A part of ``rows`` as a live view, [B, *shape]."""
-        size = ctypes.c_int()
-        address = self._library.mjb_stateComponent(self._batch, int(component), ctypes.byref(size))
-        start = (address - self._library.mjb_state(self._batch)) // self.rows.itemsize
+        size, batch = ctypes.c_int(), self._batches[0]
+        address = self._library.mjb_stateComponent(batch, int(component), ctypes.byref(size))
+        start = (address - self._library.mjb_state(batch)) // self.rows.itemsize
         view: Floats = self.rows[:, start : start + size.value].reshape(self.number, *shape)
         return view
 
-    def apply(self, function: Any, argument: int, ids: Ids = None) -> None:
-        """Run a compiled function on simulations, on all threads; it may step them.
+    def apply(self, function: Any, argument: int, ids: Ids = None, *, parts: int = 1) -> None:
+        """Run a compiled function on simulations; it may step them.
 
         Args:
             function: from ``machine_code.compiled_for_batch``.
             argument: an address, which the function is given.
-            ids: which simulations, ascending; None for all.
+            ids: which simulations, each once; None for all.
+            parts: of which the function's work consists; it is done on all threads if there are several. The
+                function may be called several times, each time for parts ``first`` to before ``last`` of its
+                ``CALL``.
         """
-        address, count = self._everyone_address, self.number
-        if ids is not None:
-            chosen = self._chosen(ids)
-            address, count = chosen.ctypes.data, len(chosen)
-        self._note(self._library.mjb_apply(self._batch, address, count, function.address, argument, 1))
+        if not self._threads.run(function.address, argument, self._chosen(ids), parts):
+            self.stopped |= self._records["failed"] != 0
+            self.any_stopped = True
 
     def step(self, substeps: int, ids: Ids = None) -> None:
         """Advance simulations, then compute everything, accelerations included, at the new state.
@@ -148,22 +156,27 @@ class Simulations:
             substeps: physics steps.
             ids: which simulations; None for all.
         """
-        chosen = self._chosen(ids)
-        self._note(
-            self._library.mjb_step(self._batch, chosen.ctypes.data, len(chosen), substeps, _EVERYTHING)
-        )
+        for index in self._chosen(ids):
+            self._states[index][:] = self.rows[index]
+            if self._library.mjb_step(self._batches[index], None, 1, substeps, _EVERYTHING):
+                self.stopped[index] = self.any_stopped = True
+            self.rows[index] = self._states[index]
 
     def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
         chosen = self._chosen(ids)
         self.stopped[chosen] = False
         self.any_stopped = bool(self.stopped.any())
-        self._check(self._library.mjb_reset(self._batch, chosen.ctypes.data, len(chosen), None, _NOTHING))
+        for index in chosen:
+            self._check(index, self._library.mjb_reset(self._batches[index], None, 1, None, _NOTHING))
+            self.rows[index] = self._states[index]
 
     def forward(self, ids: Ids) -> None:
         """Compute everything that follows from the rows of some simulations."""
-        chosen = self._chosen(ids)
-        self._check(self._library.mjb_forward(self._batch, chosen.ctypes.data, len(chosen), _EVERYTHING))
+        for index in self._chosen(ids):
+            self._states[index][:] = self.rows[index]
+            self._check(index, self._library.mjb_forward(self._batches[index], None, 1, _EVERYTHING))
+            self.rows[index] = self._states[index]
 
     def broken(self) -> npt.NDArray[np.bool_]:
         """Whether a simulation has diverged since its last reset, [B].
@@ -171,24 +184,24 @@ class Simulations:
         MuJoCo then warns and silently starts again from the model's defaults, or, where it cannot compute a
         step at all, leaves the simulation where it was.
         """
-        return np.asarray(self._warnings[:, BAD_STATES].any(axis=1) | self.stopped)
+        return np.asarray([warnings[BAD_STATES, 1].any() for warnings in self._warnings] | self.stopped)
 
     def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
         """A copy of one simulation, for drawing or for any function of MuJoCo; a new one, or ``into``."""
         data = mujoco.MjData(self.model) if into is None else into
-        self._library.mjb_getData(self._batch, index, data._address)
+        self._library.mjb_getData(self._batches[index], 0, data._address)
         return data
 
     def save(self) -> dict[str, Any]:
         """Everything that the future of these simulations depends on."""
         asleep = np.empty((self.number, self.model.ntree), np.int32)
         for index in range(self.number):
-            self._library.mjb_getData(self._batch, index, self._data._address)
+            self._library.mjb_getData(self._batches[index], 0, self._data._address)
             asleep[index] = self._data.tree_asleep
         return {
             "rows": self.rows.copy(),
             "asleep": asleep,
-            "warnings": self._warnings.copy(),
+            "warnings": np.array([warnings[:, 1] for warnings in self._warnings]),
             "stopped": self.stopped.copy(),
         }
 
@@ -202,16 +215,17 @@ class Simulations:
         if rows.shape != self.rows.shape:
             raise ValueError(f"saved physics must have shape {self.rows.shape}, got {rows.shape}")
         self.reset(range(self.number))
-        sources = [self._restored(rows[index], state["asleep"][index]) for index in range(self.number)]
-        copy_data = self._library.mj_copyData
+        for index, batch in enumerate(self._batches):
+            restored = self._restored(rows[index], state["asleep"][index])
 
-        def put_back(model: int, data: int, index: int, _: Any) -> None:
-            copy_data(data, model, sources[index]._address)
+            def put_back(model: int, data: int, *_: Any, source: int = restored._address) -> None:
+                self._library.mj_copyData(data, model, source)
 
-        function = _BatchFunction(put_back)
-        address = ctypes.cast(function, ctypes.c_void_p)
-        self._check(self._library.mjb_apply(self._batch, None, 0, address, None, 1))
-        self._warnings[...], self.stopped[...] = state["warnings"], state["stopped"]
+            function = ctypes.cast(_BatchFunction(put_back), ctypes.c_void_p)
+            self._check(index, self._library.mjb_apply(batch, None, 0, function, None, 1))
+            self.rows[index] = self._states[index]
+            self._warnings[index][:, 1] = state["warnings"][index]
+        self.stopped[...] = state["stopped"]
         self.any_stopped = bool(self.stopped.any())
 
     def _restored(self, row: Floats, asleep: Integers) -> mujoco.MjData:
@@ -230,27 +244,30 @@ class Simulations:
         mujoco.mj_extractState(self.model, row, ROW, warm_start, component)
         return warm_start
 
-    def _view(self, address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
-        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-        buffer = (ctypes.c_char * size).from_address(address)
-        buffer._owner = self  # keeps the memory alive while a view is
-        return np.frombuffer(buffer, dtype).reshape(shape)
-
-    def _status(self) -> Integers:
-        status: Integers = self._view(self._library.mjb_status(self._batch), np.int32, (self.number,))
-        return status
+    def _make_batch(self) -> int:
+        config = _Config(nthread=1, persistent=True)
+        reason = ctypes.create_string_buffer(1000)
+        batch = self._library.mjb_makeBatch(self._models, 1, ctypes.byref(config), reason, len(reason))
+        if not batch:
+            raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
+        # Each batch has a copy of the model; one that all look at fits into a core's cache better.
+        self._library.mjb_setModels(batch, ctypes.byref(self._models))
+        return int(batch)
 
     def _chosen(self, ids: Ids) -> Integers:
         return self._everyone if ids is None else np.ascontiguousarray(ids, np.int32)
 
-    def _note(self, failed: int) -> None:
+    def _check(self, index: int, failed: int) -> None:
         if failed:
-            self.stopped |= self._status() != 0
-            self.any_stopped = True
+            message = self._library.mjb_error(self._batches[index], 0).decode()
+            raise PhysicsError(f"MuJoCo stopped in simulation {index}: {message}")
 
-    def _check(self, failed: int) -> None:
-        if not failed:
-            return
-        index = int(np.flatnonzero(self._status())[0])
-        message = self._library.mjb_error(self._batch, index).decode()
-        raise PhysicsError(f"MuJoCo stopped in simulation {index}: {message}")
+
+def _view(address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    return np.frombuffer((ctypes.c_char * size).from_address(address), dtype).reshape(shape)
+
+
+def _delete(library: Any, batches: list[int], _needed: object) -> None:
+    for batch in batches:
+        library.mjb_deleteBatch(batch)

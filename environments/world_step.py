@@ -1,8 +1,8 @@
 """One environment step of one world of a Safety Gym task, compiled to machine code.
 
-MuJoCo's batch calls ``step`` for each world, on its own threads: the action, ten physics steps, what the
-robot then sees, feels, earns and pays. Nothing here looks at another world, so results depend neither on how
-many there are nor on the threads. Resets and new goals, which are drawn at random, are not made here
+``step`` is called for each world, on whatever thread: the action, ten physics steps, what the robot then
+sees, feels, earns and pays. Nothing here looks at another world, so results depend neither on how many there
+are nor on the threads. Resets and new goals, which are drawn at random, are not made here
 (``recrl.environments.safety_worlds``).
 
 What a world is made of is one record ``WORLD``; what all worlds of a task share is one record ``TASK``. These
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from recrl.environments.machine_code import (
+    CALL,
     array_at,
     compiled,
     compiled_for_batch,
@@ -147,6 +148,7 @@ WORLD = np.dtype(
     align=True,
 )
 
+_calls = array_at(CALL)
 _tasks = array_at(TASK)
 _worlds = array_at(WORLD)
 _doubles = array_at(np.float64)
@@ -489,28 +491,16 @@ def lead_gremlin(task: Any, world: Any, data: int, substep: int) -> None:
 
 
 @compiled
-def simulate(task: Any, world: Any, model: int, data: int, untouched: bool) -> None:
-    """Ten physics steps under the action, and everything that follows from the state after them.
-
-    Where the last step left off, MuJoCo has computed already what follows from coordinates and velocities:
-    the first physics step then does not compute it again, which changes nothing.
-    """
+def act(task: Any, world: Any, data: int) -> bool:
+    """Set the controls; False if anything else was set, too."""
     control = field(data, task.ctrl, 2)
     control[0], control[1] = world.action[0], world.action[1]
     if task.start[GREMLINS] < task.stop[GREMLINS]:
         wanted = nearest_gremlin(task, world, data)
         if wanted != world.embodied and replaceable(task, world, data):
             embody(task, world, data, wanted)
-            untouched = False
-    leads = world.embodied >= 0
-    for substep in range(task.substeps):
-        if leads:
-            lead_gremlin(task, world, data, substep)
-        if substep == 0 and untouched and not leads:
-            mj_step2(model, data)
-        else:
-            mj_step(model, data)
-    mj_forward(model, data)
+            return False
+    return True
 
 
 @compiled
@@ -543,17 +533,39 @@ def report(task: Any, world: Any, index: int) -> None:
     flags[3 * number + index] = world.steps >= task.horizon
 
 
-@compiled_for_batch
-def step(model: int, data: int, index: int, argument: int) -> None:
-    """One environment step of one world; the action is in its record."""
-    task = _tasks(argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[index]
+@compiled
+def begin(task: Any, world: Any, model: int, data: int, index: int) -> bool:
+    """Do as the action says; whether everything else is as the last step left it."""
     left = task.rows + 8 * task.row * 2 * index
     found = left + 8 * task.row
     mj_getState(model, data, found, task.row_fields)
     untouched = same(_doubles(left, task.row), _doubles(found, task.row))
-    simulate(task, world, model, data, untouched)
-    mj_getState(model, data, left, task.row_fields)
+    return act(task, world, data) and untouched
+
+
+@compiled
+def simulate(task: Any, world: Any, model: int, data: int, call: Any) -> None:
+    """Those of a step's physics steps that are asked for.
+
+    Where the last step left off, MuJoCo has computed already what follows from coordinates and velocities:
+    the first physics step then does not compute it again, which changes nothing.
+    """
+    untouched = begin(task, world, model, data, call.index) if call.first == 0 else False
+    leads = world.embodied >= 0
+    for substep in range(call.first, min(call.last, task.substeps)):
+        if leads:
+            lead_gremlin(task, world, data, substep)
+        if substep == 0 and untouched and not leads:
+            mj_step2(model, data)
+        else:
+            mj_step(model, data)
+
+
+@compiled
+def end(task: Any, world: Any, model: int, data: int, index: int) -> None:
+    """Compute everything that follows from the state after the physics steps, and what the step brought."""
+    mj_forward(model, data)
+    mj_getState(model, data, task.rows + 8 * task.row * 2 * index, task.row_fields)
     world.steps += 1
     look(task, world, data)
     judge(task, world, data)
@@ -565,20 +577,36 @@ def step(model: int, data: int, index: int, argument: int) -> None:
 
 
 @compiled_for_batch
-def review(model: int, data: int, index: int, argument: int) -> None:
-    """Find what is to be found in one world as it is: after a reset, or with a new goal."""
-    task = _tasks(argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[index]
-    look(task, world, data)
-    judge(task, world, data)
-    observe(task, world, data, index)
+def step(model: int, data: int, _: int, address: int) -> None:
+    """One environment step of one world; the action is in its record.
+
+    Its parts are the physics steps, and what follows from them.
+    """
+    call = _calls(address, 1)[0]
+    task = _tasks(call.argument, 1)[0]
+    world = _worlds(task.worlds, task.number)[call.index]
+    simulate(task, world, model, data, call)
+    if call.last > task.substeps:
+        end(task, world, model, data, call.index)
 
 
 @compiled_for_batch
-def perceive(model: int, data: int, index: int, argument: int) -> None:
+def review(_: int, data: int, _simulation: int, address: int) -> None:
+    """Find what is to be found in one world as it is: after a reset, or with a new goal."""
+    call = _calls(address, 1)[0]
+    task = _tasks(call.argument, 1)[0]
+    world = _worlds(task.worlds, task.number)[call.index]
+    look(task, world, data)
+    judge(task, world, data)
+    observe(task, world, data, call.index)
+
+
+@compiled_for_batch
+def perceive(_: int, data: int, _simulation: int, address: int) -> None:
     """Observe one world, whose objects and accelerations are as somebody has written them."""
-    task = _tasks(argument, 1)[0]
-    observe(task, _worlds(task.worlds, task.number)[index], data, index)
+    call = _calls(address, 1)[0]
+    task = _tasks(call.argument, 1)[0]
+    observe(task, _worlds(task.worlds, task.number)[call.index], data, call.index)
 
 
 @compiled_for_python

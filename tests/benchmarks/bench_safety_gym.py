@@ -28,9 +28,11 @@ import time
 from collections.abc import Callable
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
+from typing import Any
 
 import gymnasium
 import mujoco
+import mujoco.batch
 import numpy as np
 
 from recrl.environments.cmdp import Floats
@@ -43,6 +45,8 @@ from recrl.environments.scene import PARKED
 NUM_ENVS, MANY_ENVS = 16, 64
 STEPS = 5
 """Steps of every environment in one repeat."""
+ROLLOUT = 20
+"""The same where threads are compared: a rollout has hundreds, and only at its start do threads sleep."""
 ROUNDS, TURN_SECONDS = 10, 0.4
 """Turns of one process and of several, and the wall seconds of each."""
 # safety-gymnasium 1.0.0 on mujoco 2.3.7, environment steps/s on one core without and with resets, and bare
@@ -154,35 +158,46 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
     return np.append(np.quantile(times, 0.25, axis=1), np.quantile(reset, 0.25)), shares
 
 
+class Batch:
+    """MuJoCo's own batch, which steps simulations on its own threads and computes nothing of ours."""
+
+    def __init__(self, worlds: SafetyWorlds, num_threads: int) -> None:
+        model, rows = worlds.scene.model, worlds.simulations.rows
+        self.batch: Any = mujoco.batch.Batch(model, worlds.number, nthread=num_threads, persistent=True)
+        data, state = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
+        for index, row in enumerate(rows):
+            mujoco.mj_setState(model, data, row, state)
+            for name in ("qpos", "qvel", "mocap_pos", "mocap_quat", "qfrc_applied", "eq_active"):
+                getattr(self.batch, name)[index] = getattr(data, name)
+        self.batch.forward()
+
+    def step(self, actions: Floats) -> None:
+        self.batch.ctrl[...] = actions
+        self.batch.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_ACC)
+
+
 def thread_gains(name: str, num_envs: int, repeats: int, num_threads: int) -> tuple[float, float]:
     """Wall seconds of a step on one thread over those on several, medians over neighbouring turns.
 
     Returns:
-        our gain, and that of MuJoCo's batch, which steps the same model and computes nothing of ours: what
-        the machine's cores have to give.
+        our gain, and that of MuJoCo's batch.
     """
-    batches = [SafetyGymVectorEnv(name, num_envs, num_threads=number) for number in (1, num_threads)]
-    alone = [SafetyGymVectorEnv(name, num_envs, num_threads=number) for number in (1, num_threads)]
+    ours = [SafetyGymVectorEnv(name, num_envs, num_threads=number) for number in (1, num_threads)]
+    for environment in ours:
+        environment.reset(seed=0)
+    theirs = [Batch(ours[0].worlds, number) for number in (1, num_threads)]
+    rivals: list[Any] = [*ours, *theirs]
     generator = np.random.default_rng(0)
-    for batch in (*batches, *alone):
-        batch.reset(seed=0)
-    controls = mujoco.mjtState.mjSTATE_CTRL
     times = np.zeros((4, repeats))
     for repeat in range(repeats):
-        drawn = generator.uniform(-1.0, 1.0, (STEPS, num_envs, 2))
-        for row, batch in enumerate((*batches, *alone)):
-            simulations = batch.worlds.simulations
-            control = simulations.state(controls, (2,))
+        drawn = generator.uniform(-1.0, 1.0, (ROLLOUT, num_envs, 2))
+        for row, rival in enumerate(rivals):
             start = time.perf_counter()
             for actions in drawn:
-                if row < 2:
-                    batch.step(actions)
-                else:
-                    control[...] = actions
-                    simulations.step(SUBSTEPS)
+                rival.step(actions)
             times[row, repeat] = time.perf_counter() - start
-    ours, theirs = np.median([times[0] / times[1], times[2] / times[3]], axis=1)
-    return float(ours), float(theirs)
+    gains = np.median([times[0] / times[1], times[2] / times[3]], axis=1)
+    return float(gains[0]), float(gains[1])
 
 
 def step_in_turns(

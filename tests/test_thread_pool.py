@@ -1,0 +1,168 @@
+"""Threads do each part of the work on each simulation once and in order, whoever sleeps, fails or is gone."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+import time
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba.core import types
+
+from recrl.environments import thread_pool
+from recrl.environments.machine_code import CALL, array_at, compiled_for_batch
+from recrl.environments.safety_gym import SafetyGymVectorEnv
+from recrl.environments.safety_tasks import SAFETY_TASKS
+from recrl.environments.scene import make_scene
+from recrl.environments.simulations import Simulations
+
+NUMBER = 12
+RECORD = np.dtype([("done", np.int64), ("disorder", np.int64), ("calls", np.int64)], align=True)
+MESSAGE = np.frombuffer(b"no more of this\0", np.uint8)
+records_at, calls_at = array_at(RECORD), array_at(CALL)
+mju_error = types.ExternalFunction("mju_error", types.void(types.int64))
+_MESSAGE, _FAILS = int(MESSAGE.ctypes.data), 5
+
+
+@compiled_for_batch
+def note(_model: int, _data: int, _: int, address: int) -> None:
+    call = calls_at(address, 1)[0]
+    record = records_at(call.argument, NUMBER)[call.index]
+    if call.first != record.done or call.last <= call.first:
+        record.disorder += 1
+    record.done = call.last
+    record.calls += 1
+
+
+@compiled_for_batch
+def fail(_model: int, _data: int, _: int, address: int) -> None:
+    call = calls_at(address, 1)[0]
+    records = records_at(call.argument, NUMBER + 1)
+    records[call.index].done = call.last
+    if call.index == _FAILS and call.last > 2:
+        mju_error(records[NUMBER].done)
+
+
+@functools.cache
+def simulations(num_threads: int) -> Simulations:
+    return Simulations(make_scene(SAFETY_TASKS["PointGoal0"]).model, NUMBER, num_threads=num_threads)
+
+
+def noted(num_threads: int, parts: int, ids: list[int] | None = None) -> npt.NDArray[np.void]:
+    records = np.zeros(NUMBER, RECORD)
+    simulations(num_threads).apply(note, records.ctypes.data, ids, parts=parts)
+    return records
+
+
+@given(
+    num_threads=st.integers(1, 5),
+    parts=st.integers(1, 30),
+    ids=st.lists(st.integers(0, NUMBER - 1), min_size=1, unique=True),
+)
+@settings(deadline=None, max_examples=200)
+def test_every_part_is_done_once_and_in_order(num_threads: int, parts: int, ids: list[int]) -> None:
+    records = noted(num_threads, parts, ids)
+    assert not records["disorder"].any()
+    assert np.array_equal(records["done"], np.where(np.isin(np.arange(NUMBER), ids), parts, 0))
+    assert records["calls"].sum() >= len(ids)
+
+
+def test_only_the_last_simulations_are_done_in_parts() -> None:
+    calls = noted(2, 11)["calls"]
+    apart = thread_pool.APART * 2
+    assert (calls == 1).sum() >= NUMBER - apart
+    assert calls.sum() <= NUMBER - apart + apart * -(-11 // thread_pool.PARTS)
+    assert noted(1, 11)["calls"].tolist() == [1] * NUMBER
+
+
+def test_threads_that_sleep_are_woken() -> None:
+    busy = simulations(2)._threads
+    for _ in range(3):
+        deadline = time.monotonic() + 60.0
+        while not busy._workers["asleep"][1] and time.monotonic() < deadline:
+            time.sleep(thread_pool.AWAKE_SECONDS)
+        assert busy._workers["asleep"][1]
+        before = busy._workers["seen"][1]
+        assert noted(2, 11)["done"].tolist() == [11] * NUMBER
+        while busy._workers["seen"][1] == before and time.monotonic() < deadline:
+            time.sleep(0.001)
+        assert busy._workers["seen"][1] > before
+
+
+def test_an_error_of_mujoco_stops_one_simulation_alone(
+    tmp_path: os.PathLike[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its errors to a file where it runs
+    model = make_scene(SAFETY_TASKS["PointGoal0"]).model
+    for num_threads in (1, 2):
+        broken, records = Simulations(model, NUMBER, num_threads=num_threads), np.zeros(NUMBER + 1, RECORD)
+        records["done"][NUMBER] = _MESSAGE
+        broken.apply(fail, records.ctypes.data, parts=8)
+        others = np.arange(NUMBER) != _FAILS
+        assert (records["done"][:NUMBER][others] == 8).all()
+        assert broken.any_stopped
+        assert np.array_equal(broken.stopped, ~others)
+        broken.reset([_FAILS])
+        assert not broken.any_stopped
+
+
+def test_an_interrupted_job_is_done_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = thread_pool.begin
+
+    def interrupted(address: int, job: int) -> bool:
+        begin(address, job)
+        raise KeyboardInterrupt
+
+    records = np.zeros(NUMBER, RECORD)
+    monkeypatch.setattr(thread_pool, "begin", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        simulations(3).apply(note, records.ctypes.data, parts=11)
+    assert records["done"].tolist() == [11] * NUMBER
+
+
+def _states(num_threads: int) -> bytes:
+    environment = SafetyGymVectorEnv("CarPush2", 6, num_threads=num_threads)
+    environment.reset(seed=3)
+    for actions in np.random.default_rng(0).uniform(-1.0, 1.0, (40, 6, 2)):
+        environment.step(actions)
+    return environment.worlds.simulations.rows.tobytes()
+
+
+@pytest.mark.parametrize("num_threads", [2, 3, 8])
+def test_threads_change_no_bit(num_threads: int) -> None:
+    assert _states(num_threads) == _states(1)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+def test_a_forked_process_goes_on_without_its_threads() -> None:
+    noted(2, 11)
+    context = multiprocessing.get_context("fork")
+    child = context.Process(target=_exit_with_done)
+    child.start()
+    child.join(60.0)
+    assert child.exitcode == 11
+
+
+def _exit_with_done() -> None:
+    os._exit(int(noted(2, 11)["done"].min()))
+
+
+def test_threads_end_with_their_simulations() -> None:
+    pool = Simulations(make_scene(SAFETY_TASKS["PointGoal0"]).model, 4, num_threads=3)._threads
+    threads = pool._threads
+    assert all(thread.is_alive() for thread in threads)
+    pool.close()
+    assert not any(thread.is_alive() for thread in threads)
+
+
+def test_threads_that_lack_processors_do_not_wait_awake() -> None:
+    assert simulations(2)._threads._pool["patience"][0] > 0 or (os.cpu_count() or 1) < 2
+    many = Simulations(mujoco.MjModel.from_xml_string("<mujoco/>"), 2, num_threads=65)
+    assert many._threads._pool["patience"][0] == 0 or (os.cpu_count() or 1) >= 65
+    many._threads.close()
