@@ -3,7 +3,8 @@
 Numba compiles them when they are first imported, which takes some seconds, and keeps the result beside their
 file (where nobody may write there: in the user's cache folder, see Numba's NUMBA_CACHE_DIR) until that file
 changes. A change in another file is not noticed: what is compiled must take from elsewhere nothing but this
-module's few functions, and be told everything else, numbers too.
+module's few functions and ``CALL``, and be told everything else, numbers too. Who changes those changes the
+files that use them as well.
 
 Floating-point operations are done as written (no ``fastmath``), so that results are the same to the last bit
 wherever and beside whatever a function runs.
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import os
 import platform
 from collections.abc import Callable
 from pathlib import Path
@@ -65,6 +67,9 @@ mjb_apply: Any = types.ExternalFunction(
     "mjb_apply",
     types.int32(_ADDRESS, _ADDRESS, types.int32, _ADDRESS, _ADDRESS, types.int32),
 )
+
+_yield: Any = types.ExternalFunction("sched_yield", types.int32())
+_CAN_YIELD = os.name == "posix"
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
@@ -146,7 +151,7 @@ def swap(_context: Any, address: Any, value: Any) -> Any:
 
 @instruction
 def pause(_context: Any) -> Any:
-    """Let a moment pass, in a loop that waits for another thread; cheap for the processor's core."""
+    """Let a moment pass, in a loop that waits for another thread; on x86 cheap for the processor's core."""
 
     def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
         if platform.machine() in {"x86_64", "AMD64"}:
@@ -156,6 +161,15 @@ def pause(_context: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(), generate
+
+
+@compiled
+def relax(times: int) -> None:
+    """Let some moments pass, then let another thread have this processor if it has none."""
+    for _ in range(times):
+        pause()
+    if _CAN_YIELD:
+        _yield()
 
 
 def _number_at(builder: Any, address: Any) -> Any:

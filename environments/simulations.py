@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.machine_code import mujoco_library
-from recrl.environments.thread_pool import SIMULATION, ThreadPool
+from recrl.environments.thread_pool import SIMULATION, ThreadPool, in_cache_lines
 
 Integers = npt.NDArray[np.int32]
 Ids = Sequence[int] | npt.NDArray[np.intp] | None
@@ -105,10 +105,12 @@ class Simulations:
         self._library = _library()
         self._own_model = copy.copy(model)
         self._models = ctypes.c_void_p(self._own_model._address)
-        self._batches = [self._make_batch() for _ in range(number)]
+        self._batches: list[int] = []
         self._delete = weakref.finalize(
             self, _delete, self._library, self._batches, (self._own_model, self._models)
         )
+        for _ in range(number):
+            self._batches.append(self._make_batch())
         self._data = mujoco.MjData(model)
         self._everyone: Integers = np.arange(number, dtype=np.int32)
         size = self._library.mjb_nstate(self._batches[0])
@@ -118,7 +120,7 @@ class Simulations:
             _view(self._library.mjb_warning(batch), np.int32, (_NUM_WARNINGS, 2)) for batch in self._batches
         ]
         self.rows: Floats = np.array(self._states)
-        records = np.zeros(number, SIMULATION)
+        records = in_cache_lines(number, SIMULATION)
         records["batch"], records["state"] = self._batches, addresses
         records["row"] = [row.ctypes.data for row in self.rows]
         self._records = records
@@ -144,9 +146,15 @@ class Simulations:
             parts: of which the function's work consists; it is done on all threads if there are several. The
                 function may be called several times, each time for parts ``first`` to before ``last`` of its
                 ``CALL``.
+
+        Raises:
+            ValueError: there is no such simulation, or one is named twice; or there are no parts.
         """
-        if not self._threads.run(function.address, argument, self._chosen(ids), parts):
-            self.stopped |= self._records["failed"] != 0
+        chosen = self._chosen(ids)
+        if parts < 1:
+            raise ValueError(f"work must have at least one part, got {parts}")
+        if not self._threads.run(function.address, argument, chosen, parts):
+            self.stopped[chosen] |= self._records["failed"][chosen] != 0
             self.any_stopped = True
 
     def step(self, substeps: int, ids: Ids = None) -> None:
@@ -255,7 +263,20 @@ class Simulations:
         return int(batch)
 
     def _chosen(self, ids: Ids) -> Integers:
-        return self._everyone if ids is None else np.ascontiguousarray(ids, np.int32)
+        if ids is None:
+            return self._everyone
+        chosen = np.asarray(ids)
+        if chosen.size and (
+            chosen.dtype.kind not in "iu"
+            or chosen.min() < 0
+            or chosen.max() >= self.number
+            or len(np.unique(chosen)) < len(chosen)
+        ):
+            raise ValueError(
+                f"simulations must be different whole numbers from 0 to {self.number - 1}, "
+                f"got {chosen.tolist()}"
+            )
+        return np.ascontiguousarray(chosen, np.int32)
 
     def _check(self, index: int, failed: int) -> None:
         if failed:

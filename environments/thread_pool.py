@@ -6,8 +6,9 @@ and at the end one thread waits for the other's last simulation. Here a thread t
 awake for a moment before it sleeps, each thread begins with its own share of the simulations, the same each
 time, and the last few are done in parts, by whoever is free.
 
-All that is compiled, and runs without Python's lock. MuJoCo itself runs the functions, one simulation a call
-(``mjb_apply``), and so keeps states, counts warnings and catches errors as it always does.
+All that is compiled, and runs without Python's lock; only a thread that has to be woken needs it. MuJoCo
+itself runs the functions, one simulation a call (``mjb_apply``), and so keeps states, counts warnings and
+catches errors as it always does.
 
 The calling thread works, too, and is done when all simulations are: a thread that has not woken up by then is
 not waited for. So work is also done, if slower, where threads are gone, as after a fork.
@@ -32,6 +33,7 @@ from recrl.environments.machine_code import (
     load,
     mjb_apply,
     pause,
+    relax,
     swap,
 )
 
@@ -77,7 +79,7 @@ SIMULATION = np.dtype(
         ("call", CALL),
         ("busy", np.int64),
         ("failed", np.int64),  # whether MuJoCo raised an error in this job
-        ("room", np.int64, (6,)),  # two lines of the cache
+        ("room", np.int64, (7,)),  # two lines of the cache
     ],
     align=True,
 )
@@ -95,13 +97,14 @@ _workers = array_at(_WORKER)
 _doubles = array_at(np.float64)
 _ids = array_at(np.int32)
 _MANY = 1 << 31
+_LINE = 64
 
 
 @compiled
 def acquire(address: int) -> None:
     """Wait until nobody else has the pool's lock, and take it."""
     while swap(address + _LOCK, 1) != 0:
-        pause()
+        relax(50)
 
 
 @compiled
@@ -186,30 +189,35 @@ def run(pool: Any, index: int) -> None:
             state[place] = row[place]
     if mjb_apply(one.batch, 0, 1, pool.job.function, at + _CALL, 1) != 0:
         one.failed = 1
-        one.call.last = pool.job.parts
-    if one.call.last == pool.job.parts:
+        one.call.last = pool.job.parts  # the row stays as it was
+    elif one.call.last == pool.job.parts:
         for place in range(pool.row):
             row[place] = state[place]
 
 
 @compiled
-def work(address: int, rank: int) -> bool:
-    """Work until all simulations of the job are done, or for some time nobody needed help."""
+def work(address: int, rank: int, patience: int) -> None:
+    """Work until all simulations of the job are done, or for so many moments nobody needed help."""
     pool = _pools(address, 1)[0]
-    place, waited = -1, 0
+    place, waited, moments = -1, 0, 10
     while True:
         place = take(address, rank, place)
         if place >= 0:
             run(pool, _ids(pool.job.ids, pool.job.number)[place])
-            waited = 0
+            waited, moments = 0, 10
             continue
-        if load(address + _UNFINISHED) == 0:
-            return True
-        if waited >= pool.patience:
-            return False
-        waited += 20
-        for _ in range(20):
-            pause()
+        if load(address + _UNFINISHED) == 0 or waited > patience:
+            return
+        relax(moments)
+        waited += moments
+        moments = min(2 * moments, 200)
+
+
+@compiled
+def complete(address: int) -> None:
+    """Work until the job is done, if there is one."""
+    while load(address + _UNFINISHED) > 0:
+        work(address, 0, _MANY)
 
 
 @compiled
@@ -230,6 +238,7 @@ def set_job(address: int, job: int) -> None:
 @compiled_for_python
 def do_alone(address: int, job: int) -> bool:
     """Do a ``JOB`` on the calling thread; False if MuJoCo raised an error."""
+    complete(address)
     set_job(address, job)
     pool = _pools(address, 1)[0]
     one_at = _simulations(pool.simulations, _MANY)
@@ -244,8 +253,7 @@ def do_alone(address: int, job: int) -> bool:
 @compiled_for_python
 def begin(address: int, job: int) -> bool:
     """Let all threads that are awake begin a ``JOB``; True if some sleep."""
-    while load(address + _UNFINISHED) > 0:  # its caller was interrupted
-        work(address, 0)
+    complete(address)
     acquire(address)
     set_job(address, job)
     pool = _pools(address, 1)[0]
@@ -259,14 +267,9 @@ def begin(address: int, job: int) -> bool:
 
 
 @compiled_for_python
-def help_out(address: int, rank: int) -> bool:
-    """Work on the job; False if it is not done, and there was nothing to do for a while."""
-    return work(address, rank)
-
-
-@compiled_for_python
-def went_well(address: int) -> bool:
-    """False if MuJoCo raised an error in the last job."""
+def finish(address: int) -> bool:
+    """Work until the job is done; False if MuJoCo raised an error."""
+    complete(address)
     pool = _pools(address, 1)[0]
     one_at = _simulations(pool.simulations, _MANY)
     for index in _ids(pool.job.ids, pool.job.number):  # noqa: SIM110  # not for Numba
@@ -282,7 +285,7 @@ def serve(address: int, rank: int) -> bool:
     asleep = pool.workers + _WORKER_SIZE * rank
     worker = _workers(asleep, 1)[0]
     swap(asleep, 0)
-    while True:
+    while load(address + _STOPPING) == 0:
         looked = 0
         while load(address + _JOBS) == worker.seen:
             if looked >= pool.patience:
@@ -294,9 +297,8 @@ def serve(address: int, rank: int) -> bool:
             looked += 1
             pause()
         worker.seen = load(address + _JOBS)
-        if load(address + _STOPPING) != 0:
-            return False
-        work(address, rank)
+        work(address, rank, pool.patience)
+    return False
 
 
 @compiled_for_python
@@ -310,7 +312,7 @@ def look_around(address: int, times: int) -> bool:
 
 
 class ThreadPool:
-    """Threads that work on simulations together.
+    """Threads that work on simulations together, for one caller at a time.
 
     Args:
         simulations: records ``SIMULATION`` of all, [B], filled but for their calls; kept.
@@ -319,30 +321,24 @@ class ThreadPool:
     """
 
     def __init__(self, simulations: npt.NDArray[Any], row: int, num_threads: int) -> None:
-        # An unaligned record of atomic numbers could not be written at once.
-        memory = np.zeros(POOL.itemsize + 64, np.uint8)
-        start = -int(memory.ctypes.data) % 64
-        self._pool: npt.NDArray[Any] = memory[start : start + POOL.itemsize].view(POOL)
-        self._workers = np.zeros(num_threads, _WORKER)
         self._simulations = simulations
-        self._job = np.zeros(1, JOB)
-        self._job_address = int(self._job.ctypes.data)
+        self._pool, self._workers = in_cache_lines(1, POOL), in_cache_lines(num_threads, _WORKER)
         self._address = int(self._pool.ctypes.data)
         self._pool["simulations"], self._pool["row"] = simulations.ctypes.data, row
         self._pool["threads"], self._pool["workers"] = num_threads, self._workers.ctypes.data
-        self._num_threads = num_threads
-        self._wakes: list[threading.Semaphore] = []
-        self._threads: list[threading.Thread] = []
-        if num_threads == 1:
-            return
-        self._pool["patience"] = _patience(self._address, num_threads)
-        memory_of_threads = (self._pool, self._workers, self._simulations)
+        self._job = np.zeros(1, JOB)
+        self._job_address = int(self._job.ctypes.data)
+        self._ids: object = None
+        self._process = os.getpid()
         self._wakes = [threading.Semaphore(0) for _ in range(1, num_threads)]
+        self._stop = weakref.finalize(self, _stop, self._pool, self._wakes)
+        if num_threads > 1:
+            self._pool["patience"] = _patience(self._address, num_threads)
+        memory = (self._pool, self._workers, self._simulations)
         self._threads = [
-            threading.Thread(target=_serve, args=(self._address, rank, wake, memory_of_threads), daemon=True)
+            threading.Thread(target=_serve, args=(self._address, rank, wake, memory), daemon=True)
             for rank, wake in enumerate(self._wakes, start=1)
         ]
-        self.close = weakref.finalize(self, _stop, self._pool, self._wakes, self._threads)
         for thread in self._threads:
             thread.start()
 
@@ -353,12 +349,15 @@ class ThreadPool:
             function: its address (``machine_code.compiled_for_batch``).
             argument: an address, which it is given.
             ids: which simulations, each once.
-            parts: of which the function's work consists. It may be called for some of them at a time, in
-                their order. Work of one part is not worth a thread.
+            parts: of which the function's work consists, at least 1. It may be called for some of them at a
+                time, in their order. Work of one part is not worth a thread.
 
         Returns:
             False if MuJoCo raised an error in one of them.
         """
+        if self._process != os.getpid():
+            self._forget_threads()
+        self._ids = ids
         self._job[0] = function, argument, ids.ctypes.data, len(ids), parts
         if not self._wakes or parts == 1 or len(ids) == 1:
             return do_alone(self._address, self._job_address)
@@ -368,9 +367,34 @@ class ThreadPool:
                     if worker["asleep"]:
                         wake.release()
         finally:  # an interrupted job is done nevertheless: nobody is left in the middle of a step
-            while not help_out(self._address, 0):
-                time.sleep(0.0)
-        return went_well(self._address)
+            went_well = finish(self._address)
+        return went_well
+
+    def close(self) -> None:
+        """End the threads; what is to be done later, the caller does alone."""
+        self._stop()
+        for thread in self._threads:
+            thread.join()
+        self._threads, self._wakes = [], []
+
+    def _forget_threads(self) -> None:
+        """In a forked process there are none, and what they held at that moment is held for ever."""
+        self._stop.detach()
+        self._threads, self._wakes = [], []
+        self._pool["lock"], self._pool["unfinished"] = 0, 0
+        self._process = os.getpid()
+
+
+def in_cache_lines(number: int, kind: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Records of zeros, the first at the beginning of a line of the cache."""
+    memory = np.zeros(number * kind.itemsize + _LINE, np.uint8)
+    start = -int(memory.ctypes.data) % _LINE
+    return memory[start : start + number * kind.itemsize].view(kind)
+
+
+def num_processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _serve(address: int, rank: int, wake: threading.Semaphore, _memory: object) -> None:
@@ -378,23 +402,21 @@ def _serve(address: int, rank: int, wake: threading.Semaphore, _memory: object) 
         wake.acquire()
 
 
-def _stop(pool: npt.NDArray[Any], wakes: list[threading.Semaphore], threads: list[threading.Thread]) -> None:
+def _stop(pool: npt.NDArray[Any], wakes: list[threading.Semaphore]) -> None:
+    """Let the threads end; they own the memory that they look at, so nobody need wait for them."""
     pool["stopping"] = 1
     pool["jobs"][:, 0] += 1
     for wake in wakes:
         wake.release()
-    for thread in threads:
-        if thread.is_alive() and thread is not threading.current_thread():
-            thread.join()
 
 
 def _patience(address: int, num_threads: int) -> int:
     """How many times a thread looks for a job before it sleeps; not at all where threads lack processors."""
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if num_threads > processors:
+    if num_threads > num_processors():
         return 0
-    times = 2_000
-    look_around(address, times)
-    start = time.perf_counter()
-    look_around(address, times)
-    return int(times * AWAKE_SECONDS / (time.perf_counter() - start))
+    times, shortest = 2_000, np.inf
+    for _ in range(5):
+        start = time.perf_counter()
+        look_around(address, times)
+        shortest = min(shortest, time.perf_counter() - start)
+    return int(times * AWAKE_SECONDS / shortest)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import os
+import signal
 import time
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,7 +18,7 @@ from hypothesis import strategies as st
 from numba.core import types
 
 from recrl.environments import thread_pool
-from recrl.environments.machine_code import CALL, array_at, compiled_for_batch
+from recrl.environments.machine_code import CALL, array_at, compiled_for_batch, mj_step
 from recrl.environments.safety_gym import SafetyGymVectorEnv
 from recrl.environments.safety_tasks import SAFETY_TASKS
 from recrl.environments.scene import make_scene
@@ -38,6 +40,17 @@ def note(_model: int, _data: int, _: int, address: int) -> None:
         record.disorder += 1
     record.done = call.last
     record.calls += 1
+
+
+@compiled_for_batch
+def linger(model: int, data: int, _: int, address: int) -> None:
+    call = calls_at(address, 1)[0]
+    record = records_at(call.argument, NUMBER)[call.index]
+    if call.first != record.done:
+        record.disorder += 1
+    for _step in range(10 * (call.index + 1)):
+        mj_step(model, data)
+    record.done = call.last
 
 
 @compiled_for_batch
@@ -112,6 +125,63 @@ def test_an_error_of_mujoco_stops_one_simulation_alone(
         assert not broken.any_stopped
 
 
+def test_a_failure_is_of_the_simulations_of_its_job(
+    tmp_path: os.PathLike[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    model = make_scene(SAFETY_TASKS["PointGoal0"]).model
+    broken, records = Simulations(model, NUMBER, num_threads=2), np.zeros(NUMBER + 1, RECORD)
+    records["done"][NUMBER] = _MESSAGE
+    before = broken.rows.copy()
+    broken.apply(fail, records.ctypes.data, [_FAILS, 6], parts=8)
+    assert np.array_equal(broken.rows, before)
+    broken.reset([_FAILS])
+    monkeypatch.setattr(broken._threads, "run", lambda *_: False)
+    broken.apply(note, records.ctypes.data, [2, 3], parts=8)
+    assert not broken.stopped.any()
+
+
+@pytest.mark.parametrize("ids", [[3, 3, 4], [-1], [NUMBER], [True] * NUMBER, [0.5]])
+def test_simulations_that_are_not_there_or_named_twice_are_refused(ids: list[Any]) -> None:
+    with pytest.raises(ValueError, match=r"must be different whole numbers from 0 to 11, got \["):
+        noted(2, 4, ids)
+
+
+def test_work_without_parts_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one part, got 0"):
+        noted(2, 0)
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there is no timer")
+def test_no_signal_leaves_a_job_undone() -> None:
+    """Signals come while the caller works and waits, with more threads than there are processors, too."""
+    interrupts = 0
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for num_threads in (2, 6):
+            busy = Simulations(make_scene(SAFETY_TASKS["PointGoal0"]).model, NUMBER, num_threads=num_threads)
+            for _ in range(40):
+                records = np.zeros(NUMBER, RECORD)
+                try:
+                    signal.setitimer(signal.ITIMER_REAL, 0.002)
+                    while True:
+                        records[...] = 0
+                        busy.apply(linger, records.ctypes.data, parts=6)
+                except KeyboardInterrupt:
+                    interrupts += 1
+                assert busy._threads._pool["unfinished"][0, 0] == 0
+                assert set(records["done"]) <= {0, 6}
+                assert not records["disorder"].any()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, previous)
+    assert interrupts == 80
+
+
 def test_an_interrupted_job_is_done_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     begin = thread_pool.begin
 
@@ -140,6 +210,7 @@ def test_threads_change_no_bit(num_threads: int) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_forked_process_goes_on_without_its_threads() -> None:
     noted(2, 11)
     context = multiprocessing.get_context("fork")
@@ -162,7 +233,9 @@ def test_threads_end_with_their_simulations() -> None:
 
 
 def test_threads_that_lack_processors_do_not_wait_awake() -> None:
-    assert simulations(2)._threads._pool["patience"][0] > 0 or (os.cpu_count() or 1) < 2
-    many = Simulations(mujoco.MjModel.from_xml_string("<mujoco/>"), 2, num_threads=65)
-    assert many._threads._pool["patience"][0] == 0 or (os.cpu_count() or 1) >= 65
-    many._threads.close()
+    processors = thread_pool.num_processors()
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    for num_threads, waits in ((processors, True), (processors + 1, False)):
+        pool = Simulations(model, 2, num_threads=num_threads)._threads
+        assert bool(pool._pool["patience"][0] > 0) == (waits and num_threads > 1)
+        pool.close()
