@@ -16,6 +16,7 @@ not waited for. So work is also done, if slower, where threads are gone, as afte
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -330,7 +331,7 @@ class ThreadPool:
         self._job_address = int(self._job.ctypes.data)
         self._ids: object = None
         self._process = os.getpid()
-        self._wakes = [threading.Semaphore(0) for _ in range(1, num_threads)]
+        self._wakes = [_asleep() for _ in range(1, num_threads)]
         self._stop = weakref.finalize(self, _stop, self._pool, self._wakes)
         if num_threads > 1:
             self._pool["patience"] = _patience(self._address, num_threads)
@@ -365,7 +366,7 @@ class ThreadPool:
             if begin(self._address, self._job_address):
                 for wake, worker in zip(self._wakes, self._workers[1:], strict=True):
                     if worker["asleep"]:
-                        wake.release()
+                        _wake(wake)
         finally:  # an interrupted job is done nevertheless: nobody is left in the middle of a step
             went_well = finish(self._address)
         return went_well
@@ -397,16 +398,28 @@ def num_processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _serve(address: int, rank: int, wake: threading.Semaphore, _memory: object) -> None:
+def _serve(address: int, rank: int, wake: threading.Lock, _memory: object) -> None:
     while serve(address, rank):
         wake.acquire()
 
 
-def _stop(pool: npt.NDArray[Any], wakes: list[threading.Semaphore]) -> None:
+def _stop(pool: npt.NDArray[Any], wakes: list[threading.Lock]) -> None:
     """Let the threads end; they own the memory that they look at, so nobody need wait for them."""
     pool["stopping"] = 1
     pool["jobs"][:, 0] += 1
     for wake in wakes:
+        _wake(wake)
+
+
+def _asleep() -> threading.Lock:
+    """A lock that a thread without work waits for: unlike Python's semaphores no signal can break it."""
+    lock = threading.Lock()
+    lock.acquire()
+    return lock
+
+
+def _wake(wake: threading.Lock) -> None:
+    with contextlib.suppress(RuntimeError):  # it is awake already
         wake.release()
 
 
