@@ -1,10 +1,9 @@
 """Work on many simulations, shared out to threads so that none waits long for another.
 
-MuJoCo's own pool gives each thread the next simulation in turn. With 16 simulations on two threads that costs
-a tenth of the time: threads that sleep begin late, a simulation wanders from one core's cache to the other's,
-and at the end one thread waits for the other's last simulation. Here a thread that has nothing to do stays
-awake for a moment before it sleeps, each thread begins with its own share of the simulations, the same each
-time, and the last few are done in parts, by whoever is free.
+MuJoCo's own pool loses some hundredths to a tenth of the time with 16 simulations on two threads: threads
+that sleep begin late, and at the end one thread waits for the other's last simulation. Here a thread without
+work stays awake for a moment before it sleeps, each begins with its own share of the simulations, the same
+each time, and the last few are done in parts, by whoever is free.
 
 All that is compiled, and runs without Python's lock; only a thread that has to be woken needs it. MuJoCo
 itself runs the functions, one simulation a call (``mjb_apply``), and so keeps states, counts warnings and
@@ -57,7 +56,7 @@ JOB = np.dtype(
 )
 POOL = np.dtype(
     [
-        # Each of these three has a line of the cache of its own, since threads look at it all the time.
+        # Each of these three fills a line of the cache by itself, since threads look at it all the time.
         ("lock", np.int64, (8,)),
         ("jobs", np.int64, (8,)),  # begun so far
         ("unfinished", np.int64, (8,)),  # simulations of this job
