@@ -150,6 +150,36 @@ def swap(_context: Any, address: Any, value: Any) -> Any:
 
 
 @instruction
+def add(_context: Any, address: Any, value: Any) -> Any:
+    """Add to the whole number at an address, for other threads to see, as all that was written before it.
+
+    Returns:
+        what was there.
+    """
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.atomic_rmw("add", _number_at(builder, arguments[0]), arguments[1], "seq_cst")
+
+    return types.int64(address, value), generate
+
+
+@instruction
+def replace(_context: Any, address: Any, found: Any, value: Any) -> Any:
+    """Write a whole number at an address, as ``swap`` does, if what was found there is still there.
+
+    Returns:
+        whether it was.
+    """
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        place = _number_at(builder, arguments[0])
+        result = builder.cmpxchg(place, arguments[1], arguments[2], "seq_cst", "seq_cst")
+        return builder.extract_value(result, 1)
+
+    return types.boolean(address, found, value), generate
+
+
+@instruction
 def pause(_context: Any) -> Any:
     """Let a moment pass, in a loop that waits for another thread; on x86 cheap for the processor's core."""
 
@@ -164,10 +194,8 @@ def pause(_context: Any) -> Any:
 
 
 @compiled
-def relax(times: int) -> None:
-    """Let some moments pass, then let another thread have this processor if it has none."""
-    for _ in range(times):
-        pause()
+def step_aside() -> None:
+    """Let another thread have this processor if it has none."""
     if _CAN_YIELD:
         _yield()
 

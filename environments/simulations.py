@@ -112,7 +112,8 @@ class Simulations:
         for _ in range(number):
             self._batches.append(self._make_batch())
         self._data = mujoco.MjData(model)
-        self._everyone: Integers = np.arange(number, dtype=np.int32)
+        self._everyone: Integers = in_cache_lines(number, np.int32)
+        self._everyone[:] = np.arange(number)
         size = self._library.mjb_nstate(self._batches[0])
         addresses = [self._library.mjb_state(batch) for batch in self._batches]
         self._states = [_view(address, np.float64, (size,)) for address in addresses]

@@ -31,12 +31,13 @@ from recrl.environments.safety_tasks import (
 )
 from recrl.environments.scene import Scene
 from recrl.environments.simulations import BAD_STATES, ROW
+from recrl.environments.thread_pool import in_cache_lines
 from recrl.environments.world_step import (
-    FLAGS,
     KINDS,
     MAX_BODIES,
     MAX_GEOMS,
     MAX_POINTS,
+    OUTCOME,
     SENSORS,
     TASK,
     TERMS,
@@ -74,14 +75,16 @@ class Memory:
 
     Attributes:
         worlds: records ``WORLD``, [B].
-        results: rewards, costs and the indicators of each cost term, [2 + terms, B].
-        flags: ``FLAGS``, [len(FLAGS), B].
+        outcomes: records ``OUTCOME``, [B].
+        results: of them rewards, costs and the indicators of each cost term, [2 + terms, B].
+        flags: of them ``FLAGS``, [len(FLAGS), B].
         observations: [B, size].
         rows: room for two states of each world, [B, 2, row].
         course: how gremlins move, if there are any.
     """
 
     worlds: npt.NDArray[Any]
+    outcomes: npt.NDArray[Any]
     results: Floats
     flags: npt.NDArray[np.bool_]
     observations: npt.NDArray[np.float32]
@@ -92,10 +95,12 @@ class Memory:
 def allocate(scene: Scene, number: int) -> Memory:
     """Memory for so many worlds of a scene."""
     row = mujoco.mj_stateSize(scene.model, ROW)
+    outcomes = in_cache_lines(number, OUTCOME)
     return Memory(
-        worlds=np.zeros(number, WORLD),
-        results=np.zeros((2 + len(scene.task.cost_terms), number)),
-        flags=np.zeros((len(FLAGS), number), np.bool_),
+        worlds=in_cache_lines(number, WORLD),
+        outcomes=outcomes,
+        results=outcomes["numbers"].T[: 2 + len(scene.task.cost_terms)],
+        flags=outcomes["flags"].view(np.bool_).T,
         observations=np.zeros((number, scene.task.observation_size), np.float32),
         rows=np.full((number, 2, row), np.nan),
         course=gremlin_course(scene.task) if scene.task.gremlins.number else None,
@@ -104,9 +109,9 @@ def allocate(scene: Scene, number: int) -> Memory:
 
 def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
     """The record ``TASK`` of a scene, an array [1]; it is of use as long as the memory lives."""
-    record = np.zeros(1, TASK)
+    record = in_cache_lines(1, TASK)
     one = record[0]
-    for name in ("worlds", "results", "flags", "observations", "rows"):
+    for name in ("worlds", "outcomes", "observations", "rows"):
         one[name] = getattr(memory, name).ctypes.data
     one["number"], one["row"], one["row_fields"] = len(memory.worlds), memory.rows.shape[2], ROW
     one["horizon"] = horizon

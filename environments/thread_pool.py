@@ -2,8 +2,9 @@
 
 MuJoCo's own pool loses some hundredths to a tenth of the time with 16 simulations on two threads: threads
 that sleep begin late, and at the end one thread waits for the other's last simulation. Here a thread without
-work stays awake for a moment before it sleeps, each begins with its own share of the simulations, the same
-each time, and the last few are done in parts, by whoever is free.
+work stays awake for a moment before it sleeps, and each begins with its own share of the simulations, the
+same each time. The last of each share are left to the end: who is done with all others first does them in
+parts, in turns, until everybody is there. Then there is one for each thread, and of each the same is left.
 
 All that is compiled, and runs without Python's lock; only a thread that has to be woken needs it. MuJoCo
 itself runs the functions, one simulation a call (``mjb_apply``), and so keeps states, counts warnings and
@@ -11,6 +12,10 @@ catches errors as it always does.
 
 The calling thread works, too, and is done when all simulations are: a thread that has not woken up by then is
 not waited for. So work is also done, if slower, where threads are gone, as after a fork.
+
+What one thread has written another's core has to fetch, which takes it as long as hundreds of its own
+operations. So threads share as few lines of the cache as they can: each takes simulations of its share
+without a word to the others, says only at the end how many it has done, and writes where no other looks.
 """
 
 from __future__ import annotations
@@ -27,22 +32,28 @@ import numpy.typing as npt
 
 from recrl.environments.machine_code import (
     CALL,
+    add,
     array_at,
     compiled,
     compiled_for_python,
     load,
     mjb_apply,
     pause,
-    relax,
+    replace,
+    step_aside,
     swap,
 )
 
 AWAKE_SECONDS = 5e-3
 """How long a thread without work stays awake: longer than most policies take to choose the next actions."""
-APART = 2
-"""The last simulations, this many a thread, are done in parts."""
+APART = 1
+"""The last simulations of a share, this many, are done in parts."""
 PARTS = 2
-"""So many parts at a time."""
+"""So many parts at a time, until all threads are there."""
+MOMENTS = 20
+"""Between two looks for something to do; one takes some hundredths of a microsecond."""
+ALONE_FOR = 400
+"""Moments for which a thread without work keeps its processor, where there is one for each."""
 
 JOB = np.dtype(
     [
@@ -67,7 +78,8 @@ POOL = np.dtype(
         ("patience", np.int64),  # looks at ``jobs`` before a thread sleeps
         ("stopping", np.int64),
         ("job", JOB),
-        ("untouched", np.int64),  # simulations of this job that nobody has begun
+        ("arrived", np.int64),  # threads that have only parts left to do
+        ("failures", np.int64),  # whether MuJoCo raised an error in this job
     ],
     align=True,
 )
@@ -78,16 +90,26 @@ SIMULATION = np.dtype(
         ("row", np.int64),  # address of that which Python sees
         ("call", CALL),
         ("busy", np.int64),
-        ("failed", np.int64),  # whether MuJoCo raised an error in this job
+        ("failed", np.int64),  # whether MuJoCo raised an error when it was last worked on
         ("room", np.int64, (7,)),  # two lines of the cache
     ],
     align=True,
 )
-_WORKER = np.dtype([("asleep", np.int64), ("seen", np.int64), ("room", np.int64, (6,))], align=True)
+_WORKER = np.dtype(
+    [
+        ("asleep", np.int64),
+        ("seen", np.int64),
+        ("room", np.int64, (6,)),
+        # The job, _PLACES times, plus how many of its share are to be begun that are not done in parts.
+        ("whole", np.int64, (8,)),
+    ],
+    align=True,
+)
 _LOCK, _JOBS = int(POOL.fields["lock"][1]), int(POOL.fields["jobs"][1])  # type: ignore[index]
 _UNFINISHED = int(POOL.fields["unfinished"][1])  # type: ignore[index]
 _STOPPING = int(POOL.fields["stopping"][1])  # type: ignore[index]
 _CALL = int(SIMULATION.fields["call"][1])  # type: ignore[index]
+_WHOLE = int(_WORKER.fields["whole"][1])  # type: ignore[index]
 _SIZE, _WORKER_SIZE = SIMULATION.itemsize, _WORKER.itemsize
 
 _pools = array_at(POOL)
@@ -97,6 +119,8 @@ _workers = array_at(_WORKER)
 _doubles = array_at(np.float64)
 _ids = array_at(np.int32)
 _MANY = 1 << 31
+_PLACES = 1 << 24
+_ARRIVES = -2
 _LINE = 64
 
 
@@ -104,7 +128,9 @@ _LINE = 64
 def acquire(address: int) -> None:
     """Wait until nobody else has the pool's lock, and take it."""
     while swap(address + _LOCK, 1) != 0:
-        relax(50)
+        for _ in range(MOMENTS):
+            pause()
+        step_aside()
 
 
 @compiled
@@ -114,47 +140,69 @@ def release(address: int) -> None:
 
 
 @compiled
-def choose(pool: Any, one_at: Any, rank: int, mine: int) -> int:
-    """The place among the job's ids of what this thread does next, -1 for nothing; the lock is held.
+def share(pool: Any, rank: int) -> tuple[int, int, int]:
+    """Of a thread's share of the job's ids the first place, the first that is done in parts, and the end."""
+    begins: int = rank * pool.job.number // pool.threads
+    ends: int = (rank + 1) * pool.job.number // pool.threads
+    return begins, max(begins, ends - APART), ends
 
-    While there are many that nobody has touched: the next of the thread's own share, else the last of the
-    share before it. Then: the one with the most parts left, but rather the one the thread has just worked on,
-    and of equals the first from the thread's own share onwards.
+
+@compiled
+def claim(pool: Any, job: int, rank: int) -> int:
+    """Take the next of a thread's share that is not done in parts: its place, -1 if there is none.
+
+    While it is not done, the job is not, and what the pool says of it remains.
+
+    Args:
+        pool: the ``POOL``.
+        job: its number; nothing is taken of another.
+        rank: whose share it is.
+    """
+    whole = pool.workers + _WORKER_SIZE * rank + _WHOLE
+    while True:
+        found = load(whole)
+        left = found % _PLACES
+        if left == 0 or found // _PLACES != job:
+            return -1
+        if replace(whole, found, found - 1):
+            place: int = share(pool, rank)[1] - left
+            return place
+
+
+@compiled
+def choose(pool: Any, one_at: Any, rank: int) -> int:
+    """Of what is done in parts the place of what this thread does next, -1 for nothing; the lock is held.
+
+    The one with the most parts left, of equals the first from the thread's own share onwards.
 
     Args:
         pool: the ``POOL``.
         one_at: all ``SIMULATION``s.
         rank: the thread's, 0 to threads - 1.
-        mine: the place of what it has just worked on, or -1.
     """
-    number: int = pool.job.number
-    ids, parts, threads = _ids(pool.job.ids, number), pool.job.parts, pool.threads
-    begins: int = rank * number // threads
-    ends: int = (rank + 1) * number // threads
-    if pool.untouched > APART * threads:
-        for place in range(begins, ends):
-            if one_at[ids[place]].call.last == 0:
-                return place
-        for step in range(1, number + 1):
-            place = (begins - step) % number
-            if one_at[ids[place]].call.last == 0:
-                return place
+    ids, parts, threads = _ids(pool.job.ids, pool.job.number), pool.job.parts, pool.threads
     best: int = -1
     most: int = 0
-    for step in range(number):
-        place = (begins + step) % number
-        one = one_at[ids[place]]
-        left = parts - one.call.last
-        if one.busy == 0 and left > most:
-            best, most = place, left
-    if mine >= 0 and parts - one_at[ids[mine]].call.last > max(0, most - PARTS - 1):
-        return mine
+    for step in range(threads):
+        _, begins, ends = share(pool, (rank + step) % threads)
+        for place in range(begins, ends):
+            one = one_at[ids[place]]
+            rest = parts - one.call.last
+            if one.busy == 0 and rest > most:
+                best, most = place, rest
     return best
 
 
 @compiled
-def take(address: int, rank: int, mine: int) -> int:
-    """Hand in what this thread has done, and take something to do: its place, or -1 for nothing."""
+def take(address: int, job: int, rank: int, mine: int) -> int:
+    """Hand in the parts that this thread has done, and take others to do: the place, or -1 for nothing.
+
+    Args:
+        address: of the ``POOL``.
+        job: its number; nothing is taken of another.
+        rank: the thread's.
+        mine: the place of what it has done parts of, -1 for nothing, or ``_ARRIVES``.
+    """
     pool = _pools(address, 1)[0]
     acquire(address)
     one_at, ids = _simulations(pool.simulations, _MANY), _ids(pool.job.ids, pool.job.number)
@@ -162,17 +210,17 @@ def take(address: int, rank: int, mine: int) -> int:
         done = one_at[ids[mine]]
         done.busy = 0
         if done.call.last == pool.job.parts:
-            swap(address + _UNFINISHED, load(address + _UNFINISHED) - 1)
+            add(address + _UNFINISHED, -1)
     place = -1
-    if load(address + _UNFINISHED) > 0:
-        whole = pool.untouched > APART * pool.threads
-        place = choose(pool, one_at, rank, mine)
+    if load(address + _UNFINISHED) > 0 and load(address + _JOBS) == job:
+        if mine == _ARRIVES:
+            pool.arrived += 1
+        place = choose(pool, one_at, rank)
         if place >= 0:
             one = one_at[ids[place]]
-            if one.call.last == 0:
-                pool.untouched -= 1
             one.call.first = one.call.last
-            one.call.last = pool.job.parts if whole else min(pool.job.parts, one.call.first + PARTS)
+            alone = pool.arrived < pool.threads
+            one.call.last = min(pool.job.parts, one.call.first + PARTS) if alone else pool.job.parts
             one.busy = 1
     release(address)
     return place
@@ -187,8 +235,9 @@ def run(pool: Any, index: int) -> None:
     if one.call.first == 0:
         for place in range(pool.row):
             state[place] = row[place]
+        one.failed = 0
     if mjb_apply(one.batch, 0, 1, pool.job.function, at + _CALL, 1) != 0:
-        one.failed = 1
+        one.failed = pool.failures = 1
         one.call.last = pool.job.parts  # the row stays as it was
     elif one.call.last == pool.job.parts:
         for place in range(pool.row):
@@ -196,85 +245,107 @@ def run(pool: Any, index: int) -> None:
 
 
 @compiled
-def work(address: int, rank: int, patience: int) -> None:
-    """Work until all simulations of the job are done, or for so many moments nobody needed help."""
+def run_whole(pool: Any, index: int) -> None:
+    """Do the job on one simulation."""
+    one = _simulations(pool.simulations, _MANY)[index]
+    one.call.index, one.call.argument = index, pool.job.argument
+    one.call.first, one.call.last = 0, pool.job.parts
+    run(pool, index)
+
+
+@compiled
+def work(address: int, job: int, rank: int, patience: int) -> None:
+    """Work until all simulations of a job are done, or for so many moments nobody needed help."""
     pool = _pools(address, 1)[0]
-    place, waited, moments = -1, 0, 10
+    done = 0
+    for step in range(pool.threads):
+        whose = (rank + step) % pool.threads
+        place = claim(pool, job, whose)
+        while place >= 0:
+            run_whole(pool, _ids(pool.job.ids, pool.job.number)[place])
+            done += 1
+            place = claim(pool, job, whose)
+    if done > 0:
+        add(address + _UNFINISHED, -done)
+    place, waited = _ARRIVES, 0
     while True:
-        place = take(address, rank, place)
+        place = take(address, job, rank, place)
         if place >= 0:
             run(pool, _ids(pool.job.ids, pool.job.number)[place])
-            waited, moments = 0, 10
+            waited = 0
             continue
-        if load(address + _UNFINISHED) == 0 or waited > patience:
+        if waited > patience:
             return
-        relax(moments)
-        waited += moments
-        moments = min(2 * moments, 200)
+        for _ in range(MOMENTS):
+            if load(address + _UNFINISHED) == 0 or load(address + _JOBS) != job:
+                return
+            pause()
+        waited += MOMENTS
+        if waited > min(ALONE_FOR, pool.patience):
+            step_aside()
 
 
 @compiled
 def complete(address: int) -> None:
     """Work until the job is done, if there is one."""
     while load(address + _UNFINISHED) > 0:
-        work(address, 0, _MANY)
+        work(address, load(address + _JOBS), 0, _MANY)
 
 
 @compiled
-def set_job(address: int, job: int) -> None:
-    """Write down what is to be done; the lock is held or nobody else is there."""
-    pool, wanted = _pools(address, 1)[0], _jobs(job, 1)[0]
+def set_job(pool: Any, wanted: Any) -> None:
+    """Write down what is to be done; nobody works."""
     pool.job.function, pool.job.argument = wanted.function, wanted.argument
     pool.job.ids, pool.job.number, pool.job.parts = wanted.ids, wanted.number, wanted.parts
-    pool.untouched = wanted.number
-    one_at = _simulations(pool.simulations, _MANY)
-    for index in _ids(wanted.ids, wanted.number):
-        one = one_at[index]
-        one.busy = one.failed = 0
-        one.call.index, one.call.argument = index, wanted.argument
-        one.call.first = one.call.last = 0
+    pool.failures = 0
 
 
 @compiled_for_python
 def do_alone(address: int, job: int) -> bool:
-    """Do a ``JOB`` on the calling thread; False if MuJoCo raised an error."""
+    """Do a ``JOB`` on the calling thread."""
     complete(address)
-    set_job(address, job)
     pool = _pools(address, 1)[0]
-    one_at = _simulations(pool.simulations, _MANY)
-    well = True
+    set_job(pool, _jobs(job, 1)[0])
     for index in _ids(pool.job.ids, pool.job.number):
-        one_at[index].call.last = pool.job.parts
-        run(pool, index)
-        well = well and one_at[index].failed == 0
-    return well
+        run_whole(pool, index)
+    return True
 
 
 @compiled_for_python
 def begin(address: int, job: int) -> bool:
-    """Let all threads that are awake begin a ``JOB``; True if some sleep."""
+    """Do a ``JOB`` with all threads, or, if some sleep, only begin it with those that are awake.
+
+    Returns:
+        whether it is only begun.
+    """
     complete(address)
     acquire(address)
-    set_job(address, job)
     pool = _pools(address, 1)[0]
+    set_job(pool, _jobs(job, 1)[0])
+    one_at, ids = _simulations(pool.simulations, _MANY), _ids(pool.job.ids, pool.job.number)
+    number = load(address + _JOBS) + 1
+    for rank in range(pool.threads):
+        begins, apart, ends = share(pool, rank)
+        for place in range(apart, ends):
+            one = one_at[ids[place]]
+            one.call.index, one.call.argument = ids[place], pool.job.argument
+            one.busy = one.call.first = one.call.last = 0
+        swap(pool.workers + _WORKER_SIZE * rank + _WHOLE, number * _PLACES + apart - begins)
+    pool.arrived = 0
     swap(address + _UNFINISHED, pool.job.number)
+    swap(address + _JOBS, number)
     release(address)
-    swap(address + _JOBS, load(address + _JOBS) + 1)
-    for rank in range(1, pool.threads):  # noqa: SIM110  # not for Numba
+    for rank in range(1, pool.threads):
         if load(pool.workers + _WORKER_SIZE * rank) != 0:
             return True
+    complete(address)
     return False
 
 
 @compiled_for_python
 def finish(address: int) -> bool:
-    """Work until the job is done; False if MuJoCo raised an error."""
+    """Work until the job is done."""
     complete(address)
-    pool = _pools(address, 1)[0]
-    one_at = _simulations(pool.simulations, _MANY)
-    for index in _ids(pool.job.ids, pool.job.number):  # noqa: SIM110  # not for Numba
-        if one_at[index].failed != 0:
-            return False
     return True
 
 
@@ -297,7 +368,7 @@ def serve(address: int, rank: int) -> bool:
             looked += 1
             pause()
         worker.seen = load(address + _JOBS)
-        work(address, rank, pool.patience)
+        work(address, worker.seen, rank, pool.patience)
     return False
 
 
@@ -328,7 +399,8 @@ class ThreadPool:
         self._pool["threads"], self._pool["workers"] = num_threads, self._workers.ctypes.data
         self._job = np.zeros(1, JOB)
         self._job_address = int(self._job.ctypes.data)
-        self._ids: object = None
+        self._ids, self._asked = np.zeros(0, np.int32), (0, 0, 0)
+        self._failures, self._unfinished = self._pool["failures"], self._pool["unfinished"][:, 0]
         self._process = os.getpid()
         self._wakes = [_asleep() for _ in range(1, num_threads)]
         self._stop = weakref.finalize(self, _stop, self._pool, self._wakes)
@@ -357,18 +429,22 @@ class ThreadPool:
         """
         if self._process != os.getpid():
             self._forget_threads()
-        self._ids = ids
-        self._job[0] = function, argument, ids.ctypes.data, len(ids), parts
+        # NumPy takes as long to find an address as all else here together.
+        if ids is not self._ids or (function, argument, parts) != self._asked:
+            self._ids, self._asked = ids, (function, argument, parts)
+            self._job[0] = function, argument, ids.ctypes.data, len(ids), parts
         if not self._wakes or parts == 1 or len(ids) == 1:
-            return do_alone(self._address, self._job_address)
+            do_alone(self._address, self._job_address)
+            return not self._failures[0]
         try:
             if begin(self._address, self._job_address):
                 for wake, worker in zip(self._wakes, self._workers[1:], strict=True):
                     if worker["asleep"]:
                         _wake(wake)
         finally:  # an interrupted job is done nevertheless: nobody is left in the middle of a step
-            went_well = finish(self._address)
-        return went_well
+            if self._unfinished[0]:
+                finish(self._address)
+        return not self._failures[0]
 
     def close(self) -> None:
         """End the threads; what is to be done later, the caller does alone."""
@@ -385,9 +461,10 @@ class ThreadPool:
         self._process = os.getpid()
 
 
-def in_cache_lines(number: int, kind: np.dtype[Any]) -> npt.NDArray[Any]:
-    """Records of zeros, the first at the beginning of a line of the cache."""
-    memory = np.zeros(number * kind.itemsize + _LINE, np.uint8)
+def in_cache_lines(number: int, kind: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Records of zeros, one after the other from the beginning of a line of the cache that is only theirs."""
+    kind = np.dtype(kind)
+    memory = np.zeros(number * kind.itemsize + 2 * _LINE, np.uint8)
     start = -int(memory.ctypes.data) % _LINE
     return memory[start : start + number * kind.itemsize].view(kind)
 

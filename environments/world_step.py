@@ -41,8 +41,7 @@ SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer", "ballquat_rea
 """What a robot may feel, in the order of ``TASK``'s field of it."""
 ACCELEROMETER, VELOCIMETER, GYRO, MAGNETOMETER, BALL, SPIN = range(6)
 FLAGS = ("goal_met", "broken", "terminated", "truncated")
-"""What a step brings besides rewards, costs and the indicators of the cost terms, for all worlds side by
-side."""
+"""What a step brings besides rewards, costs and the indicators of the cost terms."""
 MAX_POINTS, MAX_BODIES, MAX_GEOMS, MAX_GREMLINS, MAX_TERMS = 24, 24, 64, 6, 3
 """Room for P objects, for bodies and shapes of a model, and so on."""
 NO_GREMLIN = -1
@@ -54,8 +53,7 @@ TASK = np.dtype(
     [
         ("worlds", np.int64),  # address of the worlds' records
         ("number", np.int64),
-        ("results", np.int64),  # addresses of what the last step brought, [2 + num_terms, B] and
-        ("flags", np.int64),  # [len(FLAGS), B]
+        ("outcomes", np.int64),  # address of what the last step brought, [B] OUTCOMEs
         ("observations", np.int64),  # address of [B, observed]
         ("rows", np.int64),  # address of [B, 2, row]: the state that the last step left, and room for another
         ("row", np.int64),  # numbers in a state
@@ -148,9 +146,19 @@ WORLD = np.dtype(
     align=True,
 )
 
+OUTCOME = np.dtype(
+    [
+        ("numbers", np.float64, (2 + MAX_TERMS,)),  # reward, cost, the indicator of each cost term
+        ("flags", np.uint8, (len(FLAGS),)),  # 0 or 1
+        ("room", np.uint8, (20,)),  # a line of the cache: threads write to neighbours at the same time
+    ],
+    align=True,
+)
+
 _calls = array_at(CALL)
 _tasks = array_at(TASK)
 _worlds = array_at(WORLD)
+_outcomes = array_at(OUTCOME)
 _doubles = array_at(np.float64)
 _integers = array_at(np.int32)
 _floats = array_at(np.float32)
@@ -515,22 +523,20 @@ def same(one: Any, other: Any) -> bool:
 @compiled
 def report(task: Any, world: Any, index: int) -> None:
     """Write what this step brought; the reward is the progress in metres, within bounds."""
-    number = task.number
-    results = _doubles(task.results, (2 + task.num_terms) * number)
-    flags = _bytes(task.flags, len(FLAGS) * number)
+    outcome = _outcomes(task.outcomes, task.number)[index]
     progress = world.distances[0] - world.measured[0]
     if task.is_push:
         progress += world.distances[1] - world.measured[1]
     cost = 0.0
     for column in range(task.num_terms):
-        results[(2 + column) * number + index] = world.terms[column]
+        outcome.numbers[2 + column] = world.terms[column]
         cost = max(cost, world.terms[column])
-    results[index] = min(max(progress, -task.reward_bound), task.reward_bound)
-    results[number + index] = cost
-    flags[index] = world.goal_met
-    flags[number + index] = world.broken
-    flags[2 * number + index] = world.broken  # what else ends an episode is not known here
-    flags[3 * number + index] = world.steps >= task.horizon
+    outcome.numbers[0] = min(max(progress, -task.reward_bound), task.reward_bound)
+    outcome.numbers[1] = cost
+    outcome.flags[0] = world.goal_met
+    outcome.flags[1] = world.broken
+    outcome.flags[2] = world.broken  # what else ends an episode is not known here
+    outcome.flags[3] = world.steps >= task.horizon
 
 
 @compiled

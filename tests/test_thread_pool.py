@@ -94,6 +94,20 @@ def test_only_the_last_simulations_are_done_in_parts() -> None:
     assert noted(1, 11)["calls"].tolist() == [1] * NUMBER
 
 
+def test_nothing_is_taken_of_another_job() -> None:
+    """A thread that was held up between two looks finds that there is a new job, and leaves it alone."""
+    noted(2, 11)
+    busy = simulations(2)._threads
+    pool, job = busy._pool[0], int(busy._pool["jobs"][0, 0])
+    assert [thread_pool.claim(pool, job, rank) for rank in (0, 1)] == [-1, -1]
+    busy._workers["whole"][1, 0] = job * thread_pool._PLACES + 2
+    assert thread_pool.claim(pool, job + 1, 1) == thread_pool.claim(pool, job - 1, 1) == -1
+    begins, apart, ends = thread_pool.share(pool, 1)
+    assert (begins, apart, ends) == (6, 12 - thread_pool.APART, 12)
+    assert [thread_pool.claim(pool, job, 1) for _ in range(3)] == [apart - 2, apart - 1, -1]
+    assert thread_pool.take(busy._address, job, 0, -1) == -1
+
+
 def test_threads_that_sleep_are_woken() -> None:
     busy = simulations(2)._threads
     for _ in range(3):
