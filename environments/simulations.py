@@ -154,9 +154,13 @@ class Simulations:
         chosen = self._chosen(ids)
         if parts < 1:
             raise ValueError(f"work must have at least one part, got {parts}")
-        if not self._threads.run(function.address, argument, chosen, parts):
-            self.stopped[chosen] |= self._records["failed"][chosen] != 0
-            self.any_stopped = True
+        try:
+            self._threads.run(function.address, argument, chosen, parts)
+        finally:  # after a signal, too: the job is done then
+            if self._threads.failures[0]:
+                self.any_stopped = True
+                self.stopped[chosen] |= self._records["failed"][chosen] != 0
+                self._threads.failures[0] = 0
 
     def step(self, substeps: int, ids: Ids = None) -> None:
         """Advance simulations, then compute everything, accelerations included, at the new state.

@@ -4,7 +4,8 @@ MuJoCo's own pool loses some hundredths to a tenth of the time with 16 simulatio
 that sleep begin late, and at the end one thread waits for the other's last simulation. Here a thread without
 work stays awake for a moment before it sleeps, and each begins with its own share of the simulations, the
 same each time. The last of each share are left to the end: who is done with all others first does them in
-parts, in turns, until everybody is there. Then there is one for each thread, and of each the same is left.
+parts, in turns, until everybody is there. Then there is one for each thread, of each about as much is left,
+and each is done to its end. (With fewer simulations than threads some have none.)
 
 All that is compiled, and runs without Python's lock; only a thread that has to be woken needs it. MuJoCo
 itself runs the functions, one simulation a call (``mjb_apply``), and so keeps states, counts warnings and
@@ -14,8 +15,9 @@ The calling thread works, too, and is done when all simulations are: a thread th
 not waited for. So work is also done, if slower, where threads are gone, as after a fork.
 
 What one thread has written another's core has to fetch, which takes it as long as hundreds of its own
-operations. So threads share as few lines of the cache as they can: each takes simulations of its share
-without a word to the others, says only at the end how many it has done, and writes where no other looks.
+operations. So threads share few lines of the cache: each takes simulations of its share without a word to the
+others, says how many it has done when it comes to the last ones, and writes its results where others seldom
+look. Single lines are shared where the shares meet.
 """
 
 from __future__ import annotations
@@ -78,7 +80,8 @@ POOL = np.dtype(
         ("patience", np.int64),  # looks at ``jobs`` before a thread sleeps
         ("stopping", np.int64),
         ("job", JOB),
-        ("arrived", np.int64),  # threads that have only parts left to do
+        ("room", np.int64, (8,)),
+        ("arrived", np.int64),  # threads that have only parts left to do, or that had and gave up waiting
         ("failures", np.int64),  # whether MuJoCo raised an error in this job
     ],
     align=True,
@@ -121,6 +124,7 @@ _ids = array_at(np.int32)
 _MANY = 1 << 31
 _PLACES = 1 << 24
 _ARRIVES = -2
+_NOTHING = (0, 0, 0)
 _LINE = 64
 
 
@@ -389,6 +393,9 @@ class ThreadPool:
         simulations: records ``SIMULATION`` of all, [B], filled but for their calls; kept.
         row: numbers in a state.
         num_threads: how many, the caller's included.
+
+    Attributes:
+        failures: [1]; not 0 if MuJoCo raised an error in the last job, the record of a simulation says where.
     """
 
     def __init__(self, simulations: npt.NDArray[Any], row: int, num_threads: int) -> None:
@@ -399,8 +406,8 @@ class ThreadPool:
         self._pool["threads"], self._pool["workers"] = num_threads, self._workers.ctypes.data
         self._job = np.zeros(1, JOB)
         self._job_address = int(self._job.ctypes.data)
-        self._ids, self._asked = np.zeros(0, np.int32), (0, 0, 0)
-        self._failures, self._unfinished = self._pool["failures"], self._pool["unfinished"][:, 0]
+        self._ids, self._asked = np.zeros(0, np.int32), _NOTHING
+        self.failures: npt.NDArray[np.int64] = self._pool["failures"]
         self._process = os.getpid()
         self._wakes = [_asleep() for _ in range(1, num_threads)]
         self._stop = weakref.finalize(self, _stop, self._pool, self._wakes)
@@ -414,7 +421,7 @@ class ThreadPool:
         for thread in self._threads:
             thread.start()
 
-    def run(self, function: int, argument: int, ids: npt.NDArray[np.int32], parts: int) -> bool:
+    def run(self, function: int, argument: int, ids: npt.NDArray[np.int32], parts: int) -> None:
         """Run a compiled function on simulations.
 
         Args:
@@ -423,28 +430,28 @@ class ThreadPool:
             ids: which simulations, each once.
             parts: of which the function's work consists, at least 1. It may be called for some of them at a
                 time, in their order. Work of one part is not worth a thread.
-
-        Returns:
-            False if MuJoCo raised an error in one of them.
         """
         if self._process != os.getpid():
             self._forget_threads()
         # NumPy takes as long to find an address as all else here together.
         if ids is not self._ids or (function, argument, parts) != self._asked:
-            self._ids, self._asked = ids, (function, argument, parts)
+            self._asked = _NOTHING  # until it is all written down: a signal may come in between
             self._job[0] = function, argument, ids.ctypes.data, len(ids), parts
+            self._ids, self._asked = ids, (function, argument, parts)
         if not self._wakes or parts == 1 or len(ids) == 1:
             do_alone(self._address, self._job_address)
-            return not self._failures[0]
+            return
+        done = False
         try:
             if begin(self._address, self._job_address):
                 for wake, worker in zip(self._wakes, self._workers[1:], strict=True):
                     if worker["asleep"]:
                         _wake(wake)
+            else:
+                done = True
         finally:  # an interrupted job is done nevertheless: nobody is left in the middle of a step
-            if self._unfinished[0]:
+            if not done:
                 finish(self._address)
-        return not self._failures[0]
 
     def close(self) -> None:
         """End the threads; what is to be done later, the caller does alone."""

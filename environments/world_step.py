@@ -142,6 +142,7 @@ WORLD = np.dtype(
         ("terms", np.float64, (MAX_TERMS,)),
         ("goal_met", np.bool_),
         ("broken", np.bool_),
+        ("room", np.uint8, (16,)),  # to the end of a line of the cache
     ],
     align=True,
 )

@@ -91,21 +91,54 @@ def test_only_the_last_simulations_are_done_in_parts() -> None:
     apart = thread_pool.APART * 2
     assert (calls == 1).sum() >= NUMBER - apart
     assert calls.sum() <= NUMBER - apart + apart * -(-11 // thread_pool.PARTS)
+    assert simulations(2)._threads._pool["arrived"][0] <= 2, "it is counted anew for each job"
     assert noted(1, 11)["calls"].tolist() == [1] * NUMBER
 
 
-def test_nothing_is_taken_of_another_job() -> None:
+@pytest.fixture
+def idle() -> tuple[thread_pool.ThreadPool, int]:
+    """A pool whose thread has ended, in the middle of its second job of 11 parts, and the job's number."""
+    pool = Simulations(make_scene(SAFETY_TASKS["PointGoal0"]).model, NUMBER, num_threads=2)._threads
+    pool.close()
+    ids = np.arange(NUMBER, dtype=np.int32)
+    pool._job[0] = note.address, 0, ids.ctypes.data, NUMBER, 11
+    pool._ids, pool._pool["job"] = ids, pool._job
+    pool._pool["jobs"][0, 0] = job = 2
+    pool._pool["unfinished"][0, 0] = NUMBER
+    pool._workers["whole"][:, 0] = job * thread_pool._PLACES + 2
+    return pool, job
+
+
+def test_nothing_is_taken_of_another_job(idle: tuple[thread_pool.ThreadPool, int]) -> None:
     """A thread that was held up between two looks finds that there is a new job, and leaves it alone."""
-    noted(2, 11)
-    busy = simulations(2)._threads
-    pool, job = busy._pool[0], int(busy._pool["jobs"][0, 0])
-    assert [thread_pool.claim(pool, job, rank) for rank in (0, 1)] == [-1, -1]
-    busy._workers["whole"][1, 0] = job * thread_pool._PLACES + 2
-    assert thread_pool.claim(pool, job + 1, 1) == thread_pool.claim(pool, job - 1, 1) == -1
-    begins, apart, ends = thread_pool.share(pool, 1)
-    assert (begins, apart, ends) == (6, 12 - thread_pool.APART, 12)
-    assert [thread_pool.claim(pool, job, 1) for _ in range(3)] == [apart - 2, apart - 1, -1]
-    assert thread_pool.take(busy._address, job, 0, -1) == -1
+    pool, job = idle
+    record = pool._pool[0]
+    for other in (job - 1, job + 1):
+        assert thread_pool.claim(record, other, 1) == -1
+        assert thread_pool.take(pool._address, other, 1, thread_pool._ARRIVES) == -1
+    assert record["arrived"] == 0
+    assert thread_pool.share(record, 1) == (6, 12 - thread_pool.APART, 12)
+    assert [thread_pool.claim(record, job, 1) for _ in range(3)] == [9, 10, -1]
+
+
+def test_threads_take_turns_until_all_are_there(idle: tuple[thread_pool.ThreadPool, int]) -> None:
+    """The first does parts of both last simulations in turns; with the second, each does one to its end."""
+    pool, job = idle
+    parts, calls = thread_pool.PARTS, pool._simulations["call"]
+    first, second = 0, 1
+
+    def take(rank: int, mine: int) -> tuple[int, int, int]:
+        place = thread_pool.take(pool._address, job, rank, mine)
+        return place, calls["first"][place], calls["last"][place]
+
+    assert take(first, thread_pool._ARRIVES) == (5, 0, parts)
+    assert take(first, 5) == (11, 0, parts)
+    assert take(first, 11) == (5, parts, 2 * parts)
+    assert take(second, thread_pool._ARRIVES) == (11, parts, 11)
+    assert take(first, 5) == (5, 2 * parts, 11)
+    assert thread_pool.take(pool._address, job, second, 11) == -1
+    assert thread_pool.take(pool._address, job, first, 5) == -1
+    assert pool._pool["unfinished"][0, 0] == NUMBER - 2
 
 
 def test_threads_that_sleep_are_woken() -> None:
@@ -150,9 +183,29 @@ def test_a_failure_is_of_the_simulations_of_its_job(
     broken.apply(fail, records.ctypes.data, [_FAILS, 6], parts=8)
     assert np.array_equal(broken.rows, before)
     broken.reset([_FAILS])
-    monkeypatch.setattr(broken._threads, "run", lambda *_: False)
     broken.apply(note, records.ctypes.data, [2, 3], parts=8)
     assert not broken.stopped.any()
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_a_failure_in_an_interrupted_job_is_told(
+    num_threads: int, tmp_path: os.PathLike[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    model = make_scene(SAFETY_TASKS["PointGoal0"]).model
+    broken, records = Simulations(model, NUMBER, num_threads=num_threads), np.zeros(NUMBER + 1, RECORD)
+    records["done"][NUMBER] = _MESSAGE
+    run = broken._threads.run
+
+    def interrupted(*arguments: Any) -> None:
+        run(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(broken._threads, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        broken.apply(fail, records.ctypes.data, parts=8)
+    assert np.flatnonzero(broken.broken()).tolist() == [_FAILS]
+    assert broken.any_stopped
 
 
 @pytest.mark.parametrize("ids", [[3, 3, 4], [-1], [NUMBER], [True] * NUMBER, [0.5]])
@@ -194,6 +247,38 @@ def test_no_signal_leaves_a_job_undone() -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, previous)
     assert interrupts == 80
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there is no timer")
+def test_after_a_signal_comes_the_next_job_not_the_last() -> None:
+    """Two jobs in turns, interrupted anywhere, also where the second is being written down."""
+    alone = Simulations(mujoco.MjModel.from_xml_string("<mujoco/>"), 2)
+    ids = [np.arange(number, dtype=np.int32) for number in (1, 2)]
+    records = [np.zeros(NUMBER, RECORD) for _ in range(2)]
+    addresses = [int(record.ctypes.data) for record in records]
+
+    def done(which: int) -> bool:
+        records[which]["done"] = 0
+        alone._threads.run(note.address, addresses[which], ids[which], 1)
+        return bool((records[which]["done"][: 1 + which] == 1).all())
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for attempt in range(400):
+            try:
+                signal.setitimer(signal.ITIMER_REAL, 0.0002)
+                while True:
+                    done(0)
+                    done(1)
+            except KeyboardInterrupt:
+                signal.setitimer(signal.ITIMER_REAL, 0.0)
+            assert done(attempt % 2)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, previous)
 
 
 def test_an_interrupted_job_is_done_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
