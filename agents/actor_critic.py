@@ -136,7 +136,9 @@ class ActorCritic:
         self._noisy = False
         self._temperature = 0.0
         self._form = (
-            TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
+            TailCost(config.cvar_level, cmdp.num_costs)
+            if config.constraint == "cvar"
+            else MeanCost(config.limit_margin)
         )
         self._parts: dict[str, Stateful] = {
             "critic_optimiser": self._critic_optimiser,

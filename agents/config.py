@@ -98,6 +98,12 @@ class StudentConfig(BaseModel):
         description="alpha of the CVaR, which is the mean of the worst share 1 - alpha of the episodes; only "
         "with the constraint cvar (ours).",
     )
+    limit_margin: NonNegative = Field(
+        default=0.0,
+        exclude_if=_is_unset,
+        description="Standard errors of an update's mean episode cost that are added to it before it is "
+        "compared with its limit; only with the constraint mean (ours).",
+    )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",
         description="What critics learn: advantage plus value (ours), or the bootstrapped discounted "
@@ -127,6 +133,15 @@ class StudentConfig(BaseModel):
         if not noisy or self.noisy_target_kl is None:
             return self
         return self.model_copy(update={"target_kl": self.noisy_target_kl})
+
+    @model_validator(mode="after")
+    def _margin_is_of_means(self) -> Self:
+        if self.limit_margin > 0.0 and self.constraint != "mean":
+            raise ValueError(
+                f"limit_margin counts standard errors of a mean: with the constraint {self.constraint} "
+                f"it must be 0, got {self.limit_margin}"
+            )
+        return self
 
     @model_validator(mode="before")
     @classmethod

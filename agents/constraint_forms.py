@@ -95,12 +95,35 @@ def tail_costs(
     return beyond / (1.0 - level)
 
 
+def standard_errors(costs: Floats) -> Floats:
+    """Of the mean of E costs, [E, k] -> [k]; 0 where one cost alone says nothing of its spread.
+
+    >>> standard_errors(np.array([[1.0], [3.0]]))
+    array([1.])
+    """
+    if len(costs) < 2:
+        return np.zeros(costs.shape[1])
+    errors: Floats = costs.std(axis=0, ddof=1) / math.sqrt(len(costs))
+    return errors
+
+
 class MeanCost:
-    """The mean episode cost is constrained; nothing is kept."""
+    """The mean episode cost is constrained, or a bound above it; nothing is kept.
+
+    Args:
+        margin: so many standard errors of the mean are added to it.
+    """
+
+    def __init__(self, margin: float = 0.0) -> None:
+        self._margin = margin
 
     def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
         """See ``TailCost.judge``."""
-        values = episode_costs.mean(axis=0) if len(episode_costs) else np.full(rollout.costs.shape[2], np.nan)
+        if not len(episode_costs):
+            return rollout.costs, np.full(rollout.costs.shape[2], np.nan)
+        values = episode_costs.mean(axis=0)
+        if self._margin > 0.0:
+            values = values + self._margin * standard_errors(episode_costs)
         return rollout.costs, values
 
     def state_dict(self) -> dict[str, Any]:

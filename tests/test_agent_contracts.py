@@ -226,6 +226,25 @@ def test_noise_changes_the_trust_region_of_its_update_alone(agent: str, task: st
 
 
 @every_agent
+def test_a_margin_is_a_lower_limit(agent: str) -> None:
+    """A student with a margin learns what one without it does from a limit that is lower by as much."""
+    rule = {"multiplier_rule": "projected", "multiplier_unit": "cost"}  # the others know the limit, too
+    options = rule if agent in {"ppo-lag", "trpo-lag", "focops"} else {}
+    careful, other = (Lessons(agent, "two-state", options | margin) for margin in ({"limit_margin": 2.0}, {}))
+    rollout, episodes = careful.collect()
+    costs = episode_costs(episodes, 1)
+    margin = 2.0 * costs.std(axis=0, ddof=1) / math.sqrt(len(costs))
+    assert margin > 0.0
+    metrics = careful.agent.update(rollout, costs, careful.limits())
+    assert metrics == pytest.approx(other.agent.update(rollout, costs, other.limits() - margin), nan_ok=True)
+
+
+def test_a_margin_of_the_worst_episodes_is_refused() -> None:
+    with pytest.raises(ValueError, match="with the constraint cvar it must be 0, got 1"):
+        Lessons("cpo", "two-state", {"constraint": "cvar", "limit_margin": 1.0})
+
+
+@every_agent
 def test_the_paper_preset_learns_with_the_same_metrics(agent: str) -> None:
     paper = Lessons(agent, "continuous-bandit", {"preset": "paper"})
     assert set(paper.update()) == set(Lessons(agent, "continuous-bandit").update())
