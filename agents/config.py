@@ -371,6 +371,14 @@ class LinearisedConstraintConfig(TrustRegionConfig):
 class CPOConfig(LinearisedConstraintConfig):
     """Settings of ``cpo``, constrained policy optimisation."""
 
+    temperature: NonNegative = Field(
+        default=0.0,
+        exclude_if=_is_unset,
+        description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
+        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
+        "(ours; Achiam et al. 2017: 0).",
+    )
+
 
 class PCPOConfig(LinearisedConstraintConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""

@@ -223,7 +223,15 @@ class ConstrainedPolicyOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one constrained trust-region step, unless nothing is known about the constraints."""
-        return constrained_step(policy, experience, solve_dual, self._config, generator, kept=self._kept)
+        config = self._config
+        return constrained_step(
+            policy,
+            experience,
+            lambda problem: solve_dual(replace(problem, temperature=config.temperature)),
+            config,
+            generator,
+            kept=self._kept,
+        )
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

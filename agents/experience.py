@@ -27,8 +27,9 @@ class Constraints:
 
     Attributes:
         limits: d, [k], possibly infinite.
-        gaps: constrained value of the finished episodes (their mean undiscounted cost, or its CVaR) minus
-            limit, [k]; -inf where the limit is infinite, NaN where no episode finished.
+        gaps: constrained value of the finished episodes (their mean undiscounted cost, with a margin where
+            one is asked for, or its CVaR) minus limit, [k]; -inf where the limit is infinite, NaN where no
+            episode finished.
         episode_length: mean steps of an episode, above 0: environment steps over finished episodes; NaN if
             none finished.
         noisy: whether the teacher added noise to the policy that collected them, or rewards its entropy.
