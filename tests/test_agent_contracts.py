@@ -239,6 +239,17 @@ def test_a_margin_is_a_lower_limit(agent: str) -> None:
     assert metrics == pytest.approx(other.agent.update(rollout, costs, other.limits() - margin), nan_ok=True)
 
 
+def test_cpo_with_a_temperature_settles() -> None:
+    """Where nothing is left to gain, steps to the edge of the trust region lead anywhere, for ever."""
+    late = {}
+    for temperature in (0.0, 0.3):
+        lessons = Lessons("cpo", "two-state", {"target_kl": 0.05, "temperature": temperature})
+        entropies = [lessons.update(math.inf)["entropy"] for _ in range(60)]
+        late[temperature] = max(entropies[30:])
+    assert late[0.3] < 0.01
+    assert late[0.0] > 0.3
+
+
 def test_a_margin_of_the_worst_episodes_is_refused() -> None:
     with pytest.raises(ValueError, match="with the constraint cvar it must be 0, got 1"):
         Lessons("cpo", "two-state", {"constraint": "cvar", "limit_margin": 1.0})
