@@ -135,32 +135,25 @@ def load(_context: Any, address: Any) -> Any:
     return types.int64(address), generate
 
 
-@instruction
-def swap(_context: Any, address: Any, value: Any) -> Any:
-    """Write a whole number at an address, for other threads to see, as all that was written before it.
+def _read_and_write(operation: str) -> Any:
+    """A function (address, number) -> what was there, which writes for other threads to see.
 
-    Returns:
-        what was there.
+    With the result of LLVM's ``operation`` they see all that was written before it.
     """
 
-    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.atomic_rmw("xchg", _number_at(builder, arguments[0]), arguments[1], "seq_cst")
+    def exchange(_context: Any, address: Any, value: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+            return builder.atomic_rmw(operation, _number_at(builder, arguments[0]), arguments[1], "seq_cst")
 
-    return types.int64(address, value), generate
+        return types.int64(address, value), generate
+
+    return instruction(exchange)
 
 
-@instruction
-def add(_context: Any, address: Any, value: Any) -> Any:
-    """Add to the whole number at an address, for other threads to see, as all that was written before it.
-
-    Returns:
-        what was there.
-    """
-
-    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.atomic_rmw("add", _number_at(builder, arguments[0]), arguments[1], "seq_cst")
-
-    return types.int64(address, value), generate
+swap = _read_and_write("xchg")
+"""Write a whole number at an address; what was there."""
+add = _read_and_write("add")
+"""Add to the whole number at an address; what was there."""
 
 
 @instruction
