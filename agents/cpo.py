@@ -223,15 +223,10 @@ class ConstrainedPolicyOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one constrained trust-region step, unless nothing is known about the constraints."""
-        config = self._config
-        return constrained_step(
-            policy,
-            experience,
-            lambda problem: solve_dual(replace(problem, temperature=config.temperature)),
-            config,
-            generator,
-            kept=self._kept,
-        )
+        return constrained_step(policy, experience, self._solve, self._config, generator, kept=self._kept)
+
+    def _solve(self, problem: StepProblem) -> DualSolution:
+        return solve_dual(replace(problem, temperature=self._config.temperature))
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

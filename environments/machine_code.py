@@ -18,7 +18,7 @@ import os
 import platform
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 import mujoco
 import numba
@@ -91,13 +91,14 @@ def compiled_for_arrays(function: Callable[Parameters, Result]) -> Callable[Para
     return call
 
 
-def compiled_for_python(function: Callable[Parameters, bool]) -> Callable[Parameters, bool]:
-    """A function of whole numbers, such as addresses, that Python calls often.
+def compiled_for_python(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function of whole numbers, such as addresses, that Python calls often; it returns a bool or nothing.
 
     Numba takes no time to look at the arguments, and other Python threads go on meanwhile.
     """
-    signature = types.boolean(*(types.int64,) * function.__code__.co_argcount)
-    call: Callable[Parameters, bool] = kept(functools.partial(numba.cfunc, signature), function).ctypes
+    result = types.void if get_type_hints(function)["return"] is type(None) else types.boolean
+    signature = result(*(types.int64,) * function.__code__.co_argcount)
+    call: Callable[Parameters, Result] = kept(functools.partial(numba.cfunc, signature), function).ctypes
     return call
 
 
@@ -136,9 +137,9 @@ def load(_context: Any, address: Any) -> Any:
 
 
 def _read_and_write(operation: str) -> Any:
-    """A function (address, number) -> what was there, which writes for other threads to see.
+    """A function (address, number) -> what was there, which writes there as LLVM's ``operation`` says.
 
-    With the result of LLVM's ``operation`` they see all that was written before it.
+    Other threads see it, and with it all that was written before.
     """
 
     def exchange(_context: Any, address: Any, value: Any) -> Any:

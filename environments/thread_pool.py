@@ -305,23 +305,18 @@ def set_job(pool: Any, wanted: Any) -> None:
 
 
 @compiled_for_python
-def do_alone(address: int, job: int) -> bool:
+def do_alone(address: int, job: int) -> None:
     """Do a ``JOB`` on the calling thread."""
     complete(address)
     pool = _pools(address, 1)[0]
     set_job(pool, _jobs(job, 1)[0])
     for index in _ids(pool.job.ids, pool.job.number):
         run_whole(pool, index)
-    return True
 
 
 @compiled_for_python
 def begin(address: int, job: int) -> bool:
-    """Do a ``JOB`` with all threads, or, if some sleep, only begin it with those that are awake.
-
-    Returns:
-        whether it is only begun.
-    """
+    """Let all threads that are awake begin a ``JOB``; True if some sleep."""
     complete(address)
     acquire(address)
     pool = _pools(address, 1)[0]
@@ -339,18 +334,16 @@ def begin(address: int, job: int) -> bool:
     swap(address + _UNFINISHED, pool.job.number)
     swap(address + _JOBS, number)
     release(address)
-    for rank in range(1, pool.threads):
+    for rank in range(1, pool.threads):  # noqa: SIM110  # not for Numba
         if load(pool.workers + _WORKER_SIZE * rank) != 0:
             return True
-    complete(address)
     return False
 
 
 @compiled_for_python
-def finish(address: int) -> bool:
+def finish(address: int) -> None:
     """Work until the job is done."""
     complete(address)
-    return True
 
 
 @compiled_for_python
@@ -441,17 +434,13 @@ class ThreadPool:
         if not self._wakes or parts == 1 or len(ids) == 1:
             do_alone(self._address, self._job_address)
             return
-        done = False
         try:
             if begin(self._address, self._job_address):
                 for wake, worker in zip(self._wakes, self._workers[1:], strict=True):
                     if worker["asleep"]:
                         _wake(wake)
-            else:
-                done = True
         finally:  # an interrupted job is done nevertheless: nobody is left in the middle of a step
-            if not done:
-                finish(self._address)
+            finish(self._address)
 
     def close(self) -> None:
         """End the threads; what is to be done later, the caller does alone."""
