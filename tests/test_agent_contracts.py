@@ -240,7 +240,7 @@ def test_a_margin_is_a_lower_limit(agent: str) -> None:
 
 
 def test_cpo_with_a_temperature_settles() -> None:
-    """Where nothing is left to gain, steps to the edge of the trust region lead anywhere, here for 60 updates."""
+    """Where nothing is left to gain, steps to the edge of the trust region lead anywhere."""
     late = {}
     for temperature in (0.0, 0.3):
         lessons = Lessons("cpo", "two-state", {"target_kl": 0.05, "temperature": temperature})
