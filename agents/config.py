@@ -366,18 +366,17 @@ class LinearisedConstraintConfig(TrustRegionConfig):
         "count for more as far as less is confirmed; where observations are many and noisy, as on Safety Gym "
         "(ours).",
     )
-
-
-class CPOConfig(LinearisedConstraintConfig):
-    """Settings of ``cpo``, constrained policy optimisation."""
-
     temperature: NonNegative = Field(
         default=0.0,
         exclude_if=_is_unset,
         description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
         "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
-        "(ours; Achiam et al. 2017: 0).",
+        "(ours).",
     )
+
+
+class CPOConfig(LinearisedConstraintConfig):
+    """Settings of ``cpo``, constrained policy optimisation."""
 
 
 class PCPOConfig(LinearisedConstraintConfig):
@@ -386,6 +385,14 @@ class PCPOConfig(LinearisedConstraintConfig):
 
 class TRPOConfig(TrustRegionConfig):
     """Settings of ``trpo``, which knows no constraint."""
+
+    temperature: NonNegative = Field(
+        default=0.0,
+        exclude_if=_is_unset,
+        description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
+        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
+        "(ours).",
+    )
 
 
 class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):

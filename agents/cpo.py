@@ -24,7 +24,7 @@ from torch import Tensor
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import reward_spread
 from recrl.agents.batch import to_tensor
-from recrl.agents.config import CPOConfig, TrustRegionConfig
+from recrl.agents.config import CPOConfig, LinearisedConstraintConfig, TrustRegionConfig
 from recrl.agents.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.agents.cross_fitting import KeptShares, confirmed, halves
 from recrl.agents.distributions import Distribution, mean_divergence
@@ -86,7 +86,7 @@ def constrained_step(
     policy: StochasticPolicy,
     experience: Experience,
     solve: Callable[[StepProblem], DualSolution],
-    config: TrustRegionConfig,
+    config: LinearisedConstraintConfig,
     generator: np.random.Generator,
     *,
     kept: KeptShares | None,
@@ -97,7 +97,7 @@ def constrained_step(
         policy: changed in place.
         experience: the samples.
         solve: the step of the linearised problem.
-        config: the trust region, conjugate gradients and line search.
+        config: the trust region, conjugate gradients, line search and temperature.
         generator: of the samples that the metric is evaluated on.
         kept: with cross-fitting, what steps have kept of their promises; it learns from this one's.
 
@@ -119,6 +119,7 @@ def constrained_step(
     active = ActiveConstraints.of(constraints)
     metric = model.metric(config, generator)
     problem, solved = linearise(model, active, metric, config)
+    problem = replace(problem, temperature=config.temperature)
     if kept is not None and len(active.index):
         signs = halves(len(centred), experience.num_envs)
         contrast = LocalModel(policy, experience, centred[:, 1 + active.index] * signs[:, None])
@@ -223,10 +224,7 @@ class ConstrainedPolicyOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one constrained trust-region step, unless nothing is known about the constraints."""
-        return constrained_step(policy, experience, self._solve, self._config, generator, kept=self._kept)
-
-    def _solve(self, problem: StepProblem) -> DualSolution:
-        return solve_dual(replace(problem, temperature=self._config.temperature))
+        return constrained_step(policy, experience, solve_dual, self._config, generator, kept=self._kept)
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

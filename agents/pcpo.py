@@ -11,7 +11,8 @@ The optimum is x = y - sum_i nu_i w_i, where nu >= 0 solves the complementarity 
 
 for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far from feasible is far from it
 too: the paper bounds the damage, here the step is scaled back into the trust region. Then it is shortened by
-``cpo``'s line search, which the paper leaves out.
+``cpo``'s line search, which the paper leaves out. With a temperature T (ours, as in ``cpo``) the reward's
+step ends with the gain: y = -min(sqrt(2 delta / q), 1 / T) v.
 
 If no episode finished, nothing is known about the constraints and the policy stays. With ``cross_fitting`` c
 is what steps that keep a share of their promises have to promise, and nu grows with it. Letters: N samples, k
@@ -45,6 +46,8 @@ def projected_step(problem: StepProblem) -> DualSolution:
     """
     squared = problem.squared_gradient
     reach = float(np.sqrt(2.0 * problem.radius / squared)) if squared > NO_INFLUENCE else 0.0
+    if problem.temperature * reach > 1.0:
+        reach = 1.0 / problem.temperature
     excesses = problem.violations - reach * problem.mixed
     weights = projection_weights(problem.gram, excesses)
     if weights is None:

@@ -3,7 +3,7 @@
 One step an update, along H^-1 g and as long as the trust region allows, sqrt(2 delta / q) H^-1 g with
 q = g.H^-1 g (appendix C), shortened until the surrogate does not fall and the true KL is within delta. ``g``
 is the gradient of a surrogate and H the Hessian of the mean KL plus damping. With no finite limit, ``cpo``
-takes the same step.
+takes the same step, and with the same temperature (ours), which ends a step with the gain.
 
 Letters: N samples, k costs, P parameters, delta the trust region's size.
 """
@@ -95,7 +95,9 @@ class TrustRegionPolicyOptimisation:
     ) -> dict[str, float]:
         """Take one step up the reward's surrogate."""
         rewards, _ = scaled_advantages(experience.advantages, "centred")
-        metrics = step_up(policy, experience, rewards, self._config, generator)
+        metrics = step_up(
+            policy, experience, rewards, self._config, generator, temperature=self._config.temperature
+        )
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 
 

@@ -239,11 +239,12 @@ def test_a_margin_is_a_lower_limit(agent: str) -> None:
     assert metrics == pytest.approx(other.agent.update(rollout, costs, other.limits() - margin), nan_ok=True)
 
 
-def test_cpo_with_a_temperature_settles() -> None:
+@pytest.mark.parametrize("agent", ["cpo", "pcpo", "trpo"])
+def test_with_a_temperature_a_student_settles(agent: str) -> None:
     """Where nothing is left to gain, steps to the edge of the trust region lead anywhere."""
     late = {}
     for temperature in (0.0, 0.3):
-        lessons = Lessons("cpo", "two-state", {"target_kl": 0.05, "temperature": temperature})
+        lessons = Lessons(agent, "two-state", {"target_kl": 0.05, "temperature": temperature})
         entropies = [lessons.update(math.inf)["entropy"] for _ in range(60)]
         late[temperature] = max(entropies[30:])
     assert late[0.3] < 0.01

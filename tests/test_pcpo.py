@@ -26,10 +26,10 @@ SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
 EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
 
-def step(gradient: Floats, costs: Floats, violations: list[float]) -> Floats:
+def step(gradient: Floats, costs: Floats, violations: list[float], temperature: float = 0.0) -> Floats:
     """PCPO's step with H = I and a trust region of radius 1."""
     problem = StepProblem(
-        float(gradient @ gradient), costs @ gradient, costs @ costs.T, np.array(violations), 0.5
+        float(gradient @ gradient), costs @ gradient, costs @ costs.T, np.array(violations), 0.5, temperature
     )
     solution = projected_step(problem)
     return -(solution.gradient_weight * gradient + solution.constraint_weights @ costs)
@@ -46,6 +46,22 @@ def step(gradient: Floats, costs: Floats, violations: list[float]) -> Floats:
 )
 def test_the_step_is_the_one_computed_by_hand(violation: float, expected: list[float]) -> None:
     assert step(-EAST, EAST[None], [violation]) == pytest.approx(np.array(expected), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("temperature", "violation", "expected"),
+    [
+        (0.5, -2.0, [1.0, 0.0]),  # the reward's step would be 1 / T = 2 long: the trust region ends it
+        (4.0, -2.0, [0.25, 0.0]),  # 1 / T
+        (4.0, -0.125, [0.125, 0.0]),  # and moved back to where the constraint begins
+        (4.0, 0.5, [-0.5, 0.0]),  # what is violated is mended all the same
+    ],
+)
+def test_with_a_temperature_the_rewards_step_ends_with_the_gain(
+    temperature: float, violation: float, expected: list[float]
+) -> None:
+    found = step(-EAST, EAST[None], [violation], temperature)
+    assert found == pytest.approx(np.array(expected), abs=1e-12)
 
 
 def test_the_projection_leaves_what_no_constraint_concerns() -> None:
