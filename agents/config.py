@@ -199,6 +199,12 @@ class MultiplierConfig(StudentConfig):
         default=1000.0,
         description="The largest multiplier that projected ascent and PID give (ours; anti-wind-up).",
     )
+    multiplier_geometric: bool = Field(
+        default=False,
+        exclude_if=_is_unset,
+        description="Let the integral I of PID grow and fall by shares of 1 + I, so that a price that had to "
+        "be high is not high for long; only with the rule pid (ours).",
+    )
     multiplier_waits: bool = Field(
         default=False,
         exclude_if=_is_unset,
@@ -217,6 +223,15 @@ class MultiplierConfig(StudentConfig):
             raise ValueError(
                 f"multiplier_initial must be above 0 with the rule softplus-adam, "
                 f"got {self.multiplier_initial}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _shares_are_of_an_integral(self) -> Self:
+        if self.multiplier_geometric and self.multiplier_rule != "pid":
+            raise ValueError(
+                "multiplier_geometric is how the integral of PID moves: with the rule "
+                f"{self.multiplier_rule} it must be false"
             )
         return self
 

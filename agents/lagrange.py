@@ -113,6 +113,7 @@ def pid(
     integral: float | Floats,
     derivative: float | Floats,
     maximum: float,
+    geometric: bool = False,
 ) -> dict[str, Floats]:
     """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
 
@@ -128,6 +129,9 @@ def pid(
     under a limit of 1, no 400 later ones can take back. So a violation counts no more than the best that can
     undo it. (The 1 is for limits near 0, which still must be answered.)
 
+    ``geometric`` (ours) sums up in the logarithm of 1 + I: I <- (1 + I) exp(K_I min(gap, max(d, 1))) - 1. A
+    price that had to be high comes down by shares of itself, as it went up, and a small one moves as without.
+
     Args:
         state: ``multipliers``, ``integral``, ``last_gap``.
         gaps: J - d, [k]; -inf where there is no constraint.
@@ -137,11 +141,15 @@ def pid(
         integral: K_I.
         derivative: K_D.
         maximum: the largest multiplier, possibly infinite.
+        geometric: whether the integral grows and falls by shares of 1 + I.
     """
     active = np.isfinite(gaps)
     gap = np.where(active, gaps, 0.0)
     rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
-    summed = np.clip(state["integral"] + integral * np.minimum(gap, limit_units(limits)), 0.0, maximum)
+    change = integral * np.minimum(gap, limit_units(limits))
+    if geometric:
+        change = (1.0 + state["integral"]) * np.expm1(change)
+    summed = np.clip(state["integral"] + change, 0.0, maximum)
     output = np.clip(proportional * gap + summed + derivative * rise, 0.0, maximum)
     return {
         "multipliers": np.where(active, output, 0.0),

@@ -99,6 +99,7 @@ def pid_step(config: MultiplierConfig, *, integral: float) -> MultiplierRule:
         integral=integral / units(limits),
         derivative=config.multiplier_derivative / units(limits),
         maximum=config.multiplier_maximum,
+        geometric=config.multiplier_geometric,
     )
 
 

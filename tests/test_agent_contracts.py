@@ -203,6 +203,26 @@ def test_a_student_that_waits_sums_up_no_violation_of_a_noisy_policy(rule: str) 
     assert lessons.update(violated)["multiplier_0"] > 0.5
 
 
+@pytest.mark.parametrize("agent", ["ppo-lag", "trpo-lag"])
+def test_a_geometric_price_comes_down_faster_from_where_it_is_high(agent: str) -> None:
+    fall = {}
+    for geometric in (False, True):
+        options = {
+            **{"multiplier_initial": 9.0, "multiplier_step": 0.1, "multiplier_proportional": 0.0},
+            "multiplier_geometric": geometric,
+        }
+        lessons = Lessons(agent, "two-state", options)
+        metrics = lessons.update(1e9)
+        fall[geometric] = 9.0 - metrics["multiplier_0"]
+    assert fall[False] == pytest.approx(0.1)
+    assert fall[True] == pytest.approx(10.0 * -math.expm1(-0.1))
+
+
+def test_a_geometric_price_of_another_rule_is_refused() -> None:
+    with pytest.raises(ValueError, match="with the rule projected it must be false"):
+        Lessons("ppo-lag", "two-state", {"multiplier_rule": "projected", "multiplier_geometric": True})
+
+
 @every_agent
 @pytest.mark.parametrize("task", ["two-state", "continuous-bandit"])
 def test_noise_changes_the_trust_region_of_its_update_alone(agent: str, task: str) -> None:

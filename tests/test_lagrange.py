@@ -1,6 +1,7 @@
 """Multiplier rules against hand-computed steps and against PyTorch."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from recrl.agents.lagrange import (
     STARTS,
+    MultiplierState,
     limit_units,
     pid,
     projected_ascent,
@@ -55,7 +57,7 @@ def test_softplus_adam_equals_pytorch() -> None:
 
 
 def test_pid_adds_its_three_terms() -> None:
-    gains = {"proportional": 0.1, "integral": 0.01, "derivative": 1.0, "maximum": 100.0}
+    gains: dict[str, Any] = {"proportional": 0.1, "integral": 0.01, "derivative": 1.0, "maximum": 100.0}
     limits = np.array([20.0])
     state = pid(start_pid(1, 0.0), np.array([10.0]), limits, **gains)
     assert state["multipliers"] == pytest.approx([1.1])  # 0.1 * 10 + 0.01 * 10; nothing to differ from yet
@@ -65,8 +67,43 @@ def test_pid_adds_its_three_terms() -> None:
     assert state["multipliers"] == pytest.approx([1.1 + 0.33])  # a falling gap is not differentiated
 
 
+def summed_geometrically(state: MultiplierState, gap: float, limit: float, maximum: float = 100.0) -> float:
+    """The integral after one more gap, with K_I = 0.1 and no other gain."""
+    after = pid(
+        state,
+        np.array([gap]),
+        np.array([limit]),
+        proportional=0.0,
+        integral=0.1,
+        derivative=0.0,
+        maximum=maximum,
+        geometric=True,
+    )
+    return float(after["integral"][0])
+
+
+def test_a_geometric_integral_moves_by_shares_of_what_it_is() -> None:
+    high, low = start_pid(1, 7.0), start_pid(1, 0.0)
+    assert summed_geometrically(high, 2.0, 4.0) == pytest.approx(8.0 * math.exp(0.2) - 1.0)
+    assert summed_geometrically(low, 2.0, 4.0) == pytest.approx(math.exp(0.2) - 1.0)
+    assert summed_geometrically(high, -4.0, 4.0) == pytest.approx(8.0 * math.exp(-0.4) - 1.0)
+    assert summed_geometrically(high, 1e6, 4.0) == pytest.approx(8.0 * math.exp(0.4) - 1.0)  # no wind-up
+
+
+def test_a_geometric_integral_comes_back_the_way_it_went() -> None:
+    integral = 0.5
+    for gap in (1.0, 2.0, -1.0, -2.0):
+        integral = summed_geometrically(start_pid(1, integral), gap, 2.0)
+    assert integral == pytest.approx(0.5)
+
+
+def test_a_geometric_integral_is_held_within_what_a_multiplier_can_be() -> None:
+    assert summed_geometrically(start_pid(1, 2.9), 5.0, 5.0, maximum=3.0) == 3.0
+    assert summed_geometrically(start_pid(1, 0.1), -5.0, 5.0) == 0.0
+
+
 def test_pid_does_not_wind_up() -> None:
-    gains = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 2.0}
+    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 2.0}
     state, limits = start_pid(2, 0.0), np.array([10.0, 10.0])
     for _ in range(1000):
         state = pid(state, np.array([10.0, -10.0]), limits, **gains)
@@ -76,7 +113,7 @@ def test_pid_does_not_wind_up() -> None:
 
 
 def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates() -> None:
-    gains = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
+    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
     state, limits = start_pid(3, 1.0), np.array([5.0, 2.0, 0.0])
     state = pid(state, np.array([60.0, 1.0, 60.0]), limits, **gains)
     assert state["integral"].tolist() == pytest.approx([1.5, 1.1, 1.1])
