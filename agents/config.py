@@ -371,7 +371,19 @@ class IPOConfig(AscentConfig):
     )
 
 
-class LinearisedConstraintConfig(TrustRegionConfig):
+class SettlingConfig(TrustRegionConfig):
+    """Settings of students that as published take steps to the trust region's edge, and need not."""
+
+    temperature: NonNegative = Field(
+        default=0.0,
+        exclude_if=_is_unset,
+        description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
+        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
+        "(ours).",
+    )
+
+
+class LinearisedConstraintConfig(SettlingConfig):
     """Settings of students that hold a step to linearised constraints."""
 
     cross_fitting: bool = Field(
@@ -379,13 +391,6 @@ class LinearisedConstraintConfig(TrustRegionConfig):
         exclude_if=_is_unset,
         description="Judge what a step does to a cost on samples that did not choose it, and let a violation "
         "count for more as far as less is confirmed; where observations are many and noisy, as on Safety Gym "
-        "(ours).",
-    )
-    temperature: NonNegative = Field(
-        default=0.0,
-        exclude_if=_is_unset,
-        description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
-        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
         "(ours).",
     )
 
@@ -398,16 +403,8 @@ class PCPOConfig(LinearisedConstraintConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""
 
 
-class TRPOConfig(TrustRegionConfig):
+class TRPOConfig(SettlingConfig):
     """Settings of ``trpo``, which knows no constraint."""
-
-    temperature: NonNegative = Field(
-        default=0.0,
-        exclude_if=_is_unset,
-        description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
-        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
-        "(ours).",
-    )
 
 
 class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):

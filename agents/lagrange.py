@@ -130,7 +130,7 @@ def pid(
     undo it. (The 1 is for limits near 0, which still must be answered.)
 
     ``geometric`` (ours) sums up in the logarithm of 1 + I: I <- (1 + I) exp(K_I min(gap, max(d, 1))) - 1. A
-    price that had to be high comes down by shares of itself, as it went up, and a small one moves as without.
+    price that had to be high comes down by shares of itself, as it went up; near 0 it moves as without.
 
     Args:
         state: ``multipliers``, ``integral``, ``last_gap``.

@@ -38,23 +38,24 @@ def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floa
     return policy, LearningBatch.gather(observations, actions, compact=True), advantages
 
 
-def rule_of(name: str, policy: StochasticPolicy) -> PolicyRule:
+def rule_of(name: str, policy: StochasticPolicy, temperature: float = 0.0) -> PolicyRule:
     if name == "ppo":
         return ProximalPolicyOptimisation(PPOConfig(target_kl=DELTA), policy)
     if name == "trpo":
-        return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA))
-    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA), num_costs=2)
+        return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA, temperature=temperature))
+    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, temperature=temperature), num_costs=2)
 
 
 def improved(
-    name: str, space: Space[object], gaps: list[float], limits: list[float]
+    name: str, space: Space[object], gaps: list[float], limits: list[float], temperature: float = 0.0
 ) -> tuple[dict[str, float], Floats]:
     """The metrics, and the policy's parameters afterwards."""
     policy, batch, advantages = sampled(space)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), length)
     experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
-    metrics = improve_and_measure(rule_of(name, policy), policy, experience, np.random.default_rng(0))
+    rule = rule_of(name, policy, temperature)
+    metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
     return metrics, policy.parameters.to_numpy().astype(np.float64)
 
 
@@ -70,11 +71,14 @@ def test_neither_limits_nor_costs_nor_finished_episodes_change_a_control(
         np.testing.assert_array_equal(improved(name, space, gaps, limits)[1], reference)
 
 
+@pytest.mark.parametrize("temperature", [0.0, 20.0])
 @pytest.mark.parametrize("space", SPACES)
-def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object]) -> None:
-    unlimited = [math.inf, math.inf]
-    found, after = improved("trpo", space, [-math.inf, -math.inf], unlimited)
-    expected, after_cpo = improved("cpo", space, [-math.inf, -math.inf], unlimited)
+def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object], temperature: float) -> None:
+    gaps, unlimited = [-math.inf, -math.inf], [math.inf, math.inf]
+    found, after = improved("trpo", space, gaps, unlimited, temperature)
+    expected, after_cpo = improved("cpo", space, gaps, unlimited, temperature)
+    longest, _ = improved("trpo", space, gaps, unlimited)
+    assert (found["step_norm"] < 0.5 * longest["step_norm"]) == (temperature > 0.0)
     np.testing.assert_allclose(after, after_cpo, atol=1e-5)
     assert found["surrogate_reward"] == pytest.approx(expected["surrogate_reward"], rel=1e-3)
     assert found["step_norm"] == pytest.approx(expected["step_norm"], rel=1e-3)
