@@ -29,6 +29,7 @@ from recrl.orchestrator.archives import UNREADABLE, unpacked
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import write_atomically
+from recrl.orchestrator.validation import missing
 
 SUFFIX = ".zip"
 FORMAT = 1
@@ -83,6 +84,8 @@ def load(path: Path) -> Sweep:
             sweep, *frames = unpacked(archive, names, max_bytes=MAX_BYTES)
         told = json.loads(sweep)
         rows = {name: pd.read_csv(io.BytesIO(data)) for name, data in zip(ROWS, frames, strict=True)}
+    except FileNotFoundError as error:
+        raise RecrlError(f"{path}: {missing(path)}") from error
     except UNREADABLE as error:
         raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({error})") from error
     found = told.get("format") if isinstance(told, dict) else None

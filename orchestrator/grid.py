@@ -45,7 +45,7 @@ from recrl.orchestrator.grid_file import (
 )
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.validation import nearest, sentences, shown
+from recrl.orchestrator.validation import missing, nearest, sentences, shown
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000
@@ -131,6 +131,8 @@ def read_grid(path: Path) -> GridSpec:
     """
     try:
         data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise GridError([f"{path}: {missing(path)}"]) from error
     except OSError as error:
         raise GridError([f"{path}: cannot be read: {error.strerror}"]) from error
     return parse_grid(data, source=str(path))

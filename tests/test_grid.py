@@ -290,9 +290,20 @@ def test_what_is_no_grid_at_all_is_refused_in_one_sentence(data: bytes, problem:
     assert _problems(data) == [problem]
 
 
-def test_a_missing_file_is_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(GridError, match=r"nowhere\.yaml: cannot be read: No such file or directory"):
-        read_grid(tmp_path / "nowhere.yaml")
+def test_a_missing_file_is_a_sentence_that_says_where_it_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "sweep.yaml").touch()
+    meant = "; did you mean 'sweep.yaml'?"
+    for name, ends in [("sweep.yml", meant), ("sweeps.yaml", meant), ("other.yaml", "")]:
+        with pytest.raises(GridError) as raised:
+            read_grid(tmp_path / name)
+        assert str(raised.value) == f"{tmp_path / name}: there is no such file in {tmp_path}{ends}"
+    with pytest.raises(GridError, match=r"grid\.yaml: there is no folder .*nowhere$"):
+        read_grid(tmp_path / "nowhere" / "grid.yaml")
+
+
+def test_what_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(GridError, match=": cannot be read: Is a directory"):
+        read_grid(tmp_path)
 
 
 def test_scalars_are_what_they_look_like() -> None:
