@@ -26,10 +26,9 @@ import pandas as pd
 
 from recrl.analysis.frames import ROWS, TRIAL, Sweep, TrialFacts, assemble, drawn_columns
 from recrl.orchestrator.archives import UNREADABLE, unpacked
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import RecrlError, missing
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import write_atomically
-from recrl.orchestrator.validation import missing
 
 SUFFIX = ".zip"
 FORMAT = 1

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import re
+from pathlib import Path
 
 
 class RecrlError(Exception):
@@ -52,3 +54,14 @@ def without_password(uri: str) -> str:
     'postgresql://me:***@host/mlflow'
     """
     return re.sub(r"(://[^/:@]*):[^@]*@", r"\1:***@", uri)
+
+
+def missing(path: Path) -> str:
+    """What is said of a file that is not there: where it was looked for, and what there may be meant."""
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        return f"there is no folder {folder}"
+    names = {each.stem: each.name for each in sorted(folder.iterdir(), reverse=True) if each.is_file()}
+    near = difflib.get_close_matches(path.stem, names, n=1)
+    hint = f"; did you mean {names[near[0]]!r}?" if near else ""
+    return f"there is no such file in {folder}{hint}"

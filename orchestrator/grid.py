@@ -33,7 +33,7 @@ from recrl.agents.registry import agent_config
 from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import make_vector, task_options
-from recrl.orchestrator.errors import GridError
+from recrl.orchestrator.errors import GridError, missing
 from recrl.orchestrator.grid_file import (
     Entry,
     Exclusion,
@@ -45,7 +45,7 @@ from recrl.orchestrator.grid_file import (
 )
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.validation import missing, nearest, sentences, shown
+from recrl.orchestrator.validation import nearest, sentences, shown
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000

@@ -10,7 +10,6 @@ import difflib
 import json
 import typing
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -94,17 +93,6 @@ def nearest(name: str, known: list[str]) -> str:
     """``; did you mean 'window'?``, or nothing where no known name is near."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
-
-
-def missing(path: Path) -> str:
-    """What is said of a file that is not there: where it was looked for, and what there may be meant."""
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        return f"there is no folder {folder}"
-    names = {each.stem: each.name for each in sorted(folder.iterdir(), reverse=True) if each.is_file()}
-    near = difflib.get_close_matches(path.stem, names, n=1)
-    hint = f"; did you mean {names[near[0]]!r}?" if near else ""
-    return f"there is no such file in {folder}{hint}"
 
 
 def _unknown_key(key: str, known: list[str]) -> str:
