@@ -61,7 +61,9 @@ def missing(path: Path) -> str:
     folder = path.absolute().parent
     if not folder.is_dir():
         return f"there is no folder {folder}"
-    names = {each.stem: each.name for each in sorted(folder.iterdir(), reverse=True) if each.is_file()}
+    files = sorted(each for each in folder.iterdir() if each.is_file())
+    files.sort(key=lambda each: each.suffix == path.suffix)  # of two with one stem, that of the same kind
+    names = {each.stem: each.name for each in files}
     near = difflib.get_close_matches(path.stem, names, n=1)
     hint = f"; did you mean {names[near[0]]!r}?" if near else ""
     return f"there is no such file in {folder}{hint}"

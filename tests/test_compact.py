@@ -76,6 +76,10 @@ def test_what_is_no_compact_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "none.zip"
     with pytest.raises(RecrlError, match=r"none\.zip: there is no such file in /"):
         compact.load(path)
+    for suffix in ("yaml", "zip", "csv"):
+        (tmp_path / f"some.{suffix}").touch()
+    with pytest.raises(RecrlError, match=r"did you mean 'some\.zip'\?"):
+        compact.load(tmp_path / "sone.zip")
     with pytest.raises(RecrlError, match="cannot be read as a sweep's compact file"):
         compact.load(tmp_path)
     path.write_text("nothing")
