@@ -7,8 +7,9 @@ is lost to whoever reads ``info["cost"]``. Here it stays.
 What a scalar environment must do: report ``info["cost"]``, a number or k numbers, at every step; have a
 ``Discrete`` or a bounded or unbounded floating-point ``Box`` action space; and be a function of its seed and
 its actions: ``reset(seed=...)`` must determine an episode. It may name its costs in an attribute
-``cost_names``. Observations of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``),
-actions clipped to their bounds.
+``cost_names``, and the parts of its flattened observation in ``observation_components`` (a sequence of
+``recrl.environments.cmdp.ObservationComponent``), which tell agents what is a lidar. Observations of any kind
+are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to their bounds.
 
 Every episode is started by ``reset(seed=...)`` with a new seed drawn here, which makes an exact checkpoint
 possible without asking the environment for its state and without pickling it: the seed and the actions so
@@ -30,7 +31,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
 
-from recrl.environments.cmdp import CMDPSpec, Floats
+from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
 from recrl.environments.vector import CMDPVectorEnv
 
 Environment = gymnasium.Env[Any, Any]
@@ -72,7 +73,12 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             )
         horizon = first.spec.max_episode_steps if first.spec is not None else None
         self.cmdp = CMDPSpec(
-            name, self.single_observation_space, self.single_action_space, tuple(cost_names), horizon
+            name,
+            self.single_observation_space,
+            self.single_action_space,
+            tuple(cost_names),
+            horizon,
+            _declared_components(first),
         )
         self._costless = costless
         self._episode_seeds = [0] * self.num_envs
@@ -112,6 +118,14 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             for index in np.flatnonzero(terminated | truncated).tolist():
                 self._observations[index] = self._start_episode(index)
         return self._observations.copy(), rewards, terminated, truncated, info
+
+    def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[np.float32]:
+        """Begin new episodes in some environments; see ``recrl.environments.vector``."""
+        if self._observations is None:
+            raise ValueError(f"{self.cmdp.name}: call reset before restart")
+        for environment in index.tolist():
+            self._observations[environment] = self._start_episode(environment)
+        return self._observations.copy()
 
     def render(self) -> tuple[Any, ...]:
         """One frame per environment, in the environment's own render mode."""
@@ -269,6 +283,13 @@ class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, terminated, truncated, {**info, "cost": np.zeros(self._num_costs)}
+
+
+def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
+    """What an environment says of the parts of its flattened observation; none if it says nothing."""
+    if not environment.has_wrapper_attr("observation_components"):
+        return ()
+    return tuple(environment.get_wrapper_attr("observation_components"))
 
 
 def _float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:

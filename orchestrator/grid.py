@@ -49,6 +49,7 @@ from recrl.orchestrator.validation import nearest, sentences, shown
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000
+ROLLOUT_STEPS = 64  # by default: short rollouts of many environments make many updates
 # d_t: infinite, so that the teacher measures its start. Nobody but the user can say d_d.
 DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
 
@@ -326,15 +327,12 @@ class _Check:
         return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
 
     def _rollout_steps(self, run: Run | None, label: str, cmdp: CMDPSpec) -> int | None:
-        """T: as given, or the task's horizon."""
+        """T: as given, or its default."""
         if run is None:
             return None
-        steps, num_envs = run.rollout_steps or cmdp.horizon, run.num_envs
-        if steps is None:
-            self._add(
-                ("run", "rollout_steps"), f"is required: {label} has no horizon that could be its default"
-            )
-        elif run.total_steps < num_envs * steps:
+        default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
+        steps, num_envs = run.rollout_steps or default, run.num_envs
+        if run.total_steps < num_envs * steps:
             self._add(
                 ("run", "total_steps"),
                 f"must be at least one update of {label}, "

@@ -150,13 +150,18 @@ class Run(_Written):
     deploy_fraction: Number = Field(
         default=0.05, ge=0.0, le=0.9, description="Share of the steps in deployment (paper, section 5: 5%)."
     )
-    num_envs: Whole = Field(default=16, ge=1, le=4096, description="Environments stepped together (ours).")
+    num_envs: Whole = Field(
+        default=64,
+        ge=1,
+        le=4096,
+        description="Environments stepped together; many, so that an update sees many episodes (ours).",
+    )
     rollout_steps: Whole | None = Field(
         default=None,
         ge=1,
         le=10_000_000,
-        description="T, steps of each environment between two policy updates; by default the task's horizon, "
-        "so that every environment finishes an episode an update.",
+        description="T, steps of each environment between two policy updates; by default 64, or the task's "
+        "horizon where that is shorter. Episodes go on from one update to the next (ours).",
     )
     evaluation_episodes: Whole = Field(
         default=100, ge=0, le=1_000_000, description="Episodes of each frozen-policy evaluation (ours)."

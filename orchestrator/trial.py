@@ -87,7 +87,7 @@ class Trial:
         self._environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
         self._cmdp = self._environments.cmdp
         self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, seeds.agent)
-        self._collector = Collector(self._environments, num_steps=spec.rollout_steps)
+        self._collector = Collector(self._environments, num_steps=spec.rollout_steps, staggered=True)
         tree = writer.restore()
         if tree is None:
             self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
