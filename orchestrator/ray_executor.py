@@ -39,13 +39,29 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import ray
 from ray import cloudpickle, tune
-from ray.exceptions import RayTaskError
+from ray.exceptions import (
+    ActorDiedError,
+    ActorUnavailableError,
+    NodeDiedError,
+    OutOfMemoryError,
+    RayTaskError,
+    TaskCancelledError,
+    WorkerCrashedError,
+)
 from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import ClusterError, StorageError, TeacherUnavailableError
 from recrl.orchestrator.own_package import copy_package
 from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
-from recrl.orchestrator.ray_services import RAY_FOLDER, TOKEN, TOKEN_VARIABLE, LostServices, end_processes
+from recrl.orchestrator.ray_services import (
+    RAY_FOLDER,
+    TOKEN,
+    TOKEN_VARIABLE,
+    LostServices,
+    end_processes,
+    end_processes_of_the_dead,
+)
+from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.remote_sweep import RemoteSweep, StopObject
 from recrl.orchestrator.scratch import scratch_folder
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -512,14 +528,15 @@ class _Watch(tune.Callback):
         """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
         self._last_event = time.monotonic()
         cause, spec = _last_error(trial), _spec_of(trial)
+        if self._lost.any_is_gone():  # not the trial's fault: it waits
+            return
         if isinstance(cause, StorageError):
             logger.warning("%s: %s; it waits", spec.title, cause)
             return
         self._refresh(spec)
         files = self._store.trial(spec)
         if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
-            what = f"{type(cause).__name__}: {_first_line(cause)}" if cause else "unknown"
-            error = f"failures of its process: {trial.num_failures}; the last: {what}"
+            error = shown(process_error(cause, trial.num_failures))
             try:
                 files.set_status(TrialState.FAILED, error=error)
             except StorageError as also:
@@ -565,7 +582,8 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
     Raises:
         ClusterError: Ray does not start.
     """
-    with scratch_folder(_short_folder(), before_removal=end_processes) as folder:
+    end_processes_of_the_dead(_short_folder())
+    with scratch_folder(_short_folder()) as folder:
         token_path = folder / TOKEN
         with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
             file.write(_token())
@@ -574,6 +592,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
             for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
                 os.environ.pop(name, None)  # Ray looks at its mode only where it sets it itself
             with (
+                _leaving_no_process(folder),
                 _at_loopback(),
                 _connection(
                     "cannot start Ray on this machine",
@@ -611,7 +630,8 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
         try:
             socket.create_connection((host, int(port)), timeout=CONNECT_SECONDS).close()
         except (OSError, ValueError) as error:
-            raise ClusterError(f"{failure}: {error}; is it running, and is this host:port?") from error
+            reason = getattr(error, "strerror", None) or error
+            raise ClusterError(f"{failure}: {reason}; is it running, and is this host:port?") from error
     hint = (
         "; is this machine a node of it (ray start --address=<host:port> --num-cpus=0), and does it want a "
         "token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
@@ -710,6 +730,15 @@ def _fewer_processes() -> Iterator[None]:
 
 
 @contextmanager
+def _leaving_no_process(folder: Path) -> Iterator[None]:
+    """End at last what Ray leaves behind of the cluster in a folder: its agents, if its raylet was killed."""
+    try:
+        yield
+    finally:
+        end_processes(folder)
+
+
+@contextmanager
 def _at_loopback() -> Iterator[None]:
     """Let Ray's services listen at this machine's own address only.
 
@@ -752,6 +781,28 @@ def _last_error(trial: Any) -> BaseException | None:
         return None
     error: BaseException = cloudpickle.loads(Path(path).read_bytes())  # Tune wrote it a moment ago
     return error.cause if isinstance(error, RayTaskError) else error
+
+
+def process_error(cause: BaseException | None, failures: int) -> str:
+    """What is said of a trial whose processes failed, so often that it is not started again.
+
+    Args:
+        cause: what Ray says of the last time, if it does.
+        failures: how often, at least 1.
+    """
+    times = "once" if failures == 1 else f"{failures} times"
+    if isinstance(cause, OutOfMemoryError):
+        why = "Ray ended it because the machine ran out of memory; let fewer trials run at once"
+    elif isinstance(cause, TaskCancelledError):
+        why = "Ray cancelled it"
+    elif isinstance(cause, ActorDiedError | ActorUnavailableError | WorkerCrashedError | NodeDiedError):
+        why = (
+            "it ended without a word: killed from outside, for want of memory, or by the task's or the "
+            "agent's own code"
+        )
+    else:
+        why = f"{type(cause).__name__}: {_first_line(cause)}" if cause else "nobody says why"
+    return f"its process failed {times}; the last time: {why}"
 
 
 def _first_line(error: BaseException) -> str:

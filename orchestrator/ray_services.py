@@ -7,6 +7,7 @@ then. A service that takes a connection counts as alive: one that hangs is left 
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import os
 import signal
@@ -24,6 +25,7 @@ import ray
 from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.scratch import LOCK, PREFIX
 
 LOOK_SECONDS = 3.0  # between two looks
 CONNECT_SECONDS = 2.0
@@ -95,6 +97,10 @@ class LostServices:
         if self.problem:
             raise ClusterError(self.problem)
 
+    def any_is_gone(self) -> bool:
+        """Whether a service takes no connection right now."""
+        return not all(service.is_there() for service in self._services)
+
     @contextmanager
     def watched(self, cluster: AbstractContextManager[None]) -> Iterator[None]:
         """Look after a cluster's services for as long as it is used, and see to it that it can be left.
@@ -143,6 +149,18 @@ def end_processes(folder: Path) -> None:
                 _is_below(it, folder / RAY_FOLDER) for it in descriptors.iterdir()
             ):
                 os.kill(number, signal.SIGKILL)
+
+
+def end_processes_of_the_dead(parent: str) -> None:
+    """Kill what is left of the local clusters of processes that were killed.
+
+    Args:
+        parent: the folder that the clusters' own folders are in.
+    """
+    for lock_path in Path(parent).glob(f"{PREFIX}*/{LOCK}"):
+        with suppress(OSError), lock_path.open("r+") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails where its process lives
+            end_processes(lock_path.parent)
 
 
 def _is_below(link: Path, folder: Path) -> bool:

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from recrl.orchestrator.scratch import LOCK, NEW_SECONDS, scratch_folder
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.store import SweepStore
-from tests.chaos import descendants
+from tests.chaos import comm, descendants
 
 GRID = """\
 name: bereft
@@ -70,6 +69,9 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
     expected = r"[0-9]+ has died; nothing that was saved is lost, and the same launch goes on\n"
     assert re.fullmatch("(recrl-sweep: )?" + re.escape(said) + expected, errors)
     assert not store.is_locked()
+    end = time.monotonic() + 30.0
+    while comm(trial) and time.monotonic() < end:  # it is killed; the kernel takes its time
+        time.sleep(0.1)
     assert comm(trial) == ""
     again = launch(tmp_path)
     again.communicate(timeout=300.0)
@@ -77,39 +79,15 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
     assert [trial.record().status for trial in store.trials()] == [TrialState.COMPLETE]
 
 
-def comm(pid: int) -> str:
-    """The name of a process; empty if it is over."""
-    try:
-        status = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return ""
-    name, _, rest = status.partition("(")[2].rpartition(")")
-    return "" if rest.split()[0] == "Z" else name
-
-
-def test_an_interrupted_removal_leaves_the_lock_by_which_the_next_process_finds_the_folder(
-    tmp_path: Path,
-) -> None:
-    def interrupt(folder: Path) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), scratch_folder(str(tmp_path), before_removal=interrupt) as folder:
-        (folder / "part").mkdir()
-    assert {path.name for path in folder.iterdir()} == {LOCK, "part"}
-    with scratch_folder(str(tmp_path)):
-        assert not folder.exists()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_empty_folder_without_a_lock_is_removed_after_a_minute_and_a_full_one_never(
-    tmp_path: Path,
-) -> None:
-    young, old, others = (tmp_path / f"recrl-{name}" for name in ("young", "old", "others"))
-    for folder in (young, old, others):
-        folder.mkdir()
-    (others / "results.csv").write_text("1\n")
-    for folder in (old, others):
-        os.utime(folder, (0.0, time.time() - NEW_SECONDS - 1.0))
-    with scratch_folder(str(tmp_path)):
-        pass
-    assert sorted(tmp_path.iterdir()) == [others, young]
+def test_what_a_killed_launch_left_of_ray_is_ended_by_the_next_one(tmp_path: Path) -> None:
+    (tmp_path / "grid.yaml").write_text(GRID)
+    driver = launch(tmp_path)
+    running_trial(SweepStore(tmp_path / "runs", "bereft"))
+    processes = [pid for pid in descendants(driver.pid, "") if comm(pid).startswith(("ray::", "raylet"))]
+    assert len(processes) >= 4
+    driver.kill()
+    driver.communicate()
+    again = launch(tmp_path)
+    again.communicate(timeout=300.0)
+    assert again.returncode == 0
+    assert [comm(pid) for pid in processes] == [""] * len(processes)
