@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, model_validator
 
+from recrl.orchestrator.foreign import PlainText, ShortText
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.validation import shown
 
@@ -110,8 +111,8 @@ class _Written(BaseModel):
 class Entry(_Written):
     """A student or a method: its name, or a mapping."""
 
-    name: str = Field(min_length=1, description="Registry name, entry point or package.module:attribute.")
-    label: str = Field(
+    name: ShortText = Field(description="Registry name, entry point or package.module:attribute.")
+    label: PlainText = Field(
         default="", max_length=60, description="What tables and figures call it; the name by default."
     )
     options: dict[str, Any] = Field(

@@ -55,6 +55,7 @@ import pandas as pd
 from recrl.environments.cmdp import EpisodeStats
 from recrl.orchestrator import checkpoint
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError, SweepBusyError
+from recrl.orchestrator.locks import look_at_lock, open_lock
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 EPISODE_COLUMNS = ("index", "phase", "end_step", "length", "episode_return", "noise")
@@ -239,7 +240,7 @@ class SweepStore:
     def is_locked(self) -> bool:
         """Whether some process runs the sweep."""
         try:
-            with (self.folder / "lock").open() as file:
+            with look_at_lock(self.folder / "lock") as file:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except FileNotFoundError:
             return False
@@ -255,7 +256,7 @@ class SweepStore:
             SweepBusyError: another process holds it.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / "lock").open("a+") as file:
+        with open_lock(self.folder / "lock") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -412,6 +413,7 @@ class TrialStore:
 
     def _begin(self, spec: TrialSpec) -> TrialWriter:
         with self.locked():
+            self.reserve_path.unlink(missing_ok=True)  # it might be a link
             self.reserve_path.write_bytes(secrets.token_bytes(RESERVE_BYTES))
             if not self.spec_path.exists():
                 write_json(self.spec_path, spec.to_json())
@@ -471,7 +473,7 @@ class TrialStore:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Exclude other writers of this trial on the same file system, for a moment."""
-        with (self.folder / ".lock").open("w") as file:
+        with open_lock(self.folder / ".lock") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
