@@ -33,7 +33,11 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "noise_form": "match-mixture",
 }
 
-STARTER_AGENTS_ASCENT: Mapping[str, Any] = {"policy_learning_rate": 3e-4, "policy_steps": 80}
+STARTER_AGENTS_ASCENT: Mapping[str, Any] = {
+    "target_kl": 0.01,
+    "policy_learning_rate": 3e-4,
+    "policy_steps": 80,
+}
 STARTER_AGENTS_TRUST_REGION: Mapping[str, Any] = {"metric_samples": None}
 STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
     "multiplier_rule": "softplus-adam",
@@ -108,7 +112,7 @@ class StudentConfig(BaseModel):
         "with the constraint cvar (ours).",
     )
     constraint_window: Count = Field(
-        default=1,
+        default=16,
         description="Episodes, at least, from which a mean cost is estimated: where fewer finish in an "
         "update, those of the updates before it count as well (ours).",
     )
@@ -173,15 +177,19 @@ class AscentConfig(StudentConfig):
 
     paper: ClassVar[Mapping[str, Any]] = {**STARTER_AGENTS_SETTING, **STARTER_AGENTS_ASCENT}
 
+    target_kl: Positive = Field(
+        default=0.02,
+        description="Size of the trust region, mean KL in nats an update (ours; paper 0.01).",
+    )
     policy_learning_rate: Positive = Field(
-        default=1e-3,
+        default=5e-4,
         description="Adam's, for the policy; the KL keeps it in bounds (ours; paper 3e-4).",
     )
     policy_steps: Count = Field(
         default=20, description="Steps of the policy an update; the KL may stop it before (ours; paper 80)."
     )
     policy_passes: Count = Field(
-        default=5,
+        default=10,
         description="Passes of the policy over the samples an update, where these are more steps than "
         "policy_steps; the KL may stop it before (ours).",
     )
@@ -212,7 +220,7 @@ class MultiplierConfig(StudentConfig):
         default=0.1,
         description="Step of the dual ascent, K_I, or Adam's learning rate, without unit (ours; paper 0.05).",
     )
-    multiplier_proportional: NonNegative = Field(default=1.0, description="K_P of the PID rule (ours).")
+    multiplier_proportional: NonNegative = Field(default=0.2, description="K_P of the PID rule (ours).")
     multiplier_derivative: NonNegative = Field(default=0.0, description="K_D of the PID rule (ours).")
     multiplier_maximum: Positive = Field(
         default=1000.0,
