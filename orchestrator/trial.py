@@ -51,6 +51,8 @@ from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, last_lesson
 
 COMMIT_SECONDS = 20.0
 HEARTBEAT_SECONDS = 2.0
+HARD_LANDING = 0.1
+"""By what share of d_d (of 1, where d_d is less) the last training limit may exceed it without an event."""
 
 logger = logging.getLogger("recrl.trial")
 
@@ -200,6 +202,7 @@ class Trial:
     def _next_lesson(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
         """Ask the teacher, or enter deployment; apply the policy noise and the temperature it wants."""
         if self.phase is Phase.DEPLOYMENT:
+            self._warn_of_hard_landing()
             self._lesson = Lesson(self.spec.deploy_limits)
             return
         measured = self._teacher_state.get("start_limits")
@@ -218,6 +221,14 @@ class Trial:
                     f"{self.spec.agent.name} has not; choose another of the two"
                 )
             self._agent.reward_entropy(self._lesson.temperature)
+
+    def _warn_of_hard_landing(self) -> None:
+        """Record an event if deployment begins with limits that the agent was never near."""
+        before, after = self._lesson.limits, self.spec.deploy_limits
+        if any(
+            late > (1.0 + HARD_LANDING) * max(final, 1.0) for late, final in zip(before, after, strict=True)
+        ):
+            self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
 
     def _shown_temperature(self, lesson: Lesson) -> dict[str, float]:
         """The temperature, for teachers that have one."""

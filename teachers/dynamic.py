@@ -8,6 +8,11 @@ the letter wherever it is defined.
 
 - *Clock.* The student learns once per policy update, so it is judged once per update, over windows of whole
   updates (``windows``). With one episode an update this is Algorithm 2's clock.
+- *Enough episodes* (``window_grows``). The ratio of two noisy means passes the test of line 5 by chance: with
+  8 episodes a window, frozen policies of Safety Gym did in up to 59% of the cases. So a window takes in more
+  updates until the standard errors of its means are within the tolerances, and until then nothing is decided.
+  The tolerances are of the mean or of the episodes' standard deviation, whichever is more, so that 100
+  episodes always are enough.
 - *Zero and negative means* (line 5). |new / old - 1| divides by zero for a student that has become perfectly
   safe, and it would wait for ever. |new - old| <= eps max(|old|, floor) is the same test where that is
   defined, and 0 against 0 has converged. The floor keeps small means from being compared by their noise.
@@ -71,6 +76,7 @@ PAPER = {
     "start_fraction": 0.0,
     "window": 80,
     "window_unit": "episodes",
+    "window_grows": False,
     "return_floor": 0.0,
     "cost_floor": 0.0,
     "adherence_tolerance": "none",
@@ -103,6 +109,12 @@ class DynamicConfig(BaseModel):
     window_unit: WindowUnit = Field(
         default="updates",
         description="What W counts: policy updates, or finished episodes (rounded up to whole updates).",
+    )
+    window_grows: bool = Field(
+        default=True,
+        description="Whether a window takes in more updates until the standard errors of its means are "
+        "within the tolerances: enough episodes, or no decision (ours). The tolerances are then of the mean "
+        "or of the episodes' standard deviation, whichever is more.",
     )
     return_tolerance: float = Field(
         default=0.1,
@@ -260,15 +272,40 @@ def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
     """
     if old.episodes == 0 or new.episodes == 0:
         return [False] * len(new.mean_costs)
+    return_floor, cost_floors = _floors(old, config)
     return_converged = has_converged(
-        new.mean_return, old.mean_return, tolerance=config.return_tolerance, floor=config.return_floor
+        new.mean_return, old.mean_return, tolerance=config.return_tolerance, floor=return_floor
     )
     converged = [
-        return_converged
-        and has_converged(cost, before, tolerance=config.cost_tolerance, floor=config.cost_floor)
-        for cost, before in zip(new.mean_costs, old.mean_costs, strict=True)
+        return_converged and has_converged(cost, before, tolerance=config.cost_tolerance, floor=floor)
+        for cost, before, floor in zip(new.mean_costs, old.mean_costs, cost_floors, strict=True)
     ]
     return [all(converged)] * len(converged) if config.dimensions == "joint" else converged
+
+
+def _floors(window: Stretch, config: DynamicConfig) -> tuple[float, tuple[float, ...]]:
+    """What a mean return and mean costs at least count as in a comparison: the floor, or the spread."""
+    if not config.window_grows:
+        return config.return_floor, (config.cost_floor,) * len(window.mean_costs)
+    cost_floors = tuple(max(spread, config.cost_floor) for spread in window.cost_spreads)
+    return max(window.return_spread, config.return_floor), cost_floors
+
+
+def is_precise(window: Stretch, config: DynamicConfig) -> bool:
+    """Whether a window's means are known to within what equal means may differ by.
+
+    s <= eps max(|mean|, floor, standard deviation), s the standard error of the return and of each cost. With
+    eps = 0.1 a hundred episodes are always enough.
+    """
+    if window.episodes == 0:
+        return False
+    return_floor, cost_floors = _floors(window, config)
+    root = math.sqrt(window.episodes)
+    return_scale = max(abs(window.mean_return), return_floor)
+    return window.return_spread <= config.return_tolerance * return_scale * root and all(
+        spread <= config.cost_tolerance * max(cost, floor) * root
+        for spread, cost, floor in zip(window.cost_spreads, window.mean_costs, cost_floors, strict=True)
+    )
 
 
 def _kept(new: Stretch, limits: CostLimits, config: DynamicConfig) -> list[bool]:
@@ -301,7 +338,7 @@ def steps_left(
     next one is not counted: Algorithm 2 judges before it plays episode b, when b - 1 are played and
     B - b + 1 are left.
 
-    >>> last = Stretch(env_steps=1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    >>> last = Stretch(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
     [2, 35]
     """
@@ -357,10 +394,10 @@ class DynamicTeacher:
             lesson = Lesson(limits)
         else:
             is_due = True
-            lesson = self._judge(limits, history, report.env_steps)
+            lesson = self._judge(limits, history, report.env_steps, last_change)
         has_changed = lesson.limits != before or lesson.policy_noise > 0.0
         if is_due and self.config.clock_reset == "convergence":
-            has_changed = has_changed or self._has_converged(history)
+            has_changed = has_changed or self._has_converged(history, last_change)
         if lesson.policy_noise > 0.0 and self.config.windows_after_noise == 2:
             history = ()
         next_state = _state(
@@ -382,35 +419,77 @@ class DynamicTeacher:
         )
         unit = self.config.window_unit
         history = extend([Stretch.from_json(stretch) for stretch in state["history"]], latest, unit=unit)
-        windows = last_two_windows(history, self.config.window, unit=unit)
-        return history if windows is None else (*windows[0], *windows[1])
+        needed = [self._last_two(history, group) for group in self._groups]
+        if any(windows is None for windows in needed):
+            return history
+        return history[-max(len(windows[0]) + len(windows[1]) for windows in needed if windows) :]
 
-    def _windows(self, history: Sequence[Stretch]) -> tuple[Stretch, Stretch] | None:
-        """The last two windows, each pooled, or None as long as there are fewer (line 4: b >= 2 W)."""
-        windows = last_two_windows(history, self.config.window, unit=self.config.window_unit)
-        return None if windows is None else (Stretch.pooled(windows[0]), Stretch.pooled(windows[1]))
+    @property
+    def _groups(self) -> tuple[tuple[int, ...], ...]:
+        """The costs that are judged together: all, or where windows grow each limit on its own."""
+        costs = tuple(range(len(self.spec.train_limits)))
+        if self.config.window_grows and self.config.dimensions == "separate":
+            return tuple((index,) for index in costs)
+        return (costs,)
 
-    def _has_converged(self, history: Sequence[Stretch]) -> bool:
-        """Whether line 11 is reached: the test of line 5 holds in some dimension, or jointly."""
-        windows = self._windows(history)
-        return windows is not None and any(_converged(*windows, self.config))
-
-    def _judge(self, limits: CostLimits, history: Sequence[Stretch], env_steps: int) -> Lesson:
-        """The next lesson once W has passed since the last change."""
-        windows = self._windows(history)
-        if windows is None:
-            return Lesson(limits)
-        old, new = windows
-        return judge(
-            old,
-            new,
-            limits=limits,
-            deploy_limits=self.spec.deploy_limits,
-            remaining=steps_left(
-                new, env_steps=env_steps, train_steps=self.spec.train_steps, unit=self.config.remaining
-            ),
-            config=self.config,
+    def _last_two(
+        self, history: Sequence[Stretch], group: tuple[int, ...]
+    ) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]] | None:
+        """The updates of the last two windows for a group of costs, or None as long as there are too few."""
+        config = self.config
+        return last_two_windows(
+            history,
+            config.window,
+            unit=config.window_unit,
+            is_enough=(lambda window: is_precise(window.of_costs(group), config))
+            if config.window_grows
+            else None,
         )
+
+    def _is_due(self, newest: Sequence[Stretch], last_change: int) -> bool:
+        """Whether a newest window lies wholly after the last change (line 4)."""
+        in_episodes = self.config.window_unit == "episodes"
+        length = sum(each.episodes for each in newest) if in_episodes else len(newest)
+        return not self.config.window_grows or last_change >= length
+
+    def _windows(
+        self, history: Sequence[Stretch], group: tuple[int, ...], last_change: int
+    ) -> tuple[Stretch, Stretch] | None:
+        """The last two windows of a group of costs, each pooled; None if they are too few or too old."""
+        windows = self._last_two(history, group)
+        if windows is None or not self._is_due(windows[1], last_change):
+            return None
+        return Stretch.pooled(windows[0]).of_costs(group), Stretch.pooled(windows[1]).of_costs(group)
+
+    def _has_converged(self, history: Sequence[Stretch], last_change: int) -> bool:
+        """Whether line 11 is reached: the test of line 5 holds in some dimension, or jointly."""
+        groups = (self._windows(history, group, last_change) for group in self._groups)
+        return any(any(_converged(*windows, self.config)) for windows in groups if windows is not None)
+
+    def _judge(
+        self, limits: CostLimits, history: Sequence[Stretch], env_steps: int, last_change: int
+    ) -> Lesson:
+        """The next lesson once W has passed since the last change."""
+        values, noise = list(limits), 0.0
+        for group in self._groups:
+            windows = self._windows(history, group, last_change)
+            if windows is None:
+                continue
+            old, new = windows
+            lesson = judge(
+                old,
+                new,
+                limits=CostLimits(tuple(limits[index] for index in group)),
+                deploy_limits=CostLimits(tuple(self.spec.deploy_limits[index] for index in group)),
+                remaining=steps_left(
+                    new, env_steps=env_steps, train_steps=self.spec.train_steps, unit=self.config.remaining
+                ),
+                config=self.config,
+            )
+            noise = max(noise, lesson.policy_noise)
+            for index, value in zip(group, lesson.limits, strict=True):
+                values[index] = value
+        return Lesson(CostLimits(tuple(values)), noise)
 
 
 def _state(

@@ -10,8 +10,8 @@ Letters: k the number of costs, W a window's size.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from recrl.environments.cmdp import EpisodeStats
@@ -29,6 +29,7 @@ class Stretch:
         mean_return: r-bar, the mean undiscounted return.
         mean_costs: C-bar, the mean undiscounted episode costs, [k].
         cost_scatter: sums of squared deviations from ``mean_costs``, [k].
+        return_scatter: sum of squared deviations from ``mean_return``.
     """
 
     env_steps: int
@@ -36,6 +37,7 @@ class Stretch:
     mean_return: float
     mean_costs: tuple[float, ...]
     cost_scatter: tuple[float, ...]
+    return_scatter: float = 0.0
 
     @classmethod
     def of_update(cls, episodes: Sequence[EpisodeStats], *, env_steps: int, num_costs: int) -> Stretch:
@@ -50,7 +52,8 @@ class Stretch:
             math.fsum((cost - mean) ** 2 for cost in column)
             for column, mean in zip(costs, mean_costs, strict=True)
         )
-        return cls(env_steps, count, mean_return, mean_costs, cost_scatter)
+        return_scatter = math.fsum((episode.episode_return - mean_return) ** 2 for episode in episodes)
+        return cls(env_steps, count, mean_return, mean_costs, cost_scatter, return_scatter)
 
     @classmethod
     def pooled(cls, parts: Sequence[Stretch]) -> Stretch:
@@ -72,16 +75,36 @@ class Stretch:
             )
             for i, mean in enumerate(mean_costs)
         )
-        return cls(env_steps, episodes, mean_return, mean_costs, cost_scatter)
+        return_scatter = math.fsum(
+            part.episodes * (part.mean_return - mean_return) ** 2 + part.return_scatter for part in parts
+        )
+        return cls(env_steps, episodes, mean_return, mean_costs, cost_scatter, return_scatter)
+
+    def of_costs(self, group: Sequence[int]) -> Stretch:
+        """The same with some of the costs alone."""
+        return replace(
+            self,
+            mean_costs=tuple(self.mean_costs[index] for index in group),
+            cost_scatter=tuple(self.cost_scatter[index] for index in group),
+        )
+
+    @property
+    def cost_spreads(self) -> tuple[float, ...]:
+        """Standard deviations of the episode costs, sqrt(scatter / (n - 1)), [k]; 0 where n < 2."""
+        return tuple(self._spread(scatter) for scatter in self.cost_scatter)
+
+    @property
+    def return_spread(self) -> float:
+        """Standard deviation of the returns; 0 where n < 2."""
+        return self._spread(self.return_scatter)
 
     @property
     def standard_errors(self) -> tuple[float, ...]:
         """Standard errors of ``mean_costs``, sqrt(scatter / (n - 1) / n), [k]; 0 where n < 2."""
-        if self.episodes < 2:
-            return (0.0,) * len(self.mean_costs)
-        return tuple(
-            math.sqrt(scatter / (self.episodes - 1) / self.episodes) for scatter in self.cost_scatter
-        )
+        return tuple(spread / math.sqrt(max(self.episodes, 1)) for spread in self.cost_spreads)
+
+    def _spread(self, scatter: float) -> float:
+        return math.sqrt(scatter / (self.episodes - 1)) if self.episodes > 1 else 0.0
 
     def to_json(self) -> list[Any]:
         """The stretch as a JSON list, in the order of the attributes."""
@@ -91,13 +114,14 @@ class Stretch:
             self.mean_return,
             list(self.mean_costs),
             list(self.cost_scatter),
+            self.return_scatter,
         ]
 
     @classmethod
     def from_json(cls, values: Sequence[Any]) -> Stretch:
         """The inverse of ``to_json``."""
-        env_steps, episodes, mean_return, mean_costs, cost_scatter = values
-        return cls(env_steps, episodes, mean_return, tuple(mean_costs), tuple(cost_scatter))
+        env_steps, episodes, mean_return, mean_costs, cost_scatter, return_scatter = values
+        return cls(env_steps, episodes, mean_return, tuple(mean_costs), tuple(cost_scatter), return_scatter)
 
 
 def extend(history: Sequence[Stretch], latest: Stretch, *, unit: WindowUnit) -> tuple[Stretch, ...]:
@@ -111,12 +135,32 @@ def extend(history: Sequence[Stretch], latest: Stretch, *, unit: WindowUnit) -> 
     return (*history, latest)
 
 
-def latest_window(history: Sequence[Stretch], size: int, *, unit: WindowUnit) -> int | None:
+def latest_window(
+    history: Sequence[Stretch],
+    size: int,
+    *,
+    unit: WindowUnit,
+    is_enough: Callable[[Stretch], bool] | None = None,
+) -> int | None:
     """How many of the last updates make a window of W; None if there are too few.
 
     ``updates``: the last W updates. ``episodes``: the fewest last updates in which at least W episodes
-    finished; with one episode an update, as in Algorithm 2, these are exactly the last W episodes.
+    finished; with one episode an update, as in Algorithm 2, these are exactly the last W episodes. With
+    ``is_enough`` a window takes in more updates until that holds of it.
     """
+    count = _latest_of_size(history, size, unit=unit)
+    if count is None or is_enough is None:
+        return count
+    window = Stretch.pooled(history[len(history) - count :])
+    while not is_enough(window):
+        count += 1
+        if count > len(history):
+            return None
+        window = Stretch.pooled([history[len(history) - count], window])
+    return count
+
+
+def _latest_of_size(history: Sequence[Stretch], size: int, *, unit: WindowUnit) -> int | None:
     if unit == "updates":
         return size if len(history) >= size else None
     episodes = 0
@@ -128,14 +172,18 @@ def latest_window(history: Sequence[Stretch], size: int, *, unit: WindowUnit) ->
 
 
 def last_two_windows(
-    history: Sequence[Stretch], size: int, *, unit: WindowUnit
+    history: Sequence[Stretch],
+    size: int,
+    *,
+    unit: WindowUnit,
+    is_enough: Callable[[Stretch], bool] | None = None,
 ) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]] | None:
     """The updates of the window before the last one, and of the last one; None if there are too few."""
-    new = latest_window(history, size, unit=unit)
+    new = latest_window(history, size, unit=unit, is_enough=is_enough)
     if new is None:
         return None
     split = len(history) - new
-    old = latest_window(history[:split], size, unit=unit)
+    old = latest_window(history[:split], size, unit=unit, is_enough=is_enough)
     if old is None:
         return None
     return tuple(history[split - old : split]), tuple(history[split:])

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.teachers.dynamic import DynamicConfig, has_converged, judge, keeps_limit, next_limit, steps_left
+from recrl.teachers.dynamic import (
+    DynamicConfig,
+    has_converged,
+    is_precise,
+    judge,
+    keeps_limit,
+    next_limit,
+    steps_left,
+)
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherState
 from recrl.teachers.windows import Stretch
@@ -485,3 +493,46 @@ def test_the_state_stays_small() -> None:
             ) * 30
             _, state = teacher.step(state, ProgressReport(update, update, episodes))
         assert len(state["history"]) <= 10
+
+
+def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
+    """Eight episodes of a policy whose cost scatters as much as its mean look converged by chance."""
+    generator = np.random.default_rng(0)
+
+    def noisy(number: int) -> Stretch:
+        costs = generator.exponential(50.0, number)
+        episodes = [
+            EpisodeStats(
+                b, Phase.TRAINING, 0, 1000, float(cost) / 10.0, (float(cost),), CostLimits((25.0,)), 0.0
+            )
+            for b, cost in enumerate(costs)
+        ]
+        return Stretch.of_update(episodes, env_steps=8000, num_costs=1)
+
+    config = DynamicConfig()
+    assert not any(is_precise(noisy(8), config) for _ in range(100))
+    assert all(is_precise(noisy(100), config) for _ in range(20))
+    assert is_precise(window(9.5, 5.0, episodes=1), config)  # deterministic: one episode says it all
+    assert not is_precise(Stretch(100, 0, 0.0, (0.0,), (0.0,)), config)
+
+
+def test_a_noisy_agent_is_held_where_it_is_until_a_hundred_episodes_say_that_it_has_converged() -> None:
+    generator = np.random.default_rng(1)
+    spec = TeacherSpec("dynamic", {"window": 2}, CostLimits((200.0,)), CostLimits((25.0,)), 1_000_000)
+    teacher = make_teacher(spec)
+    lesson, state = teacher.start()
+    changes, episodes_at_change, total = 0, [], 0
+    for update in range(1, 240):
+        limits = lesson.limits
+        costs = generator.exponential(80.0, 4)
+        episodes = tuple(
+            EpisodeStats(b, Phase.TRAINING, 0, 1000, float(cost) / 10.0, (float(cost),), limits, 0.0)
+            for b, cost in enumerate(costs)
+        )
+        total += len(episodes)
+        lesson, state = teacher.step(state, ProgressReport(update, 4096 * update, episodes))
+        if lesson.limits != limits and 4096 * update < 1_000_000:
+            changes += 1
+            episodes_at_change.append(total)
+    assert 2 <= changes <= 6
+    assert episodes_at_change[0] >= 2 * 75

@@ -19,7 +19,8 @@ def of_costs(*costs: float, env_steps: int = 100) -> Stretch:
 
 def test_an_update_is_summed_up_by_its_means_and_its_scatter() -> None:
     update = of_costs(1.0, 2.0, 6.0)
-    assert update == Stretch(100, 3, mean_return=6.0, mean_costs=(3.0,), cost_scatter=(14.0,))
+    assert update == Stretch(100, 3, 6.0, mean_costs=(3.0,), cost_scatter=(14.0,), return_scatter=56.0)
+    assert update.return_spread == pytest.approx(math.sqrt(56 / 2))
     assert update.standard_errors[0] == pytest.approx(math.sqrt(14 / 2 / 3))
 
 
@@ -33,7 +34,7 @@ def test_an_update_without_episodes_says_nothing() -> None:
 
 def test_pooled_updates_are_one_update() -> None:
     pooled = Stretch.pooled([of_costs(1.0, 2.0), of_costs(), of_costs(6.0)])
-    assert pooled == Stretch(300, 3, mean_return=6.0, mean_costs=(3.0,), cost_scatter=(14.0,))
+    assert pooled == Stretch(300, 3, 6.0, mean_costs=(3.0,), cost_scatter=(14.0,), return_scatter=56.0)
 
 
 def test_windows_of_updates_count_updates() -> None:
@@ -45,6 +46,13 @@ def test_windows_of_updates_count_updates() -> None:
 def test_with_one_episode_an_update_windows_are_those_of_the_paper() -> None:
     history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0)]
     assert last_two_windows(history, 2, unit="episodes") == (tuple(history[1:3]), tuple(history[3:]))
+
+
+def test_a_window_grows_until_it_is_enough() -> None:
+    history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]
+    windows = last_two_windows(history, 1, unit="updates", is_enough=lambda window: window.episodes >= 3)
+    assert windows == (tuple(history[:3]), tuple(history[3:]))
+    assert last_two_windows(history[1:], 1, unit="updates", is_enough=lambda it: it.episodes >= 3) is None
 
 
 def test_windows_of_episodes_are_rounded_up_to_whole_updates() -> None:
