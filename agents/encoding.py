@@ -23,8 +23,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.spaces import Box
 
 from recrl.environments.cmdp import Floats, ObservationComponent
 
@@ -141,3 +143,44 @@ def lidar_numbers(components: Sequence[ObservationComponent]) -> tuple[npt.NDArr
     )
     places = np.flatnonzero(ranges)
     return places, ranges[places]
+
+
+class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """The proximity features as a Gymnasium wrapper, for agents of other libraries.
+
+    Args:
+        environment: its observations are vectors, and its ``observation_components`` say which of their
+            numbers are a lidar, as those of ``recrl.environments.safety_gym`` do.
+        components: the parts of an observation, for an environment that does not declare them.
+        scales: length scales in metres.
+
+    Raises:
+        ValueError: nothing is declared to be a lidar.
+    """
+
+    def __init__(
+        self,
+        environment: gymnasium.Env[Any, Any],
+        components: Sequence[ObservationComponent] | None = None,
+        scales: Sequence[float] = (0.15, 0.4),
+    ) -> None:
+        super().__init__(environment)
+        if components is None and environment.has_wrapper_attr("observation_components"):
+            components = environment.get_wrapper_attr("observation_components")
+        space = environment.observation_space
+        if not isinstance(space, Box) or len(space.shape) != 1 or not len(lidar_numbers(components or ())[0]):
+            raise ValueError(
+                f"proximity features need observations that are vectors with a declared lidar, got {space}; "
+                "give components"
+            )
+        self._encoder = Encoder(space.shape[0], components or (), scales=scales, normalise=False)
+        added = self._encoder.size - space.shape[0]
+        self.observation_space = Box(
+            np.concatenate([space.low, np.zeros(added, np.float32)]),
+            np.concatenate([space.high, np.ones(added, np.float32)]),
+            dtype=np.float32,
+        )
+
+    def observation(self, observation: Any) -> Rows:
+        """Add the proximity features, [n] -> [n + S L]."""
+        return self._encoder(np.asarray(observation, np.float32)[None])[0]

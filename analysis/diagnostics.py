@@ -1,9 +1,10 @@
 """What a curriculum did to its student: limit, cost, multiplier and step size on one axis, for each method.
 
 A figure a task and student; a column a method. From above: the student's own cost under the limit in force;
-the mean multipliers (where the student has them); the mean KL divergence of its updates. Ticks below the
-costs mark where noise was added to some run's policy; ticks below the KL divergence mark CPO's recovery
-steps, in which it only lowers the cost.
+the mean multipliers (where the student has them); what the critics of the reward and of the cost explain of
+the variance of fresh returns; the mean KL divergence of its updates. Ticks below the costs mark where noise
+was added to some run's policy; ticks below the KL divergence mark CPO's recovery steps, in which it only
+lowers the cost.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ NOISE_EVENT = "policy noise"
 RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only lowers the cost
 LARGE_MULTIPLIER = 50.0
 EVENT_TICK = (0.0, 0.05)  # share of the panel's height
+EXPLAINED = "explained_variance_"
+LEAST_EXPLAINED = -0.5  # critics may be arbitrarily wrong; what is below this is cut off
 
 
 def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0) -> Figure:
@@ -49,7 +52,14 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     edges = step_grid(boundary, total, updates=count, bins=BINS)
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     methods = [method for method in look if (updates["method"] == method).any()]
-    rows = [name for name in (f"cost_{cost}", f"multiplier_{cost}", "kl") if _known(updates, name)]
+    quantities = (
+        f"cost_{cost}",
+        f"multiplier_{cost}",
+        f"{EXPLAINED}reward",
+        f"{EXPLAINED}cost_{cost}",
+        "kl",
+    )
+    rows = [name for name in quantities if _known(updates, name)]
     limit = float(trials[f"deploy_limit_{cost}"].iloc[0])
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 1.15 * len(rows) + 0.85), layout="constrained")
@@ -69,12 +79,22 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             column[-1].set_xlabel("environment steps")
         panels.cost_axis(grid[0, 0], limit, float(np.nanmax(updates[f"cost_{cost}"].to_numpy(np.float64))))
         for axes, quantity in zip(grid[:, 0], rows, strict=True):
-            axes.set_ylabel({"kl": "KL divergence"}.get(quantity, quantity.split("_")[0]), fontsize=7.0)
+            axes.set_ylabel(_label(quantity), fontsize=7.0)
+            if quantity.startswith(EXPLAINED):
+                axes.set_ylim(LEAST_EXPLAINED, 1.0)
             if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
                 axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
                 axes.set_ylim(bottom=-0.3)
         _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}")
     return figure
+
+
+def _label(quantity: str) -> str:
+    """What an axis is called."""
+    if quantity.startswith(EXPLAINED):
+        signal = quantity.removeprefix(EXPLAINED).split("_")[0]
+        return f"explained\nvariance, {signal}"
+    return {"kl": "KL divergence"}.get(quantity, quantity.split("_", maxsplit=1)[0])
 
 
 def _panel(axes: Axes, updates: pd.DataFrame, quantity: str, edges: Floats, style: MethodStyle) -> None:

@@ -2,11 +2,12 @@
 
 import math
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-from recrl.agents.encoding import Encoder, RunningMoments
+from recrl.agents.encoding import Encoder, ProximityObservation, RunningMoments
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec, ObservationComponent
 from recrl.environments.registry import make_vector
@@ -92,3 +93,19 @@ def test_components_must_add_up_to_the_observation() -> None:
     space = Box(-1.0, 1.0, (4,), np.float32)
     with pytest.raises(ValueError, match="add up to the 4 numbers of an observation, got 3"):
         CMDPSpec("mine", space, space, ("cost",), 10, (SPEED, WALLS))
+
+
+def test_the_wrapper_gives_other_libraries_agents_the_same_numbers() -> None:
+    plain = gymnasium.make("recrl.environments.safety_gym:recrl/CarGoal2-v0")
+    wrapped = ProximityObservation(gymnasium.make("recrl.environments.safety_gym:recrl/CarGoal2-v0"))
+    seen, shown = plain.reset(seed=3)[0], wrapped.reset(seed=3)[0]
+    components = make_vector("CarGoal2", 1).cmdp.components
+    expected = Encoder(72, components, scales=(0.15, 0.4), normalise=False)(seen[None])[0]
+    assert shown.tobytes() == expected.tobytes()
+    assert wrapped.observation_space.contains(shown)
+    assert wrapped.observation_space.shape == (168,)
+
+
+def test_the_wrapper_refuses_observations_in_which_nothing_is_a_lidar() -> None:
+    with pytest.raises(ValueError, match="with a declared lidar"):
+        ProximityObservation(gymnasium.make("CartPole-v1"))
