@@ -84,10 +84,10 @@ class StudentConfig(BaseModel):
     )
     discount: Share = Field(default=0.99, description="gamma of the critics, per step (paper).")
     reward_trace_decay: Share = Field(
-        default=0.95, description="lambda of the reward's advantages (Schulman et al. 2017; paper 0.97)."
+        default=0.9, description="lambda of the reward's advantages (ours; paper 0.97)."
     )
     cost_trace_decay: Share = Field(
-        default=0.95, description="lambda of the costs' advantages (as the reward's; paper 0.97)."
+        default=0.9, description="lambda of the costs' advantages (ours; paper 0.97)."
     )
     critic_learning_rate: Positive = Field(default=1e-3, description="Adam's, for the critics (paper).")
     minibatch_size: Count | None = Field(
