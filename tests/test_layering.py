@@ -40,7 +40,7 @@ ADAPTERS = {
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\..*",
     "mujoco": r"environments\..*",
-    "numba": r"environments\.machine_code",
+    "numba": r"environments\.(machine_code|code_digest)",
     "ray": r"orchestrator\.(ray_executor|ray_nodes|ray_services|teacher_service)",
     "mlflow": r"orchestrator\.tracking(_reader)?",
     "sqlalchemy": r"orchestrator\.tracking_database",
