@@ -46,6 +46,9 @@ _ADDRESS = types.int64
 mj_step: Any = types.ExternalFunction("mj_step", types.void(_ADDRESS, _ADDRESS))
 mj_step2: Any = types.ExternalFunction("mj_step2", types.void(_ADDRESS, _ADDRESS))
 mj_forward: Any = types.ExternalFunction("mj_forward", types.void(_ADDRESS, _ADDRESS))
+mj_rnePostConstraint: Any = types.ExternalFunction(  # noqa: N816  # MuJoCo's name
+    "mj_rnePostConstraint", types.void(_ADDRESS, _ADDRESS)
+)
 mj_getState: Any = types.ExternalFunction(  # noqa: N816  # MuJoCo's name
     "mj_getState", types.void(_ADDRESS, _ADDRESS, _ADDRESS, types.int32)
 )

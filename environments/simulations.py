@@ -191,6 +191,10 @@ class Simulations:
         """
         return np.asarray(self._warnings[:, BAD_STATES, 1].any(axis=1) | self.stopped)
 
+    def any_broken(self) -> bool:
+        """Whether any simulation has diverged since its last reset: cheaper than ``broken``."""
+        return self.any_stopped or bool(self._warnings[:, BAD_STATES, 1].any())
+
     def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
         """A copy of one simulation, for drawing or for any function of MuJoCo; a new one, or ``into``."""
         data = mujoco.MjData(self.model) if into is None else into
