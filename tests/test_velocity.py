@@ -79,7 +79,7 @@ def gymnasiums_step(name: str, data: mujoco.MjData, action: Floats) -> tuple[Flo
     def place() -> Floats:
         if task.measured == "mass":
             return np.asarray(model.body_mass @ data.xipos / model.body_mass.sum())
-        return (data.xpos[1] if task.measured == "torso" else data.qpos).copy()
+        return np.array(data.xpos[1] if task.measured == "torso" else data.qpos)
 
     before = place()
     data.ctrl[:] = action
@@ -330,12 +330,12 @@ def test_a_picture_is_rgb_follows_the_robot_and_changes_nothing(name: str) -> No
     assert first.shape == (360, 480, 3)
     assert first.dtype == np.uint8
     assert first.std() > 5.0, "there is something to be seen"
-    assert np.array_equal(first, seen.render())
+    assert np.array_equal(first, np.asarray(seen.render()))
     for _ in range(5):
         action = np.full(unseen.action_space.shape or (), 0.3)
         assert np.array_equal(seen.step(action)[0], unseen.step(action)[0])
         seen.render()
-    assert not np.array_equal(first, seen.render())
+    assert not np.array_equal(first, np.asarray(seen.render()))
     seen.close()
 
 

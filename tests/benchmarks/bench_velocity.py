@@ -97,7 +97,7 @@ class Gymnasium(Bare):
         if self.task.measured == "mass":
             mass = self.model.body_mass
             return np.asarray(mass @ data.xipos / mass.sum())
-        return (data.xpos[1] if self.task.measured == "torso" else data.qpos[:2]).copy()
+        return np.array(data.xpos[1] if self.task.measured == "torso" else data.qpos[:2])
 
 
 def timed(work: Callable[[Floats], object], actions: Floats) -> float:
