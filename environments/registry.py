@@ -57,6 +57,14 @@ SAFETY_GYM = {
     "Button": "touches the right one of four buttons",
     "Push": "pushes a box to one goal after another",
 }
+VELOCITY = {
+    "Ant": 2.6222,
+    "HalfCheetah": 3.2096,
+    "Hopper": 0.7402,
+    "Humanoid": 1.4149,
+    "Swimmer": 0.2282,
+    "Walker2d": 2.3415,
+}
 OBSTACLES = ("", ", past a few obstacles", ", past many obstacles")
 
 TASKS: dict[str, Task] = {
@@ -130,6 +138,16 @@ TASKS: dict[str, Task] = {
         for robot in ("Car", "Point")
         for goal, what in SAFETY_GYM.items()
         for level in (0, 1, 2)
+    },
+    **{
+        f"Safety{robot}Velocity": Task(
+            summary=f"Safety-Gymnasium: {robot} runs, at a cost of 1 in each step above {threshold} m/s.",
+            options="recrl.environments.velocity.environments:VelocityOptions",
+            make="recrl.environments.velocity.environments:make_velocity",
+            drawn="recrl.environments.velocity.environments:draw_velocity",
+            sample_options={"horizon": 12},
+        )
+        for robot, threshold in VELOCITY.items()
     },
 }
 

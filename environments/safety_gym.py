@@ -24,7 +24,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field
 
+from recrl.environments.camera import Camera, Renderer
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.ordering import give_actions
 from recrl.environments.safety_tasks import HORIZON, LIDAR_RANGE, SAFETY_TASKS, SUBSTEPS, SafetyTask
 from recrl.environments.vector import CMDPVectorEnv
 
@@ -101,22 +103,8 @@ def _order(
     worlds: SafetyWorlds, actions: npt.NDArray[Any], shape: tuple[int, ...], options: SafetyGymOptions
 ) -> None:
     """Give the worlds their actions, or say in a sentence what is wrong with them."""
-    name = worlds.task.name
-    actions = np.asarray(actions)
-    if actions.shape != shape or actions.dtype.kind not in "fiu":
-        raise ValueError(
-            f"{name}: actions must be numbers of shape {shape}, got {actions.dtype} of shape {actions.shape}"
-        )
-    if worlds.order(actions):
-        return
-    if not np.isfinite(actions).all():
-        raise ValueError(f"{name}: actions must be finite, got {actions.tolist()}")
-    if options.out_of_range == "error":
-        raise ValueError(
-            f"{name}: actions must be in [-1, 1], got {actions.tolist()} "
-            "(option out_of_range: clip clips them)"
-        )
-    worlds.order(np.clip(actions, -1.0, 1.0))
+    out_of_range = options.out_of_range
+    give_actions(worlds.task.name, worlds, actions, shape=shape, bound=1.0, out_of_range=out_of_range)
 
 
 def _info(terms: tuple[str, ...], outcome: Outcome, options: SafetyGymOptions) -> dict[str, Any]:
@@ -128,37 +116,10 @@ def _info(terms: tuple[str, ...], outcome: Outcome, options: SafetyGymOptions) -
     return info
 
 
-class _Camera:
-    """Draws worlds, once somebody looks; copies of an environment get a camera of their own."""
+def _renderer(worlds: SafetyWorlds) -> Renderer:
+    from recrl.environments.safety_rendering import SafetyRenderer  # noqa: PLC0415  # needs graphics
 
-    def __init__(self, render_mode: str | None) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        self.render_mode = render_mode
-        self._renderer: Any = None
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _Camera, (self.render_mode,)
-
-    def frames(self, worlds: SafetyWorlds) -> tuple[npt.NDArray[np.uint8], ...]:
-        """One picture [height, width, 3] of each world."""
-        if self.render_mode is None:
-            raise ValueError(
-                f"{worlds.task.name}: to render, make the environment with render_mode='rgb_array'"
-            )
-        if not worlds.generators:
-            raise ValueError(f"{worlds.task.name}: call reset before the first picture")
-        if self._renderer is None:
-            from recrl.environments.safety_rendering import SafetyRenderer  # noqa: PLC0415  # needs graphics
-
-            self._renderer = SafetyRenderer(worlds)
-        return tuple(self._renderer.frame(index) for index in range(worlds.number))
-
-    def close(self) -> None:
-        """Free the graphics driver's memory."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+    return SafetyRenderer(worlds)
 
 
 class SafetyGymVectorEnv(CMDPVectorEnv):
@@ -182,7 +143,7 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
         self._terms = tuple(f"cost_{term}" for term in found.cost_terms)
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self._camera = _Camera(render_mode)
+        self._camera = Camera(render_mode, _renderer)
         self.metadata = {
             **CMDPVectorEnv.metadata,
             "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -277,7 +238,7 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
         self.options = SafetyGymOptions(**options)
         self._terms = tuple(f"cost_{term}" for term in found.cost_terms)
         self.render_mode = render_mode
-        self._camera = _Camera(render_mode)
+        self._camera = Camera(render_mode, _renderer)
         self.metadata = {**self.metadata, "render_fps": frames_per_second(found)}
         self.cost_names = cost_names(found, self.options)
         self.observation_components = observation_components(found)

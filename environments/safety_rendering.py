@@ -3,30 +3,23 @@
 Goals and hazards are no part of the physics' model; they are added to the picture, and so are the lidar's
 readings: one ring of 16 spheres above the robot for each kind of object, brighter where something is near.
 
-Off-screen drawing goes through EGL or, where that is missing, OSMesa; the environment variable ``MUJOCO_GL``
-may name one of them. Importing this module imports neither.
-
 Source of colours and places of the spheres: openai/safety-gym ``engine.py``.
 """
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
 from typing import Any
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
+from recrl.environments.camera import Frame, make_context
 from recrl.environments.cmdp import Floats
 from recrl.environments.gremlins import gremlin_course
 from recrl.environments.safety_tasks import GOAL_HEIGHT, LIDAR_BINS
 from recrl.environments.safety_worlds import SafetyWorlds
 from recrl.environments.scene import rotation_matrices, scene_xml, upright
 
-Frame = npt.NDArray[np.uint8]
 Colour = tuple[float, float, float]
 
 COLOURS: dict[str, Colour] = {
@@ -63,10 +56,6 @@ _ROOM = """
 """
 
 
-class RenderingUnavailableError(RuntimeError):
-    """This machine cannot draw off-screen."""
-
-
 class SafetyRenderer:
     """Draws single worlds of a task.
 
@@ -83,7 +72,7 @@ class SafetyRenderer:
         self._worlds = worlds
         self._model = _coloured_model(worlds)
         self._data = mujoco.MjData(self._model)
-        self._context = _make_context(width, height)
+        self._context = make_context(width, height)
         self._drawing = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawing)
         self._scene = mujoco.MjvScene(self._model, maxgeom=MAX_GEOMS)
@@ -202,22 +191,3 @@ def _coloured_model(worlds: SafetyWorlds) -> mujoco.MjModel:
             if body and body.startswith(kind.rstrip("s")):
                 model.geom_rgba[geom] = (*colour, 1.0)
     return model
-
-
-def _make_context(width: int, height: int) -> Any:
-    """An off-screen drawing context, by the first library that is there."""
-    defaults = {"darwin": ("cgl",), "win32": ("glfw",)}.get(sys.platform, ("egl", "osmesa"))
-    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
-    failures = []
-    for name in (chosen,) if chosen in defaults else defaults:
-        try:
-            context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
-            context.make_current()
-        except Exception as error:  # each library fails in a way of its own
-            failures.append(f"{name}: {error}".splitlines()[0])
-        else:
-            return context
-    raise RenderingUnavailableError(
-        "drawing off-screen needs EGL (Debian: libegl1) or OSMesa (Debian: libosmesa6, MUJOCO_GL=osmesa); "
-        f"failed: {'; '.join(failures)}"
-    )

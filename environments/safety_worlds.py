@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.layout import keepouts, sample_goal, sample_layout
-from recrl.environments.safety_tasks import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SUBSTEPS, SafetyTask
+from recrl.environments.safety_tasks import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
 from recrl.environments.scene import make_scene, upright
 from recrl.environments.simulations import Simulations
 from recrl.environments.task_record import allocate, places_of_objects, task_record
@@ -37,8 +37,6 @@ Booleans = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 Observations = npt.NDArray[np.float32]
 
-PARTS = SUBSTEPS + 1
-"""Of which a step's work consists: see ``recrl.environments.world_step.step``."""
 _NOBODY = np.zeros(0, np.intp)
 
 
@@ -154,7 +152,7 @@ class SafetyWorlds:
 
     def advance(self) -> Outcome:
         """Take one step in every world, as ordered."""
-        self.simulations.apply(step, self._address, parts=PARTS)
+        self.simulations.apply(step, self._address)
         results, flags = self._memory.results.copy(), self._memory.flags.copy()
         rewards, costs, terms = results[0], results[1:2], results[2:]
         goal_met, broken, terminated, truncated = flags[0], flags[1], flags[2], flags[3]
@@ -208,8 +206,8 @@ class SafetyWorlds:
                 f"these are {self.number}"
             )
         self.simulations.load(state["physics"])
-        for name, saved in state["worlds"].items():
-            self._memory.worlds[name] = saved
+        for name in WORLD.names or ():
+            self._memory.worlds[name] = state["worlds"][name]
         self._memory.observations[...] = state["observations"]
         self.seed(0)
         for generator, saved in zip(self.generators, state["generators"], strict=True):

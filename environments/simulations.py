@@ -1,18 +1,20 @@
 """Many MuJoCo simulations of one model, stepped together, that can be saved and restored exactly.
 
-Each is a batch of MuJoCo's (``mjbatch.h``, MuJoCo 4) with one simulation, through its C interface; threads
-share the batches out (``recrl.environments.thread_pool``). MuJoCo's Python class ``mujoco.batch.Batch`` lacks
-one thing besides: which bodies sleep is not part of a state row, and the class offers no way to put it back.
-Here ``load`` does, so that a simulation with sleeping bodies continues to the last bit.
+They are one batch of MuJoCo's (``mjbatch.h``, MuJoCo 4) through its C interface, on MuJoCo's own threads.
+MuJoCo's Python class ``mujoco.batch.Batch`` lacks two things: it cannot run a compiled function on each
+simulation, and it offers no way to put sleeping bodies back to sleep, which is no part of a state row. Here
+``load`` does, so that a simulation with sleeping bodies continues to the last bit.
 
-Letters: B simulations; n numbers in a state row.
+A batch with several threads cannot follow its process through a fork: the child has none of the threads.
+
+Notation: B simulations; n numbers in a state row.
 """
 
 from __future__ import annotations
 
-import copy
 import ctypes
 import functools
+import os
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -23,7 +25,6 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.machine_code import mujoco_library
-from recrl.environments.thread_pool import SIMULATION, ThreadPool, in_cache_lines
 
 Integers = npt.NDArray[np.int32]
 Ids = Sequence[int] | npt.NDArray[np.intp] | None
@@ -56,11 +57,11 @@ def _library() -> Any:
             (pointer, integer, ctypes.POINTER(_Config), ctypes.c_char_p, integer),
         ),
         "mjb_deleteBatch": (None, (pointer,)),
-        "mjb_setModels": (None, (pointer, pointer)),
         "mjb_nstate": (integer, (pointer,)),
         "mjb_state": (pointer, (pointer,)),
         "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
         "mjb_warning": (pointer, (pointer,)),
+        "mjb_status": (pointer, (pointer,)),
         "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
         "mjb_forward": (integer, (pointer, pointer, integer, integer)),
         "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
@@ -78,6 +79,32 @@ def _library() -> Any:
 
 class PhysicsError(RuntimeError):
     """MuJoCo refused to go on."""
+
+
+class _Batch:
+    """MuJoCo's batch; freed when neither it nor a view of its memory is in use.
+
+    Attributes:
+        address: of the ``mjBatch``.
+        process: which made it.
+    """
+
+    def __init__(self, model: mujoco.MjModel, number: int, num_threads: int) -> None:
+        config = _Config(nthread=num_threads, persistent=True)
+        reason = ctypes.create_string_buffer(1000)
+        address = _library().mjb_makeBatch(model._address, number, ctypes.byref(config), reason, len(reason))
+        if not address:
+            raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
+        self.address = int(address)
+        self.process = os.getpid()
+        weakref.finalize(self, _delete, self.address, self.process, num_threads)
+
+    def view(self, address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
+        """The batch's memory at an address as an array, which keeps the batch alive."""
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        memory = (ctypes.c_char * size).from_address(address)
+        memory.batch = self
+        return np.frombuffer(memory, dtype).reshape(shape)
 
 
 class Simulations:
@@ -102,65 +129,40 @@ class Simulations:
             raise ValueError(f"there must be at least one simulation, got {number}")
         self.model = model
         self.number = number
+        self._num_threads = num_threads
         self._library = _library()
-        self._own_model = copy.copy(model)
-        self._models = ctypes.c_void_p(self._own_model._address)
-        self._batches: list[int] = []
-        self._delete = weakref.finalize(
-            self, _delete, self._library, self._batches, (self._own_model, self._models)
-        )
-        for _ in range(number):
-            self._batches.append(self._make_batch())
+        self._batch = _Batch(model, number, num_threads)
         self._data = mujoco.MjData(model)
-        self._everyone: Integers = in_cache_lines(number, np.int32)
-        self._everyone[:] = np.arange(number)
-        size = self._library.mjb_nstate(self._batches[0])
-        addresses = [self._library.mjb_state(batch) for batch in self._batches]
-        self._states = [_view(address, np.float64, (size,)) for address in addresses]
-        self._warnings = [
-            _view(self._library.mjb_warning(batch), np.int32, (_NUM_WARNINGS, 2)) for batch in self._batches
-        ]
-        self.rows: Floats = np.array(self._states)
-        records = in_cache_lines(number, SIMULATION)
-        records["batch"], records["state"] = self._batches, addresses
-        records["row"] = [row.ctypes.data for row in self.rows]
-        self._records = records
-        self._threads = ThreadPool(records, size, num_threads)
+        address = self._batch.address
+        size = self._library.mjb_nstate(address)
+        view = self._batch.view
+        self.rows: Floats = view(self._library.mjb_state(address), np.float64, (number, size))
+        self._warnings = view(self._library.mjb_warning(address), np.int32, (number, _NUM_WARNINGS, 2))
+        self._status = view(self._library.mjb_status(address), np.int32, (number,))
         self.stopped = np.zeros(number, np.bool_)
         self.any_stopped = False
 
     def state(self, component: mujoco.mjtState, shape: tuple[int, ...]) -> Floats:
         """A part of ``rows`` as a live view, [B, *shape]."""
-        size, batch = ctypes.c_int(), self._batches[0]
+        size, batch = ctypes.c_int(), self._batch.address
         address = self._library.mjb_stateComponent(batch, int(component), ctypes.byref(size))
         start = (address - self._library.mjb_state(batch)) // self.rows.itemsize
         view: Floats = self.rows[:, start : start + size.value].reshape(self.number, *shape)
         return view
 
-    def apply(self, function: Any, argument: int, ids: Ids = None, *, parts: int = 1) -> None:
+    def apply(self, function: Any, argument: int, ids: Ids = None) -> None:
         """Run a compiled function on simulations; it may step them.
 
         Args:
             function: from ``machine_code.compiled_for_batch``.
             argument: an address, which the function is given.
             ids: which simulations, each once; None for all.
-            parts: of which the function's work consists; it is done on all threads if there are several. The
-                function may be called several times, each time for parts ``first`` to before ``last`` of its
-                ``CALL``.
 
         Raises:
-            ValueError: there is no such simulation, or one is named twice; or there are no parts.
+            ValueError: there is no such simulation, or one is named twice.
+            PhysicsError: the process is a fork of the one that made the simulations, which had threads.
         """
-        chosen = self._chosen(ids)
-        if parts < 1:
-            raise ValueError(f"work must have at least one part, got {parts}")
-        try:
-            self._threads.run(function.address, argument, chosen, parts)
-        finally:  # after a signal, too: the job is done then
-            if self._threads.failures[0]:
-                self.any_stopped = True
-                self.stopped[chosen] |= self._records["failed"][chosen] != 0
-                self._threads.failures[0] = 0
+        self._call(self._library.mjb_apply, ids, function.address, argument, 1)
 
     def step(self, substeps: int, ids: Ids = None) -> None:
         """Advance simulations, then compute everything, accelerations included, at the new state.
@@ -169,27 +171,17 @@ class Simulations:
             substeps: physics steps.
             ids: which simulations; None for all.
         """
-        for index in self._chosen(ids):
-            self._states[index][:] = self.rows[index]
-            if self._library.mjb_step(self._batches[index], None, 1, substeps, _EVERYTHING):
-                self.stopped[index] = self.any_stopped = True
-            self.rows[index] = self._states[index]
+        self._call(self._library.mjb_step, ids, substeps, _EVERYTHING)
 
     def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
-        chosen = self._chosen(ids)
-        self.stopped[chosen] = False
+        self._check(self._library.mjb_reset, ids, None, _NOTHING)
+        self.stopped[self._chosen(ids)] = False
         self.any_stopped = bool(self.stopped.any())
-        for index in chosen:
-            self._check(index, self._library.mjb_reset(self._batches[index], None, 1, None, _NOTHING))
-            self.rows[index] = self._states[index]
 
     def forward(self, ids: Ids) -> None:
         """Compute everything that follows from the rows of some simulations."""
-        for index in self._chosen(ids):
-            self._states[index][:] = self.rows[index]
-            self._check(index, self._library.mjb_forward(self._batches[index], None, 1, _EVERYTHING))
-            self.rows[index] = self._states[index]
+        self._check(self._library.mjb_forward, ids, _EVERYTHING)
 
     def broken(self) -> npt.NDArray[np.bool_]:
         """Whether a simulation has diverged since its last reset, [B].
@@ -197,24 +189,25 @@ class Simulations:
         MuJoCo then warns and silently starts again from the model's defaults, or, where it cannot compute a
         step at all, leaves the simulation where it was.
         """
-        return np.asarray([warnings[BAD_STATES, 1].any() for warnings in self._warnings] | self.stopped)
+        return np.asarray(self._warnings[:, BAD_STATES, 1].any(axis=1) | self.stopped)
+
+    def any_broken(self) -> bool:
+        """Whether any simulation has diverged since its last reset: cheaper than ``broken``."""
+        return self.any_stopped or bool(self._warnings[:, BAD_STATES, 1].any())
 
     def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
         """A copy of one simulation, for drawing or for any function of MuJoCo; a new one, or ``into``."""
         data = mujoco.MjData(self.model) if into is None else into
-        self._library.mjb_getData(self._batches[index], 0, data._address)
+        self._library.mjb_getData(self._batch.address, index, data._address)
         return data
 
     def save(self) -> dict[str, Any]:
         """Everything that the future of these simulations depends on."""
-        asleep = np.empty((self.number, self.model.ntree), np.int32)
-        for index in range(self.number):
-            self._library.mjb_getData(self._batches[index], 0, self._data._address)
-            asleep[index] = self._data.tree_asleep
+        asleep = [self.data(index, self._data).tree_asleep.copy() for index in range(self.number)]
         return {
             "rows": self.rows.copy(),
-            "asleep": asleep,
-            "warnings": np.array([warnings[:, 1] for warnings in self._warnings]),
+            "asleep": np.array(asleep, np.int32),
+            "warnings": self._warnings[:, :, 1].copy(),
             "stopped": self.stopped.copy(),
         }
 
@@ -227,17 +220,16 @@ class Simulations:
         rows = np.asarray(state["rows"], np.float64)
         if rows.shape != self.rows.shape:
             raise ValueError(f"saved physics must have shape {self.rows.shape}, got {rows.shape}")
-        self.reset(range(self.number))
-        for index, batch in enumerate(self._batches):
+        self.reset(None)
+        for index in range(self.number):
             restored = self._restored(rows[index], state["asleep"][index])
 
             def put_back(model: int, data: int, *_: Any, source: int = restored._address) -> None:
                 self._library.mj_copyData(data, model, source)
 
             function = ctypes.cast(_BatchFunction(put_back), ctypes.c_void_p)
-            self._check(index, self._library.mjb_apply(batch, None, 0, function, None, 1))
-            self.rows[index] = self._states[index]
-            self._warnings[index][:, 1] = state["warnings"][index]
+            self._check(self._library.mjb_apply, [index], function, None, 1)
+        self._warnings[:, :, 1] = state["warnings"]
         self.stopped[...] = state["stopped"]
         self.any_stopped = bool(self.stopped.any())
 
@@ -257,43 +249,57 @@ class Simulations:
         mujoco.mj_extractState(self.model, row, ROW, warm_start, component)
         return warm_start
 
-    def _make_batch(self) -> int:
-        config = _Config(nthread=1, persistent=True)
-        reason = ctypes.create_string_buffer(1000)
-        batch = self._library.mjb_makeBatch(self._models, 1, ctypes.byref(config), reason, len(reason))
-        if not batch:
-            raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
-        # Each batch has a copy of the model; one that all look at fits into a core's cache better.
-        self._library.mjb_setModels(batch, ctypes.byref(self._models))
-        return int(batch)
+    def _call(self, function: Any, ids: Ids, *arguments: Any) -> None:
+        """Call a function of MuJoCo on simulations, and note which of them it could not compute."""
+        chosen = None if ids is None else self._chosen(ids)
+        failed = True
+        try:
+            failed = self._run(function, chosen, *arguments)
+        finally:  # a signal may come before the number of failures is known
+            if failed:
+                self.stopped[self._chosen(ids)] |= self._status[self._chosen(ids)] != 0
+                self.any_stopped = bool(self.stopped.any())
+
+    def _check(self, function: Any, ids: Ids, *arguments: Any) -> None:
+        """Call a function of MuJoCo on simulations; raise an error if it could not compute one of them."""
+        chosen = self._chosen(ids)
+        if self._run(function, chosen, *arguments):
+            index = int(chosen[self._status[chosen] != 0][0])
+            message = self._library.mjb_error(self._batch.address, index).decode()
+            raise PhysicsError(f"MuJoCo stopped in simulation {index}: {message}")
+
+    def _run(self, function: Any, chosen: Integers | None, *arguments: Any) -> bool:
+        """Call a function of MuJoCo on simulations; whether it could not compute some."""
+        if self._num_threads > 1 and os.getpid() != self._batch.process:
+            raise PhysicsError(
+                f"simulations with num_threads = {self._num_threads} stay in the process that made them, and "
+                "this is a fork of it: make them anew here, or with num_threads = 1"
+            )
+        if chosen is None:
+            return bool(function(self._batch.address, None, 0, *arguments))
+        if not chosen.size:
+            return False
+        return bool(function(self._batch.address, chosen.ctypes.data, chosen.size, *arguments))
 
     def _chosen(self, ids: Ids) -> Integers:
         if ids is None:
-            return self._everyone
+            return np.arange(self.number, dtype=np.int32)
         chosen = np.asarray(ids)
+        ordered = np.unique(chosen)  # MuJoCo asks for that
         if chosen.size and (
             chosen.dtype.kind not in "iu"
-            or chosen.min() < 0
-            or chosen.max() >= self.number
-            or len(np.unique(chosen)) < len(chosen)
+            or ordered[0] < 0
+            or ordered[-1] >= self.number
+            or len(ordered) < len(chosen)
         ):
             raise ValueError(
                 f"simulations must be different whole numbers from 0 to {self.number - 1}, "
                 f"got {chosen.tolist()}"
             )
-        return np.ascontiguousarray(chosen, np.int32)
-
-    def _check(self, index: int, failed: int) -> None:
-        if failed:
-            message = self._library.mjb_error(self._batches[index], 0).decode()
-            raise PhysicsError(f"MuJoCo stopped in simulation {index}: {message}")
+        return ordered.astype(np.int32)
 
 
-def _view(address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    return np.frombuffer((ctypes.c_char * size).from_address(address), dtype).reshape(shape)
-
-
-def _delete(library: Any, batches: list[int], _needed: object) -> None:
-    for batch in batches:
-        library.mjb_deleteBatch(batch)
+def _delete(address: int, process: int, num_threads: int) -> None:
+    """Free a batch; what a fork has inherited stays, as MuJoCo would wait for threads that are not there."""
+    if num_threads == 1 or process == os.getpid():
+        _library().mjb_deleteBatch(address)

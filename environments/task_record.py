@@ -31,7 +31,6 @@ from recrl.environments.safety_tasks import (
 )
 from recrl.environments.scene import Scene
 from recrl.environments.simulations import BAD_STATES, ROW
-from recrl.environments.thread_pool import in_cache_lines
 from recrl.environments.world_step import (
     KINDS,
     MAX_BODIES,
@@ -95,9 +94,9 @@ class Memory:
 def allocate(scene: Scene, number: int) -> Memory:
     """Memory for so many worlds of a scene."""
     row = mujoco.mj_stateSize(scene.model, ROW)
-    outcomes = in_cache_lines(number, OUTCOME)
+    outcomes = np.zeros(number, OUTCOME)
     return Memory(
-        worlds=in_cache_lines(number, WORLD),
+        worlds=np.zeros(number, WORLD),
         outcomes=outcomes,
         results=outcomes["numbers"].T[: 2 + len(scene.task.cost_terms)],
         flags=outcomes["flags"].view(np.bool_).T,
@@ -109,7 +108,7 @@ def allocate(scene: Scene, number: int) -> Memory:
 
 def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
     """The record ``TASK`` of a scene, an array [1]; it is of use as long as the memory lives."""
-    record = in_cache_lines(1, TASK)
+    record = np.zeros(1, TASK)
     one = record[0]
     for name in ("worlds", "outcomes", "observations", "rows"):
         one[name] = getattr(memory, name).ctypes.data

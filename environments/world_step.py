@@ -1,12 +1,12 @@
 """One environment step of one world of a Safety Gym task, compiled to machine code.
 
-``step`` is called for each world, on whatever thread: the action, ten physics steps, what the robot then
-sees, feels, earns and pays. Nothing here looks at another world, so results depend neither on how many there
-are nor on the threads. Resets and new goals, which are drawn at random, are not made here
+``step`` is called for each world, on whatever thread of MuJoCo's: the action, ten physics steps, what the
+robot then sees, feels, earns and pays. Nothing here looks at another world, so results depend neither on how
+many there are nor on the threads. Resets and new goals, which are drawn at random, are not made here
 (``recrl.environments.safety_worlds``).
 
 What a world is made of is one record ``WORLD``; what all worlds of a task share is one record ``TASK``. These
-have room for every task. All numbers come with them: see ``recrl.environments.machine_code``.
+have room for every task.
 
 Letters: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
 
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from recrl.environments.machine_code import (
-    CALL,
     array_at,
     compiled,
     compiled_for_batch,
@@ -142,7 +141,6 @@ WORLD = np.dtype(
         ("terms", np.float64, (MAX_TERMS,)),
         ("goal_met", np.bool_),
         ("broken", np.bool_),
-        ("room", np.uint8, (16,)),  # to the end of a line of the cache
     ],
     align=True,
 )
@@ -151,12 +149,10 @@ OUTCOME = np.dtype(
     [
         ("numbers", np.float64, (2 + MAX_TERMS,)),  # reward, cost, the indicator of each cost term
         ("flags", np.uint8, (len(FLAGS),)),  # 0 or 1
-        ("room", np.uint8, (20,)),  # a line of the cache: threads write to neighbours at the same time
     ],
     align=True,
 )
 
-_calls = array_at(CALL)
 _tasks = array_at(TASK)
 _worlds = array_at(WORLD)
 _outcomes = array_at(OUTCOME)
@@ -551,15 +547,15 @@ def begin(task: Any, world: Any, model: int, data: int, index: int) -> bool:
 
 
 @compiled
-def simulate(task: Any, world: Any, model: int, data: int, call: Any) -> None:
-    """Those of a step's physics steps that are asked for.
+def simulate(task: Any, world: Any, model: int, data: int, index: int) -> None:
+    """A step's physics steps.
 
     Where the last step left off, MuJoCo has computed already what follows from coordinates and velocities:
     the first physics step then does not compute it again, which changes nothing.
     """
-    untouched = begin(task, world, model, data, call.index) if call.first == 0 else False
+    untouched = begin(task, world, model, data, index)
     leads = world.embodied >= 0
-    for substep in range(call.first, min(call.last, task.substeps)):
+    for substep in range(task.substeps):
         if leads:
             lead_gremlin(task, world, data, substep)
         if substep == 0 and untouched and not leads:
@@ -584,36 +580,29 @@ def end(task: Any, world: Any, model: int, data: int, index: int) -> None:
 
 
 @compiled_for_batch
-def step(model: int, data: int, _: int, address: int) -> None:
-    """One environment step of one world; the action is in its record.
-
-    Its parts are the physics steps, and what follows from them.
-    """
-    call = _calls(address, 1)[0]
-    task = _tasks(call.argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[call.index]
-    simulate(task, world, model, data, call)
-    if call.last > task.substeps:
-        end(task, world, model, data, call.index)
+def step(model: int, data: int, index: int, argument: int) -> None:
+    """One environment step of one world; the action is in its record."""
+    task = _tasks(argument, 1)[0]
+    world = _worlds(task.worlds, task.number)[index]
+    simulate(task, world, model, data, index)
+    end(task, world, model, data, index)
 
 
 @compiled_for_batch
-def review(_: int, data: int, _simulation: int, address: int) -> None:
+def review(_: int, data: int, index: int, argument: int) -> None:
     """Find what is to be found in one world as it is: after a reset, or with a new goal."""
-    call = _calls(address, 1)[0]
-    task = _tasks(call.argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[call.index]
+    task = _tasks(argument, 1)[0]
+    world = _worlds(task.worlds, task.number)[index]
     look(task, world, data)
     judge(task, world, data)
-    observe(task, world, data, call.index)
+    observe(task, world, data, index)
 
 
 @compiled_for_batch
-def perceive(_: int, data: int, _simulation: int, address: int) -> None:
+def perceive(_: int, data: int, index: int, argument: int) -> None:
     """Observe one world, whose objects and accelerations are as somebody has written them."""
-    call = _calls(address, 1)[0]
-    task = _tasks(call.argument, 1)[0]
-    observe(task, _worlds(task.worlds, task.number)[call.index], data, call.index)
+    task = _tasks(argument, 1)[0]
+    observe(task, _worlds(task.worlds, task.number)[index], data, index)
 
 
 @compiled_for_python

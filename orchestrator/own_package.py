@@ -17,8 +17,9 @@ def source_digest() -> str:
     """Ten hex digits that differ whenever a Python file of recrl does: a version alone does not say it."""
     digest = hashlib.sha256()
     for name in FOLDERS:
-        for path in sorted(_folder(name).glob("*.py")):
-            digest.update(f"{name}/{path.name}\n".encode())
+        folder = _folder(name)
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:10]
 

@@ -336,7 +336,15 @@ def test_too_many_trials_are_refused() -> None:
 
 
 ROOT = Path(__file__).parent.parent
-SHIPPED = {"demo": 20, "rivergrid": 100, "safety-gym": 150, "safety-gym-small": 36, "safety-gym-agents": 27}
+SHIPPED = {
+    "demo": 20,
+    "rivergrid": 100,
+    "safety-gym": 150,
+    "safety-gym-agents": 27,
+    "safety-gym-small": 36,
+    "velocity": 180,
+    "velocity-curricula": 180,
+}
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "grids").glob("*.yaml")), ids=lambda path: path.stem)

@@ -34,6 +34,7 @@ DEFINITIONS = {
         "1.0.0": "a version",
         "1e-5": "the tolerance",
     },
+    "Velocity tasks": {"1.0.0": "a version", "1e-5": "the tolerance"},
 }
 NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
 MEASURED = re.compile(r"[.%,e]|\d{3}")  # small whole numbers are mostly counts of things

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+from recrl.environments.camera import RenderingUnavailableError
 from recrl.environments.safety_gym import SafetyGymEnv, SafetyGymVectorEnv
-from recrl.environments.safety_rendering import RenderingUnavailableError
 
 
 def drawing(task: str) -> SafetyGymEnv:

@@ -1,0 +1,93 @@
+"""Pictures of worlds, drawn once somebody looks.
+
+Off-screen drawing goes through EGL or, where that is missing, OSMesa; the environment variable ``MUJOCO_GL``
+may name one of them. Importing this module imports neither.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+Frame = npt.NDArray[np.uint8]
+
+
+class RenderingUnavailableError(RuntimeError):
+    """This machine cannot draw off-screen."""
+
+
+class Renderer(Protocol):
+    """Draws single worlds of a task."""
+
+    def frame(self, index: int) -> Frame:
+        """World ``index`` as it is now, [height, width, 3]."""
+
+    def close(self) -> None:
+        """Free what the graphics driver holds."""
+
+
+class Camera:
+    """Draws worlds; copies of an environment get a camera of their own.
+
+    Args:
+        render_mode: None or ``rgb_array``.
+        make_renderer: (worlds) -> what draws them, called when the first picture is wanted; a function of a
+            module.
+    """
+
+    def __init__(self, render_mode: str | None, make_renderer: Callable[[Any], Renderer]) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.render_mode = render_mode
+        self._make_renderer = make_renderer
+        self._renderer: Renderer | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Camera, (self.render_mode, self._make_renderer)
+
+    def frames(self, worlds: Any) -> tuple[Frame, ...]:
+        """One picture [height, width, 3] of each world."""
+        if self.render_mode is None:
+            raise ValueError(
+                f"{worlds.task.name}: to render, make the environment with render_mode='rgb_array'"
+            )
+        if not worlds.generators:
+            raise ValueError(f"{worlds.task.name}: call reset before the first picture")
+        if self._renderer is None:
+            self._renderer = self._make_renderer(worlds)
+        return tuple(self._renderer.frame(index) for index in range(worlds.number))
+
+    def close(self) -> None:
+        """Free the graphics driver's memory."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def make_context(width: int, height: int) -> Any:
+    """An off-screen drawing context, by the first library that is there.
+
+    Raises:
+        RenderingUnavailableError: there is neither EGL nor OSMesa, or MUJOCO_GL names one that is missing.
+    """
+    defaults = {"darwin": ("cgl",), "win32": ("glfw",)}.get(sys.platform, ("egl", "osmesa"))
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    failures = []
+    for name in (chosen,) if chosen in defaults else defaults:
+        try:
+            context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+            context.make_current()
+        except Exception as error:  # each library fails in a way of its own
+            failures.append(f"{name}: {error}".splitlines()[0])
+        else:
+            return context
+    raise RenderingUnavailableError(
+        "drawing off-screen needs EGL (Debian: libegl1) or OSMesa (Debian: libosmesa6, MUJOCO_GL=osmesa); "
+        f"failed: {'; '.join(failures)}"
+    )

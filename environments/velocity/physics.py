@@ -1,0 +1,96 @@
+"""One step of a robot's physics, compiled: MuJoCo's steps, and copies of what is observed of its bodies.
+
+After a step what is known of bodies is what MuJoCo computed last: before its last physics step ended. So it
+is in Gymnasium's environments, which read it without computing it anew.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.machine_code import (
+    array_at,
+    compiled,
+    compiled_for_batch,
+    mj_forward,
+    mj_rnePostConstraint,
+    mj_step,
+)
+from recrl.environments.mujoco_layout import structure
+
+MAX_FIELDS = 5
+"""Room for fields of ``mjData`` that are copied."""
+
+PHYSICS = np.dtype(
+    [
+        ("frame_skip", np.int64),
+        ("forces", np.bool_),  # whether contact forces on bodies are computed
+        ("fields", np.int64),  # how many are copied
+        ("offset", np.int64, (MAX_FIELDS,)),  # in mjData
+        ("size", np.int64, (MAX_FIELDS,)),  # numbers
+        ("copy", np.int64, (MAX_FIELDS,)),  # address of [B, size]
+    ],
+    align=True,
+)
+
+_physics = array_at(PHYSICS)
+_doubles = array_at(np.float64)
+_addresses = array_at(np.int64)
+
+
+def physics_record(frame_skip: int, copies: dict[str, Floats], *, forces: bool) -> npt.NDArray[Any]:
+    """The record ``PHYSICS``, an array [1].
+
+    Args:
+        frame_skip: physics steps in a step.
+        copies: where fields of ``mjData`` are copied to, by name, contiguous, [B, ...]; kept by the caller.
+        forces: whether contact forces on bodies are computed.
+    """
+    record, data = np.zeros(1, PHYSICS), structure("mjData")
+    one = record[0]
+    one["frame_skip"], one["forces"], one["fields"] = frame_skip, forces, len(copies)
+    for place, (name, copy) in enumerate(copies.items()):
+        one["offset"][place], one["copy"][place] = getattr(data, name).offset, copy.ctypes.data
+        one["size"][place] = copy[0].size
+    return record
+
+
+@compiled
+def copy_fields(physics: Any, data: int, index: int) -> None:
+    """Copy what MuJoCo computed last."""
+    for place in range(physics.fields):
+        size = physics.size[place]
+        source = _doubles(_addresses(data + physics.offset[place], 1)[0], size)
+        target = _doubles(physics.copy[place] + 8 * size * index, size)
+        for number in range(size):
+            target[number] = source[number]
+
+
+@compiled_for_batch
+def advance(model: int, data: int, index: int, argument: int) -> None:
+    """The physics steps of one step; the controls are in the state."""
+    physics = _physics(argument, 1)[0]
+    for _step in range(physics.frame_skip):
+        mj_step(model, data)
+    if physics.forces:
+        mj_rnePostConstraint(model, data)
+    copy_fields(physics, data, index)
+
+
+@compiled_for_batch
+def derive(model: int, data: int, index: int, argument: int) -> None:
+    """Compute and copy what follows from the state, but for contact forces, which are as they were."""
+    mj_forward(model, data)
+    copy_fields(_physics(argument, 1)[0], data, index)
+
+
+@compiled_for_batch
+def derive_with_forces(model: int, data: int, index: int, argument: int) -> None:
+    """Compute and copy what follows from the state, contact forces included."""
+    mj_forward(model, data)
+    mj_rnePostConstraint(model, data)
+    copy_fields(_physics(argument, 1)[0], data, index)
