@@ -281,9 +281,10 @@ def _sizes_of(name: str, canonical: str, cost: int) -> TaskSizes | None:
 def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
     """The discount gamma of a CPO student, None for others: Lemma 1 is not about them."""
     options = sweep.agent_options[str(trial["agent"])]
-    discount = options.get("discount")
-    is_known = trial["agent_name"] == "cpo" and isinstance(discount, int | float)
-    return float(discount) if is_known else math.nan if trial["agent_name"] == "cpo" else None
+    discount = options.get("discount", math.nan)
+    if trial["agent_name"] != "cpo":
+        return None
+    return float(discount) if isinstance(discount, int | float) else math.nan
 
 
 def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:

@@ -220,19 +220,18 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             raise ValueError(f"{self.cmdp.name}: a reward must be finite, got {bad:g}")
 
     def _flat(self, observation: Any) -> npt.NDArray[np.float32]:
+        cause: Exception | None = None
         try:
-            flat = np.asarray(spaces.flatten(self._raw_observation_space, observation), np.float32)
+            if observation is not None:  # NumPy would make NaN of it
+                flat = np.asarray(spaces.flatten(self._raw_observation_space, observation), np.float32)
+                if flat.shape == self.single_observation_space.shape:
+                    return flat
         except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
-            flat = None
-            cause: Exception | None = error
-        else:
-            cause = None
-        if flat is None or flat.shape != self.single_observation_space.shape:
-            raise ValueError(
-                f"{self.cmdp.name}: an observation must lie in {self._raw_observation_space}, "
-                f"got {_brief(observation)}"
-            ) from cause
-        return flat
+            cause = error
+        raise ValueError(
+            f"{self.cmdp.name}: an observation must lie in {self._raw_observation_space}, "
+            f"got {_brief(observation)}"
+        ) from cause
 
     def _checked(self, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
         space = self.single_action_space

@@ -36,7 +36,8 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid, read_name
 from recrl.orchestrator.plan import Plan, estimate, make_plan, select, trials_at_once
-from recrl.orchestrator.redaction import redacted, shown
+from recrl.orchestrator.redaction import redacted
+from recrl.orchestrator.redaction import shown as text_shown
 from recrl.orchestrator.refresh import refreshing
 from recrl.orchestrator.spec import Choice, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
@@ -688,7 +689,7 @@ def _short(path: Path) -> Path:
 
 def _say(console: Console, sentence: str) -> None:
     """One line as it is, but for secrets and control characters: no markup, no colours, no wrapping."""
-    console.print(shown(sentence), markup=False, highlight=False, soft_wrap=True)
+    console.print(text_shown(sentence), markup=False, highlight=False, soft_wrap=True)
 
 
 COMMANDS: Mapping[str, Command] = {

@@ -8,6 +8,8 @@ import numpy.typing as npt
 from recrl.agents.agent import Rollout
 from recrl.orchestrator.errors import RecrlError
 
+Numbers = npt.NDArray[np.floating]
+
 
 class TaskOutputError(RecrlError):
     """An environment returned what is no observation, reward or cost."""
@@ -23,7 +25,11 @@ def check_rollout(rollout: Rollout, task: str) -> None:
     Raises:
         TaskOutputError: they are not; the message says what was returned and where.
     """
-    per_step = {"an observation": rollout.observations, "a reward": rollout.rewards, "a cost": rollout.costs}
+    per_step: dict[str, Numbers] = {
+        "an observation": rollout.observations,
+        "a reward": rollout.rewards,
+        "a cost": rollout.costs,
+    }
     for what, values in per_step.items():
         if not _are_finite(values):
             _complain(task, what, values, ~np.isfinite(values), "all must be finite")
@@ -35,7 +41,7 @@ def check_rollout(rollout: Rollout, task: str) -> None:
             _complain(task, what, values, ~np.isfinite(values), "all must be finite", located=False)
 
 
-def _are_finite(values: npt.NDArray[np.floating]) -> bool:
+def _are_finite(values: Numbers) -> bool:
     """Whether all are; the sum of finite numbers is finite unless they are huge, and quicker to look at."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum(dtype=np.float64))) or bool(np.isfinite(values).all())
@@ -44,7 +50,7 @@ def _are_finite(values: npt.NDArray[np.floating]) -> bool:
 def _complain(
     task: str,
     what: str,
-    values: npt.NDArray[np.floating],
+    values: Numbers,
     bad: npt.NDArray[np.bool_],
     rule: str,
     *,

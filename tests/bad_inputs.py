@@ -22,6 +22,7 @@ import traceback
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -308,8 +309,8 @@ def options() -> Iterator[Case]:
             yield Case(f"{command[0]} --only {value!r}", (*command, f"--only={value}"))
         yield Case(f"plan --only {value!r} before", ("plan", "--only", value, "grid.yaml"))
     for value in ("x", "=", "window", "window=", "window=0", "windw=3", "window=[", "window=NaN", "=3"):
-        arguments = ("replay", "small", "--teacher", "dynamic", "--option", value)
-        yield Case(f"replay --option {value!r}", arguments)
+        line = ("replay", "small", "--teacher", "dynamic", "--option", value)
+        yield Case(f"replay --option {value!r}", line)
     for value in ("", "nope", "os:system", "x:y:z", "../x", "\x1b[31m"):
         yield Case(f"replay --teacher {value!r}", ("replay", "small", "--teacher", value))
     uris = (
@@ -428,7 +429,7 @@ def archives() -> Iterator[Case]:
     yield from cases("that is a folder", lambda: Path("evil.zip").mkdir(), 4)
     yield from cases("that is cut", _cut, 4)
     for at in (0.1, 0.3, 0.5, 0.7, 0.9):
-        yield from cases(f"with bytes flipped at {at:.0%}", lambda at=at: _flip(at))
+        yield from cases(f"with bytes flipped at {at:.0%}", partial(_flip, at))
     yield from cases("that is a bomb", _bomb, 4)
     yield from cases("that says it is small", _liar)
     yield from cases("with bzip2", lambda: _repack(zipfile.ZIP_BZIP2))
@@ -449,10 +450,8 @@ def changed_archives() -> Iterator[Case]:
                 ("name", "x"),
             ):
                 continue
-            yield from cases(
-                f"whose {key} is {value!r}", lambda k=key, v=value: _edit(lambda told: told.update({k: v}))
-            )
-        yield from cases(f"without {key}", lambda k=key: _edit(lambda told: told.pop(k)))
+            yield from cases(f"whose {key} is {value!r}", partial(_edit, {key: value}))
+        yield from cases(f"without {key}", partial(_edit, {}, without=key))
     for name in (
         "../evil",
         "/tmp/evil",
@@ -468,13 +467,12 @@ def changed_archives() -> Iterator[Case]:
         "a\0b",
         "~",
     ):
-        make = lambda n=name: _edit(lambda told: told.update({"name": n}))  # noqa: E731
-        yield from cases(f"named {name!r:.20}", make, 4)
+        yield from cases(f"named {name!r:.20}", partial(_edit, {"name": name}), 4)
     for key in ("spec", "status", "error", "env_steps", "cpu_seconds", "start_limits", "provenance"):
         for value in ("x", -1, [], {}, True, 10**30, float("nan")):
             if (key, value) == ("error", "x"):
                 continue
-            make = lambda k=key, v=value: _edit(lambda told: told["trials"][0].update({k: v}))  # noqa: E731
+            make = partial(_edit, {key: value}, "trials", 0)
             yield from cases(f"with a trial whose {key} is {value!r:.20}", make)
     for key in (
         *("task", "agent", "method"),
@@ -494,7 +492,7 @@ def changed_archives() -> Iterator[Case]:
             [1, 2, 3],
             {"name": "../x", "options": 3, "label": "\x1b[2J"},
         ):
-            make = lambda k=key, v=value: _edit(lambda told: told["trials"][0]["spec"].update({k: v}))  # noqa: E731
+            make = partial(_edit, {key: value}, "trials", 0, "spec")
             yield from cases(f"with a spec whose {key} is {value!r:.20}", make)
     for member in ("phases.csv", "updates.csv", "evaluations.csv", "events.csv", "policies.csv"):
         for text in (
@@ -507,9 +505,8 @@ def changed_archives() -> Iterator[Case]:
             '"',
             "\0\0",
         ):
-            make = lambda m=member, t=text: _replace(m, t.encode())  # noqa: E731
-            yield from cases(f"whose {member} is {text!r}", make)
-        yield from cases(f"without {member}", lambda m=member: _replace(m, None))
+            yield from cases(f"whose {member} is {text!r}", partial(_replace, member, text.encode()))
+        yield from cases(f"without {member}", partial(_replace, member, None))
 
 
 def _read_good() -> dict[str, bytes]:
@@ -523,10 +520,15 @@ def _pack(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> None
             archive.writestr(name, data)
 
 
-def _edit(change: Callable[[dict[str, Any]], object]) -> None:
+def _edit(changes: dict[str, Any], *place: str | int, without: str = "") -> None:
+    """Change some keys of sweep.json, at a place in it."""
     members = _read_good()
     told = json.loads(members["sweep.json"])
-    change(told)
+    inner = told
+    for part in place:
+        inner = inner[part]
+    inner.update(changes)
+    inner.pop(without, None)
     _pack({**members, "sweep.json": json.dumps(told).encode()})
 
 

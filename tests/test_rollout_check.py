@@ -20,6 +20,7 @@ def rollout() -> Rollout:
         final_observations=np.zeros((1, 4), np.float32),
         last_observations=np.zeros((2, 4), np.float32),
         carried_costs=np.zeros((2, 1)),
+        carried_lengths=np.zeros(2, np.int64),
     )
 
 

@@ -182,7 +182,7 @@ def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
     assert task_options("gymnasium", options).model_dump()["id"] == identifier
     environments = make_vector("gymnasium", 2, options=options)
     observations, _ = environments.reset(seed=0)
-    assert observations.shape == (2, *environments.single_observation_space.shape)
+    assert observations.shape == environments.observation_space.shape
     assert environments.step(np.stack([environments.single_action_space.sample()] * 2))[4]["cost"].shape == (
         2,
         1,
