@@ -41,6 +41,7 @@ from recrl.orchestrator.spec import TrialState
 BAND_REPLICATIONS = 500  # a band has a hundred intervals
 OPTIMAL_GAP = 0.2  # of the return to J*(d_d)
 OPTIMAL_EXCESS = 0.05  # of each mean cost over d_d
+ROUNDING = 1e-9  # of a difference of two returns: 9.5 - 9.3 is more than 0.2
 BAND_ENDS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 
 
@@ -113,7 +114,7 @@ def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
     Args:
         rows: gap, and what ``within_limits`` takes.
     """
-    return (rows["gap"] <= OPTIMAL_GAP) & within_limits(rows, excess=OPTIMAL_EXCESS)
+    return (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & within_limits(rows, excess=OPTIMAL_EXCESS)
 
 
 def training_totals(sweep: Sweep) -> pd.DataFrame:

@@ -48,7 +48,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pandas as pd
 
@@ -72,6 +72,7 @@ UPDATE_COLUMNS = (
 EVALUATION_COLUMNS = ("policy", "index", "length", "episode_return")
 _episode_values = operator.attrgetter(*EPISODE_COLUMNS)
 KEPT_CHECKPOINTS = 2
+LOOK_SECONDS = 10.0  # that others may take, all together, to look whether a sweep is locked
 RESERVE_BYTES = 16 * 1024  # a record and a traceback
 
 
@@ -256,18 +257,37 @@ class SweepStore:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / "lock").open("a+") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
+            if not _is_taken(file):
                 file.seek(0)
                 holder = file.read().strip() or "another process"
                 raise SweepBusyError(
                     f"{self.folder}: this sweep is already being run by {holder}; wait for it or stop it"
-                ) from error
+                )
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
             file.flush()
             yield
+
+
+def _is_taken(file: IO[str]) -> bool:
+    """Take the exclusive lock of a file, unless somebody else holds it.
+
+    ``SweepStore.is_locked`` holds a shared one for a moment: who only looks must not keep anybody from it.
+    """
+    end = time.monotonic() + LOOK_SECONDS
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return False
+            fcntl.flock(file, fcntl.LOCK_UN)
+            if time.monotonic() > end:
+                return False
+            time.sleep((1 + secrets.randbelow(10)) / 1000.0)  # two who wait must not keep step
 
 
 class TrialStore:

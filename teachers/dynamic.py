@@ -15,12 +15,14 @@ the letter wherever it is defined.
 - *Adherence* (line 6). A student at its optimum has a mean cost a little above its limit as often as below,
   or always (whoever must cross five tiles of river and slips once in a while costs 5.004), and C <= d would
   kick it for ever. C may exceed d by as much as line 5 lets equal costs differ, or by its standard error.
-- *The step* (line 7). B - b counts episodes, but a limit moves only once per window, so that the limits stay
+- *The step* (line 7). B - b counts episodes, b being the one about to be played, but a limit moves only once per window, so that the limits stay
   far above d_d. Counted in windows that are left, the steps add up to the whole way. The last two are not
   counted: so long a student may need to settle after a large step, and it would meet d_d only at B.
 - *Which limits a window was played under.* The newer window lies wholly after the last change (line 4); the
   older one may lie before it, so that a student who follows each change at once is not made to wait twice.
-- *last_change* is reset when limits or policy have changed; line 11 also resets it when nothing has.
+- *last_change* is reset when limits or policy have changed. Line 11 also resets it when nothing has, that
+  is, whenever the student has converged: a limit that is d_d already, or noise of 0, then delays the next
+  test by a window (``clock_reset``).
 - *Noise* (line 9) is a disturbance of the teacher's own making: costs jump, and take updates to come back. If
   the next window is compared with the one before the noise, two windows with the same jump in them look
   converged and above the limit, and noise follows noise at the pace of the windows for ever. Both windows
@@ -73,6 +75,7 @@ PAPER = {
     "adherence_tolerance": "none",
     "windows_after_noise": 1,
     "remaining": "episodes",
+    "clock_reset": "convergence",
     "dimensions": "joint",
 }
 
@@ -137,7 +140,13 @@ class DynamicConfig(BaseModel):
     remaining: Literal["windows", "episodes"] = Field(
         default="windows",
         description="What the step of line 7 divides by: the windows that are left but two, which "
-        "reaches deploy_limits before B, or the episodes that are left (literal), which does not.",
+        "reaches deploy_limits before B, or the episodes that are left after the next one, B - b (literal), "
+        "which does not.",
+    )
+    clock_reset: Literal["change", "convergence"] = Field(
+        default="change",
+        description="When last_change begins anew: when limits or policy have changed, or whenever the "
+        "student has converged, also where nothing changes then (line 11, literal).",
     )
     dimensions: Literal["separate", "joint"] = Field(
         default="separate",
@@ -215,7 +224,7 @@ def judge(
     remaining: int,
     config: DynamicConfig,
 ) -> Lesson:
-    """One pass through the body of Algorithm 2, lines 5 to 11.
+    """Lines 5 to 10 of Algorithm 2: the next lesson.
 
     Args:
         old: the window before the last.
@@ -230,7 +239,6 @@ def judge(
     converged = _converged(old, new, config)
     kept = _kept(new, limits, config)
     if config.dimensions == "joint":
-        converged = [all(converged)] * len(limits)
         kept = [all(kept)] * len(limits)
     is_stuck = any(settled and not keeps for settled, keeps in zip(converged, kept, strict=True))
     lowered = tuple(
@@ -243,15 +251,21 @@ def judge(
 
 
 def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
-    """Whether the return and the cost of each dimension have converged, [k]."""
+    """Whether the return and the cost of each dimension have converged (line 5), [k].
+
+    Never where a window has no episode. Jointly, none has before all have.
+    """
+    if old.episodes == 0 or new.episodes == 0:
+        return [False] * len(new.mean_costs)
     return_converged = has_converged(
         new.mean_return, old.mean_return, tolerance=config.return_tolerance, floor=config.return_floor
     )
-    return [
+    converged = [
         return_converged
         and has_converged(cost, before, tolerance=config.cost_tolerance, floor=config.cost_floor)
         for cost, before in zip(new.mean_costs, old.mean_costs, strict=True)
     ]
+    return [all(converged)] * len(converged) if config.dimensions == "joint" else converged
 
 
 def _kept(new: Stretch, limits: CostLimits, config: DynamicConfig) -> list[bool]:
@@ -280,15 +294,17 @@ def steps_left(
 
     B is given in environment steps; how many episodes it holds is known only afterwards. The last window
     took some steps and finished some episodes, so what is left holds (B - env steps) / steps such windows,
-    and as many times its episodes. Rounded down. The last two windows are not counted.
+    and as many times its episodes. Rounded down. The last two windows are not counted. Of the episodes the
+    next one is not counted: Algorithm 2 judges before it plays episode b, when b - 1 are played and
+    B - b + 1 are left.
 
     >>> last = Stretch(env_steps=1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
-    [2, 36]
+    [2, 35]
     """
     steps = train_steps - env_steps
     if unit == "episodes":
-        return steps * last.episodes // max(1, last.env_steps)
+        return steps * last.episodes // max(1, last.env_steps) - 1
     return steps // max(1, last.env_steps) - 2
 
 
@@ -331,15 +347,19 @@ class DynamicTeacher:
         )
         before = last_lesson(state).limits
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
+        is_due = False  # line 4
         if progress(report.env_steps, self.spec.train_steps) >= 1.0:
             lesson, history = Lesson(self.spec.deploy_limits), ()
         elif start["start_limits"] is None or limits != before or last_change < self.config.window:
             lesson = Lesson(limits)
         else:
+            is_due = True
             lesson = self._judge(limits, history, report.env_steps)
+        has_changed = lesson.limits != before or lesson.policy_noise > 0.0
+        if is_due and self.config.clock_reset == "convergence":
+            has_changed = has_changed or self._has_converged(history)
         if lesson.policy_noise > 0.0 and self.config.windows_after_noise == 2:
             history = ()
-        has_changed = lesson.limits != before or lesson.policy_noise > 0.0
         next_state = _state(
             update=report.update,
             env_steps=report.env_steps,
@@ -362,12 +382,22 @@ class DynamicTeacher:
         windows = last_two_windows(history, self.config.window, unit=unit)
         return history if windows is None else (*windows[0], *windows[1])
 
+    def _windows(self, history: Sequence[Stretch]) -> tuple[Stretch, Stretch] | None:
+        """The last two windows, each pooled, or None as long as there are fewer (line 4: b >= 2 W)."""
+        windows = last_two_windows(history, self.config.window, unit=self.config.window_unit)
+        return None if windows is None else (Stretch.pooled(windows[0]), Stretch.pooled(windows[1]))
+
+    def _has_converged(self, history: Sequence[Stretch]) -> bool:
+        """Whether line 11 is reached: the test of line 5 holds in some dimension, or jointly."""
+        windows = self._windows(history)
+        return windows is not None and any(_converged(*windows, self.config))
+
     def _judge(self, limits: CostLimits, history: Sequence[Stretch], env_steps: int) -> Lesson:
         """The next lesson once W has passed since the last change."""
-        windows = last_two_windows(history, self.config.window, unit=self.config.window_unit)
+        windows = self._windows(history)
         if windows is None:
             return Lesson(limits)
-        old, new = map(Stretch.pooled, windows)
+        old, new = windows
         return judge(
             old,
             new,

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
@@ -179,7 +180,7 @@ def test_a_dimension_that_is_never_constrained_stays_so() -> None:
 def test_steps_left_are_estimated_from_the_last_window() -> None:
     last = Stretch(env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     assert steps_left(last, env_steps=4000, train_steps=5000, unit="windows") == 1  # 3 windows fit
-    assert steps_left(last, env_steps=4000, train_steps=5000, unit="episodes") == 20
+    assert steps_left(last, env_steps=4000, train_steps=5000, unit="episodes") == 19
 
 
 # Lines 5 to 11 together.
@@ -278,7 +279,10 @@ def test_a_student_that_stays_and_then_crosses_is_judged_in_both_regimes(
 
 
 def test_literal_steps_leave_an_ideal_student_far_above_d_d() -> None:
-    """Line 7 with B - b in episodes: from 250, the limit gets to about 158, by the product of its factors."""
+    """Line 7 with B - b in episodes: from 250, the limit gets to about 158, by the product of its factors.
+
+    Episode b = 21, 31, ... is the one about to be played when 20, 30, ... are.
+    """
     run = play(
         obedient,
         train=(250.0,),
@@ -288,10 +292,91 @@ def test_literal_steps_leave_an_ideal_student_far_above_d_d() -> None:
         preset="paper",
         window=10,
     )
-    factors = [1.0 - 1.0 / (1000 - b) for b in range(20, 1000, 10)]
+    factors = [1.0 - 1.0 / (1000 - b) for b in range(21, 1000, 10)]
     assert run.limits[-2][0] == pytest.approx(25.0 + 225.0 * math.prod(factors))
     assert run.limits[-2][0] > 150.0
     assert run.limits[-1] == (25.0,)
+
+
+def algorithm_2(
+    costs: list[float], *, train: float, deploy: float, window: int, tolerance: float
+) -> list[tuple[float, bool]]:
+    """The pseudocode of Algorithm 2 for k = 1, line by line: the limit and noise that episode b is played under.
+
+    Args:
+        costs: C(b) of the episodes 1, ..., B; every return is 1.
+        train: d_t.
+        deploy: d_d.
+        window: W.
+        tolerance: eps_c.
+    """
+    budget, limit, last_change, taught = len(costs), train, 0, []  # line 2
+    for b in range(1, budget + 1):  # line 3
+        noise = False
+        if b > 2 * window and last_change >= window:  # line 4; at b = 2 W only 2 W - 1 are played
+            new = math.fsum(costs[b - 1 - window : b - 1]) / window
+            old = math.fsum(costs[b - 1 - 2 * window : b - 1 - window]) / window
+            if abs(new / old - 1.0) <= tolerance:  # line 5
+                if new <= limit:  # line 6
+                    # line 7; at b = B it divides by 0, and d_d is meant
+                    limit = max(deploy, new - (new - deploy) / (budget - b)) if b < budget else deploy
+                else:  # line 8
+                    noise = True  # line 9
+                last_change = 0  # line 11
+        taught.append((limit, noise))  # line 14 plays under these
+        last_change += 1  # line 15
+    return taught
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_preset_paper_is_algorithm_2_episode_by_episode(seed: int) -> None:
+    """Costs that stand still, jump and fall, also below d_d, where nothing changes and line 11 resets."""
+    generator = np.random.default_rng(seed)
+    levels = np.concatenate([np.linspace(56.0, 30.0, 6), generator.uniform(2.0, 80.0, 8)])
+    costs = [round(float(cost * generator.uniform(0.95, 1.05)), 3) for cost in np.repeat(levels, 25)]
+    expected = algorithm_2(costs, train=60.0, deploy=20.0, window=5, tolerance=0.1)
+    run = play(
+        lambda lesson, update: (1.0, (costs[update - 1],)),
+        train=(60.0,),
+        deploy=(20.0,),
+        updates=len(costs),
+        episodes=lambda lesson: 1,
+        preset="paper",
+        window=5,
+    )
+    taught = [
+        (60.0, False),
+        *zip((d for (d,) in run.limits), (noise > 0.0 for noise in run.noise), strict=True),
+    ]
+    for (limit, noise), (literal, literal_noise) in zip(taught[:-1], expected, strict=True):
+        assert limit == pytest.approx(literal, rel=1e-12)
+        assert noise == literal_noise
+    assert len({limit for limit, _ in expected}) > 3
+    assert any(noise for _, noise in expected)
+
+
+def test_literally_the_clock_begins_anew_also_where_nothing_changes() -> None:
+    """At d_d line 7 changes nothing; line 11 resets the clock all the same, so a jump is answered later."""
+
+    def jumps(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+        return 9.5, (5.0 if update <= 12 else 7.0,)
+
+    def kicked_first(clock_reset: str) -> int:
+        run = play(
+            jumps,
+            train=(5.0,),
+            deploy=(5.0,),
+            updates=60,
+            episodes=lambda lesson: 1,
+            window=4,
+            cost_tolerance=0.5,
+            adherence_tolerance="none",
+            clock_reset=clock_reset,
+        )
+        return next(update for update, noise in enumerate(run.noise, start=1) if noise > 0.0)
+
+    assert kicked_first("change") == 13
+    assert kicked_first("convergence") == 16  # judged at 8, 12 and 16 only
 
 
 @pytest.mark.parametrize(

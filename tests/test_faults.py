@@ -4,6 +4,7 @@ import fcntl
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.errors import LostLeaseError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.heartbeat import Heartbeat
-from recrl.orchestrator.scratch import LOCK, scratch_folder
+from recrl.orchestrator.scratch import EMPTY_SECONDS, LOCK, scratch_folder
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialStore
 from recrl.orchestrator.sweep import launch
@@ -273,6 +274,37 @@ def test_folders_of_dead_processes_are_removed_and_no_others(tmp_path: Path) -> 
         with (first / LOCK).open("r+") as lock, pytest.raises(BlockingIOError):
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     assert [path.name for path in tmp_path.iterdir()] == ["recrl-demo"]
+
+
+@pytest.mark.parametrize("moment", ["before its lock was there", "while it was removed"])
+def test_a_scratch_folder_whose_process_was_interrupted_is_removed_by_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """Ctrl-C, twice: the second one comes while the first is being answered."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(*((fcntl, "flock") if "before" in moment else (shutil, "rmtree")), interrupted)
+        with scratch_folder(str(tmp_path)) as folder:
+            (folder / "ray").mkdir()
+            (folder / "ray" / "session").touch()
+    [left] = tmp_path.glob("recrl-*")
+    if "before" in moment:
+        (left / LOCK).unlink()
+    old = time.time() - 2 * EMPTY_SECONDS
+    os.utime(left, (old, old))
+    with scratch_folder(str(tmp_path)) as new:
+        assert list(tmp_path.iterdir()) == [new]
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_folder_that_is_just_being_made_stays(tmp_path: Path) -> None:
+    (tmp_path / "recrl-abcd1234").mkdir()
+    with scratch_folder(str(tmp_path)):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["recrl-abcd1234"]
 
 
 GRID = """\

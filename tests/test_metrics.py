@@ -58,6 +58,13 @@ def test_at_the_optimum_is_who_is_near_it_and_within_every_limit() -> None:
     assert metrics.optimal(rows).tolist() == [True, False, False, False, False]
 
 
+def test_a_gap_of_a_fifth_is_near_whatever_rounding_does_to_it() -> None:
+    gap = 9.5 - 9.299999999999994
+    assert gap == 0.2000000000000064
+    rows = pd.DataFrame([{"gap": gap, "cost_0": 5.0, "deploy_limit_0": 5.0}])
+    assert metrics.optimal(rows).tolist() == [True]
+
+
 def test_a_summary_counts_the_seeds_at_the_optimum(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     rows.loc[rows["measure"] == "stochastic", ["gap", "cost_0"]] = [0.1, 4.0]

@@ -1,7 +1,9 @@
 """Nothing committed is ever lost, nothing is there twice, and one attempt at a time may write."""
 
 import json
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +188,28 @@ def test_one_process_at_a_time_runs_a_sweep(tmp_path: Path) -> None:
         pass
     with store.lock():
         pass
+
+
+def test_who_only_looks_whether_a_sweep_runs_keeps_nobody_from_running_it(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    with store.lock():
+        pass
+    over = threading.Event()
+
+    def look_all_the_time() -> None:
+        while not over.is_set():
+            store.is_locked()
+
+    with ThreadPoolExecutor(3) as pool:
+        looking = [pool.submit(look_all_the_time) for _ in range(3)]
+        try:
+            for _ in range(200):
+                with store.lock():
+                    pass
+        finally:
+            over.set()
+        for each in looking:
+            each.result()
 
 
 def test_trials_on_disk_are_found(tmp_path: Path, store: TrialStore) -> None:
