@@ -15,9 +15,10 @@ the letter wherever it is defined.
 - *Adherence* (line 6). A student at its optimum has a mean cost a little above its limit as often as below,
   or always (whoever must cross five tiles of river and slips once in a while costs 5.004), and C <= d would
   kick it for ever. C may exceed d by as much as line 5 lets equal costs differ, or by its standard error.
-- *The step* (line 7). B - b counts episodes, b being the one about to be played, but a limit moves only once per window, so that the limits stay
-  far above d_d. Counted in windows that are left, the steps add up to the whole way. The last two are not
-  counted: so long a student may need to settle after a large step, and it would meet d_d only at B.
+- *The step* (line 7). B - b counts episodes, b being the one about to be played, but a limit moves only once
+  per window, so that the limits stay far above d_d. Counted in windows that are left, the steps add up to the
+  whole way. The last two are not counted: so long a student may need to settle after a large step, and it
+  would meet d_d only at B.
 - *Which limits a window was played under.* The newer window lies wholly after the last change (line 4); the
   older one may lie before it, so that a student who follows each change at once is not made to wait twice.
 - *last_change* is reset when limits or policy have changed. Line 11 also resets it when nothing has, that
@@ -147,6 +148,7 @@ class DynamicConfig(BaseModel):
         default="change",
         description="When last_change begins anew: when limits or policy have changed, or whenever the "
         "student has converged, also where nothing changes then (line 11, literal).",
+        exclude_if=lambda value: value == "change",  # trials from before this option keep their identity
     )
     dimensions: Literal["separate", "joint"] = Field(
         default="separate",

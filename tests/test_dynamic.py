@@ -301,7 +301,7 @@ def test_literal_steps_leave_an_ideal_student_far_above_d_d() -> None:
 def algorithm_2(
     costs: list[float], *, train: float, deploy: float, window: int, tolerance: float
 ) -> list[tuple[float, bool]]:
-    """The pseudocode of Algorithm 2 for k = 1, line by line: the limit and noise that episode b is played under.
+    """The pseudocode of Algorithm 2 for k = 1, line by line: the limit and noise of every episode b.
 
     Args:
         costs: C(b) of the episodes 1, ..., B; every return is 1.
