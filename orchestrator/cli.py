@@ -42,6 +42,7 @@ Going on:
   recrl-sweep stop demo                   from another terminal: trials save where they are, the launch ends
   recrl-sweep logs demo 3f2a --follow     a trial's log, by the beginning of its id or title
   recrl-sweep evaluate demo 3f2a --video  run its policy again, and film an episode
+  recrl-sweep check demo                  are all files what was committed? one line for each that is not
   recrl-sweep launch grids/demo.yaml --retry-failed
   recrl-sweep launch grids/demo.yaml --only method=dynamic task=rivergrid-1b
   recrl-sweep launch grids/demo.yaml --address auto --storage s3://bucket/folder
@@ -49,7 +50,7 @@ Going on:
 
 Exit codes:
   0    done, or nothing to do
-  1    some trials failed or could not be finished
+  1    some trials failed, are damaged or could not be finished
   2    the grid or the arguments are wrong; nothing was started
   3    another process is running this sweep
   4    Ray, MLflow or the storage could not be reached, or files could not be written
@@ -57,6 +58,7 @@ Exit codes:
   130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
+WRONG_KIND = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 SWEEP_HELP = "a sweep's name, or its grid file; may be left out where there is only one"
 
@@ -88,6 +90,10 @@ def parser() -> argparse.ArgumentParser:
     status = _command(commands, "status", "say how far a sweep is, from its files alone")
     _add_sweep(status)
     status.add_argument("--brief", action="store_true", help="one line, without the table of trials")
+
+    _add_sweep(
+        _command(commands, "check", "hold every file of a sweep against its committed length and digest")
+    )
 
     _add_sweep(
         _command(commands, "stop", "ask the launch that runs a sweep to save its trials and end, and wait")
@@ -141,10 +147,13 @@ def main(given: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
     except OSError as error:
-        if error.errno not in NO_ROOM:
+        if error.errno not in (*NO_ROOM, *WRONG_KIND) or (error.errno in WRONG_KIND and not error.filename):
             raise
         where = error.filename or getattr(arguments, "root", None) or arguments.to
-        print(f"recrl-sweep: {where}: {error.strerror}; what was saved stays", file=sys.stderr)
+        remedy = (
+            "what was saved stays" if error.errno in NO_ROOM else "move it away; nothing else was touched"
+        )
+        print(f"recrl-sweep: {where}: {error.strerror}; {remedy}", file=sys.stderr)
         return ExitCode.CANNOT_RUN
 
 
@@ -394,6 +403,16 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
     _add_only(command)
     command.add_argument(
         "--retry-failed", action="store_true", help="try failed trials again, from their last checkpoint"
+    )
+    command.add_argument(
+        "--rerun-damaged",
+        action="store_true",
+        help="run damaged trials again that were complete or had failed; others are by themselves",
+    )
+    command.add_argument(
+        "--rerun-changed",
+        action="store_true",
+        help="run trials again that ran other code than is installed now; what they left is kept aside",
     )
     command.add_argument(
         "--max-concurrent",

@@ -17,7 +17,7 @@ def source_digest() -> str:
     """Ten hex digits that differ whenever a Python file of recrl does: a version alone does not say it."""
     digest = hashlib.sha256()
     for name in FOLDERS:
-        for path in sorted(_folder(name).glob("*.py")):
+        for path in sorted(folder_of(name).glob("*.py")):
             digest.update(f"{name}/{path.name}\n".encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:10]
@@ -35,7 +35,7 @@ def copy_package(parent: Path) -> list[Path]:
     """
     package = parent / "package" / DISTRIBUTION
     for name in FOLDERS:
-        shutil.copytree(_folder(name), package / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(folder_of(name), package / name, ignore=shutil.ignore_patterns("__pycache__"))
     distribution = importlib.metadata.distribution(DISTRIBUTION)
     metadata = parent / "metadata" / f"{DISTRIBUTION}-{distribution.version}.dist-info"
     metadata.mkdir(parents=True)
@@ -46,7 +46,8 @@ def copy_package(parent: Path) -> list[Path]:
     return [package, metadata]
 
 
-def _folder(name: str) -> Path:
+def folder_of(name: str) -> Path:
+    """Where one of recrl's packages is."""
     spec = importlib.util.find_spec(f"{DISTRIBUTION}.{name}")
     assert spec is not None and spec.submodule_search_locations
     return Path(next(iter(spec.submodule_search_locations)))

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ import pytest
 from recrl.orchestrator import tracking
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
+from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore
 from recrl.orchestrator.tracking import run_status, sync, tracking_uri
 from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_points import (
@@ -450,7 +450,7 @@ def test_a_resumed_trial_runs_again_and_loses_its_error(write: Callable[..., Swe
     assert run.info.status == "RUNNING"
     assert "recrl.error" not in run.data.tags
     assert run.data.tags["recrl.attempt"] == "2"
-    write_json(trial.state_path, asdict(replace(trial.record(), pid=2**22 + 1)))  # no process has this number
+    trial.write_record(replace(trial.record(), pid=2**22 + 1))  # no process has this number
     sync(store, uri)
     assert runs(store)[DYNAMIC].info.status == "KILLED"
 
