@@ -23,9 +23,9 @@ NAMED = 3  # trials that a note names, at most
 def merge(parts: Sequence[Sweep]) -> Sweep:
     """All trials of some sweeps, each once, as the part has it that got furthest with it.
 
-    A complete trial is further than any other, a damaged one less far; then its steps count, then whether it was begun; of equals the
-    first part is taken. Two parts can have completed a trial with different outcomes, as other machines and
-    versions round differently; then a note says so.
+    A damaged trial is less far than any other, a complete one further; then its steps count, then whether it
+    was begun; of equals the first part is taken. Two parts can have completed a trial with different
+    outcomes, as other machines and versions round differently; then a note says so.
 
     Args:
         parts: at least one. The first gives the name and the grid file; its trials come first, then those

@@ -340,8 +340,8 @@ def _tell_mlflow(store: SweepStore, arguments: argparse.Namespace, console: Cons
 def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Draw the figures and tables of what is on disk, in a compact file or in MLflow."""
     sweep, folder = _source(arguments)
-    _draw(sweep, arguments.to or folder, console, band=arguments.band, whole=not arguments.sketch)
     _say_warnings(sweep, console)
+    _draw(sweep, arguments.to or folder, console, band=arguments.band, whole=not arguments.sketch)
     return ExitCode.OK
 
 
@@ -406,6 +406,7 @@ def run_bound(arguments: argparse.Namespace, console: Console) -> ExitCode:
     from recrl.analysis import cumulative  # noqa: PLC0415  (imports pandas and SciPy)
 
     sweep, _ = _source(arguments)
+    _say_warnings(sweep, console)
     rows = cumulative.cumulative_costs(sweep, cost=arguments.cost - 1)
     if not len(rows):
         raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
@@ -417,7 +418,6 @@ def run_bound(arguments: argparse.Namespace, console: Console) -> ExitCode:
         allowed = cumulative.admissible_limits(rows, sweep, budget=arguments.budget)
         _say(console, f"\nThe largest d_t within {arguments.budget:g} of cost above d_d over all episodes:")
         _show(cumulative.admissible_table(allowed), console)
-    _say_warnings(sweep, console)
     return ExitCode.OK
 
 

@@ -140,6 +140,7 @@ def make_plan(
         only: the trials to plan for, as ``select`` reads it; all by default.
         retry_failed: whether failed trials are to be tried again.
         rerun_damaged: whether damaged trials that were complete or failed are to be run again; others are.
+            Then every file is read and held against its digest.
         rerun_changed: whether trials that ran other code than is installed now are to be run again.
 
     Raises:
@@ -149,7 +150,7 @@ def make_plan(
     trials = []
     for spec in select(specs, only or {}):
         trial = store.trial(spec)
-        record = trial.record()
+        record = trial.verified_record() if rerun_damaged else trial.record()
         work = _work(record, retry_failed=retry_failed, rerun_damaged=rerun_damaged)
         changed = has_other_code(trial, spec)
         if changed and rerun_changed and (work.is_to_do or work is Work.COMPLETE):

@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.beside import beside
-from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
+from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError, SweepBusyError
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.remote_trial import ALIVE, RemoteTrial, Upload, patiently, working_copy
 from recrl.orchestrator.small_files import read_sealed, write_atomically, write_sealed
@@ -90,7 +90,9 @@ class RemoteSweep:
             RecrlError: as the constructor.
         """
         try:
-            uri = read_sealed(store.storage_path, version=STORAGE_FORMAT)["uri"]
+            kept = read_sealed(store.storage_path, version=STORAGE_FORMAT)
+            if kept["name"] != store.name:
+                raise DamagedError(f"{store.storage_path.name} is that of another sweep, {kept['name']}")
         except FileNotFoundError:
             return None
         except StorageError as error:
@@ -98,7 +100,7 @@ class RemoteSweep:
                 f"{store.name}: {error}, so that nobody knows where the sweep is kept; delete it and give "
                 "--storage URI again"
             ) from error
-        return cls(uri, store.name)
+        return cls(kept["uri"], store.name)
 
     def mark(self, store: SweepStore) -> None:
         """Make a folder the mirror of this sweep.
@@ -119,7 +121,7 @@ class RemoteSweep:
             )
         store.folder.mkdir(parents=True, exist_ok=True)
         if present is None:
-            write_sealed(store.storage_path, {"uri": self.uri}, version=STORAGE_FORMAT)
+            write_sealed(store.storage_path, {"name": store.name, "uri": self.uri}, version=STORAGE_FORMAT)
 
     def is_there(self) -> bool:
         """Whether it was launched.

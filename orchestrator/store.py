@@ -31,9 +31,9 @@ synced, then a checkpoint that holds the files' lengths and digests is written, 
 dies between, a restart cuts the files back to the newest intact checkpoint and nothing is there twice.
 Readers look only at committed bytes, and hold them against the record's digests. A file that is shorter than
 its committed length, or whose committed bytes have changed, is damage: the trial's status is then DAMAGED,
-and nothing is made of it. What an attempt cannot use, or replaces, it moves to ``aside/``. A writer holds a lease
-(a token in ``state.json``): once another attempt has taken the trial over, its every write is refused. Where
-the disk is full or gone, a writer's methods raise StorageError, and the last commit stands.
+and nothing is made of it. What an attempt cannot use, or replaces, it moves to ``aside/``. A writer holds a
+lease (a token in ``state.json``): once another attempt has taken the trial over, its every write is refused.
+Where the disk is full or gone, a writer's methods raise StorageError, and the last commit stands.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ import json
 import logging
 import operator
 import os
+import re
 import secrets
 import shutil
 import socket
@@ -104,6 +105,8 @@ LOOKS = 3  # at files that an attempt may be changing, before they are called da
 LOOK_SECONDS = 10.0  # that others may take, all together, to look whether a sweep is locked
 RESERVE_BYTES = 16 * 1024  # a record and a traceback
 
+
+_TRIAL = re.compile(r"__[0-9a-f]{10}$")
 
 logger = logging.getLogger("recrl.trial")
 
@@ -243,7 +246,10 @@ class SweepStore:
             DamagedError: it is not what was written.
         """
         try:
-            return read_sealed(self.info_path, version=INFO_FORMAT)
+            info = read_sealed(self.info_path, version=INFO_FORMAT)
+            if info.get("name") != self.name:
+                raise DamagedError(f"{self.info_path.name} is that of another sweep, {info.get('name')}")
+            return info
         except FileNotFoundError:
             return {}
         except DamagedError as error:
@@ -261,7 +267,7 @@ class SweepStore:
             DamagedError: the file that lists them is not what was written.
         """
         try:
-            return _parsed_specs(read_whole(self.specs_path))[1]
+            return self._listed()[1]
         except FileNotFoundError:
             if not self._was_launched():
                 return []
@@ -280,7 +286,8 @@ class SweepStore:
         self.folder.mkdir(parents=True, exist_ok=True)
         lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs).encode()
         of_lines, of_grid = Extent.of(lines).sha256, Extent.of(grid_text).sha256
-        header = sealed({"trials": len(specs), "lines": of_lines, "grid": of_grid}, version=SPECS_FORMAT)
+        told = {"name": self.name, "trials": len(specs), "lines": of_lines, "grid": of_grid}
+        header = sealed(told, version=SPECS_FORMAT)
         if grid_text:
             write_atomically(self.grid_path, grid_text)
         write_atomically(self.specs_path, (json.dumps(header) + "\n").encode() + lines)
@@ -294,13 +301,36 @@ class SweepStore:
         except StorageError as error:
             return "", f"{error}; launching the grid again writes it anew"
         try:
-            expected = _parsed_specs(read_whole(self.specs_path))[0]
+            expected = self._listed()[0]
         except (FileNotFoundError, StorageError):
             expected = Extent.of(data).sha256  # nobody knows better
         if Extent.of(data).sha256 != expected:
             what = "is not what was written" if data else "is missing"
             return "", f"{self.grid_path.name} {what}; launching the grid again writes it anew"
         return data.decode(errors="replace"), ""
+
+    def _listed(self) -> tuple[str, list[TrialSpec]]:
+        """The digest of the grid file, and the trials, that ``trials.jsonl`` holds.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            DamagedError: it is not what was written.
+        """
+        name = self.specs_path.name
+        first, _, lines = read_whole(self.specs_path).partition(b"\n")
+        header = parsed_object(first, name)
+        found = header.get("format")
+        if found != SPECS_FORMAT:
+            raise OtherFormatError(
+                f"{name} has format {found!r}, of another version of recrl, and this one reads format "
+                f"{SPECS_FORMAT}"
+            )
+        told = {key: value for key, value in header.items() if key not in ("format", "sha256")}
+        if header != sealed(told, version=SPECS_FORMAT) or Extent.of(lines).sha256 != told["lines"]:
+            raise DamagedError(f"{name} is not what was written: its checksum differs")
+        if told["name"] != self.name:
+            raise DamagedError(f"{name} is that of another sweep, {told['name']}")
+        return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
 
     def _was_launched(self) -> bool:
         try:
@@ -328,9 +358,14 @@ class SweepStore:
         """Every trial on disk, in the order of the folders' names."""
         if not self.trials_folder.is_dir():
             return []
-        folders = sorted(path for path in self.trials_folder.iterdir() if path.is_dir())
-        trials = [TrialStore(folder) for folder in folders]
-        return [trial for trial in trials if trial.spec_path.exists() or trial.state_path.exists()]
+        trials = [TrialStore(path) for path in sorted(self.trials_folder.iterdir())]
+        return [
+            trial
+            for trial in trials
+            if trial.spec_path.exists()
+            or trial.state_path.exists()
+            or (_TRIAL.search(trial.folder.name) and not trial.folder.is_dir())  # a file in its place
+        ]
 
     def find(self, text: str) -> list[TrialStore]:
         """The trials on disk that are called so, or else all whose name begins so.
@@ -379,28 +414,6 @@ class SweepStore:
             file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
             file.flush()
             yield
-
-
-def _parsed_specs(data: bytes) -> tuple[str, list[TrialSpec]]:
-    """The digest of the grid file, and the trials, that ``trials.jsonl`` holds.
-
-    Raises:
-        DamagedError: it is not what was written.
-    """
-    name = "trials.jsonl"
-    first, _, lines = data.partition(b"\n")
-    header = parsed_object(first, name)
-    seal = sealed(
-        {key: header[key] for key in header if key not in ("format", "sha256")}, version=SPECS_FORMAT
-    )
-    if "sha256" not in header or header.get("format") != SPECS_FORMAT:
-        raise OtherFormatError(
-            f"{name} has format {header.get('format')!r}, of another version of recrl, and this one reads "
-            f"format {SPECS_FORMAT}"
-        )
-    if header != seal or Extent.of(lines).sha256 != header["lines"]:
-        raise DamagedError(f"{name} is not what was written: its checksum differs")
-    return header["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
 
 
 def _is_taken(file: IO[str]) -> bool:
@@ -583,7 +596,11 @@ class TrialStore:
 
     def _stated(self) -> TrialRecord:
         try:
-            return TrialRecord.from_json(read_sealed(self.state_path, version=RECORD_FORMAT))
+            value = read_sealed(self.state_path, version=RECORD_FORMAT)
+            owner = value.pop("trial_id")
+            if owner != self.trial_id:
+                raise DamagedError(f"{self.state_path.name} is that of another trial, {owner}")
+            return TrialRecord.from_json(value)
         except FileNotFoundError as error:
             if self.updates_path.exists() or self.episodes_path.exists() or self.checkpoints():
                 raise DamagedError(f"{self.state_path.name} is missing") from error
@@ -593,7 +610,8 @@ class TrialStore:
 
     def write_record(self, record: TrialRecord) -> None:
         """Write ``state.json``; whoever does it holds ``locked``."""
-        write_sealed(self.state_path, record.to_json(), version=RECORD_FORMAT)
+        value = {"trial_id": self.trial_id, **record.to_json()}
+        write_sealed(self.state_path, value, version=RECORD_FORMAT)
 
     def _short(self, record: TrialRecord) -> StorageError | None:
         """What is wrong with the lengths of the committed files, if anything is."""
@@ -656,11 +674,20 @@ class TrialStore:
                 self._read_spec()
             except StorageError as error:
                 yield str(error)
+        paths = {path.name: path for path in self.checkpoints()}
         if record.checkpoint and (record.status.is_finished or not self.is_mirror):
+            paths[record.checkpoint] = self.checkpoints_folder / record.checkpoint
+        for path in paths.values():
             try:
-                self.load_checkpoint(self.checkpoints_folder / record.checkpoint)
+                self.load_checkpoint(path)
             except CheckpointError as error:
                 yield str(error).removeprefix(f"{self.folder}/")
+
+    def verified_record(self) -> TrialRecord:
+        """``record``, with every file held against its digest as well."""
+        record = self.record()
+        found = self.damages() if record.status is not TrialState.DAMAGED else []
+        return self._damaged(record, DamagedError(found[0])) if found else record
 
     def require_whole(self) -> None:
         """Hold every file against what was committed.
@@ -668,13 +695,9 @@ class TrialStore:
         Raises:
             DamagedError: one is damaged; the sentence says which and what to do.
         """
-        found = self.damages()
-        if found:
-            try:
-                stated = self._stated()
-            except StorageError:
-                stated = TrialRecord()
-            raise DamagedError(f"{self.title}: {self._damaged(stated, DamagedError(found[0])).error}")
+        record = self.verified_record()
+        if record.status is TrialState.DAMAGED:
+            raise DamagedError(f"{self.title}: {record.error}")
 
     def episodes(self) -> pd.DataFrame:
         """The committed episodes: EPISODE_COLUMNS, then cost_i and limit_i for each cost.
@@ -1002,17 +1025,25 @@ class TrialWriter:
         return tree["trial"] if tree else None
 
     def _newest_usable(self) -> dict[str, Any] | None:
+        """The newest usable checkpoint; all that are not are renamed."""
+        found: dict[str, Any] | None = None
         for path in self.store.checkpoints():
             try:
                 tree = self.store.load_checkpoint(path)
             except CheckpointError as error:
-                logger.warning("%s; the one before it is used", error)
+                logger.warning("%s; it is renamed", error)
             else:
+                if found is not None:
+                    continue
                 if all(file.take_up(_extent_in(tree, file.path.name)) for file in self._rows):
-                    return tree
-                logger.warning("%s: its rows are not there any more; the one before it is used", path)
-            path.rename(path.with_suffix(".damaged"))
-        return None
+                    found = tree
+                    continue
+                logger.warning("%s: its rows are not there any more; it is renamed", path)
+            damaged = path.with_suffix(".damaged")
+            if os.path.lexists(damaged):
+                self.store.move_aside(damaged)
+            path.rename(damaged)
+        return found
 
     def append_episode(self, episode: EpisodeStats) -> None:
         """Add an episode's row to the next commit.

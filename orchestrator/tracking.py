@@ -322,6 +322,8 @@ class _View:
         if not position.fits(data):
             self._delete_run(position.run_id)
             position = Position(self._create_run(trial, record))
+        if status == "FINISHED":
+            trial.require_whole()
         new_points, position = _new_points(trial, data, position)
         if status == "FINISHED" and position.last_row:
             last = final_points(trial.updates(), trial.evaluation(), _last_row(data, position))

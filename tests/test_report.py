@@ -139,8 +139,7 @@ def test_the_page_holds_everything_and_fetches_nothing(
     )
     trial = store.trials()[0]
     commit_file(trial, "provenance.json", '{"torch": "9.9"}')
-    store.write_specs([trial.spec])
-    store.grid_path.write_text("name: made-up  # <script>alert(1)</script>\n")
+    store.write_specs([trial.spec], b"name: made-up  # <script>alert(1)</script>\n")
     report.sketch(frames.load(store), tmp_path / "figures")  # the page is made as by draw
     reader = Strict()
     reader.feed((tmp_path / "figures" / "report.html").read_text())

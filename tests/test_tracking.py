@@ -34,6 +34,7 @@ from recrl.orchestrator.tracking_points import (
 )
 from recrl.orchestrator.tracking_snapshot import SNAPSHOT_TAG
 from recrl.orchestrator.tracking_ui import open_ui, ui_command, ui_url
+from tests.committing import commit_file
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -432,7 +433,7 @@ def test_rows_that_were_cut_back_are_gone_from_mlflow_too(
     grow(store, done, DYNAMIC)
     trial = trial_titled(store, DYNAMIC)
     text = trial.updates_path.read_text().replace("1700000020.0", "1700009999.0")  # update 20, written anew
-    trial.updates_path.write_text(text)
+    commit_file(trial, "updates.csv", text)
     sync(store, tracking_uri(store, None))
     points = history(store, runs(store)[DYNAMIC])["student/kl"]
     assert len(points) == 40
