@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from typing import Any, Protocol
@@ -27,12 +28,14 @@ from recrl.agents.advantages import generalised_advantages, next_values
 from recrl.agents.agent import Rollout
 from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.config import StudentConfig
-from recrl.agents.constraint_forms import MeanCost, TailCost
+from recrl.agents.constraint_forms import MeanCost, RecentEpisodes, TailCost
 from recrl.agents.distributions import mean_divergence
+from recrl.agents.encoding import Encoder
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import INITIALISERS, Adam, Critics, NetworkForm
 from recrl.agents.policies import StochasticPolicy
+from recrl.agents.scales import RunningScale, quotient
 from recrl.agents.spaces import observation_size
 from recrl.agents.surrogates import surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
@@ -110,7 +113,8 @@ class ActorCritic:
     Args:
         cmdp: what the task fixes.
         config: the settings that students share.
-        policy: of the task's spaces.
+        encoder: of the observations that policy and critics see.
+        policy: of the encoded observations and the task's actions.
         critics: of the reward and the k costs.
         rule: improves the policy.
         generator: of the minibatches.
@@ -121,6 +125,7 @@ class ActorCritic:
         cmdp: CMDPSpec,
         config: StudentConfig,
         *,
+        encoder: Encoder,
         policy: StochasticPolicy,
         critics: Critics,
         rule: PolicyRule,
@@ -128,9 +133,12 @@ class ActorCritic:
     ) -> None:
         self._cmdp = cmdp
         self._config = config
+        self._encoder = encoder
         self._policy = policy
         self._critics = critics
         self._critic_optimiser = Adam(critics.parameters, config.critic_learning_rate)
+        self._value_scale = RunningScale(1 + cmdp.num_costs)
+        self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
         self._noisy = False
@@ -141,26 +149,29 @@ class ActorCritic:
             else MeanCost(config.limit_margin)
         )
         self._parts: dict[str, Stateful] = {
+            "encoder": self._encoder,
             "critic_optimiser": self._critic_optimiser,
+            "value_scale": self._value_scale,
+            "recent_episodes": self._recent,
             "constraint": self._form,
             **rule.parts,
         }
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
-        return self._policy.sample(observations, generator)
+        return self._policy.sample(self._encoder(observations), generator)
 
     def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
         """What ``act`` inverts at B observations [B, n], float64 [B, A]; for Discrete actions only."""
-        return self._policy.cumulative_masses(observations)
+        return self._policy.cumulative_masses(self._encoder(observations))
 
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
-        return self._policy.mode(observations)
+        return self._policy.mode(self._encoder(observations))
 
     def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
         """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
-        return self._policy.probabilities(observations)
+        return self._policy.probabilities(self._encoder(observations))
 
     def update(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
         """Improve the policy by the rule, then fit the critics to the rollout.
@@ -181,32 +192,47 @@ class ActorCritic:
         observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
         actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
         batch = LearningBatch.gather(
-            observations, actions, compact=config.compaction, most_rows=config.minibatch_size
+            self._encoder(observations), actions, compact=config.compaction, most_rows=config.minibatch_size
         )
-        costs, values = self._form.judge(rollout, episode_costs, limits)
-        advantages, targets = self._estimate(rollout, costs, batch)
-        constraints = Constraints.measure(
-            rollout, len(episode_costs), values, limits, self._cmdp.horizon, noisy=self._noisy
-        )
+        recent_costs, lengths = self._recent.add(episode_costs, rollout.finished_lengths())
+        costs, constrained = self._form.judge(rollout, recent_costs, limits)
+        estimates = self._estimate(rollout, costs, batch)
+        advantages = estimates.advantages
+        constraints = Constraints.measure(recent_costs, lengths, constrained, limits, noisy=self._noisy)
         num_envs = rollout.rewards.shape[1]
         experience = Experience.of(self._policy, batch, advantages, constraints, num_envs)
         if self._temperature > 0.0:
             experience = experience.with_entropy(self._temperature)
-        return {
+        metrics = {
             **improve_and_measure(self._rule, self._policy, experience, self._generator),
             **indexed("cost_gap", constraints.gaps),
             **indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0)),  # eps of Lemma 1
-            **self._fit_critics(batch, targets),
+            **estimates.explained_variances(),
+            **self._fit_critics(batch, estimates.targets),
         }
+        self._encoder.learn(observations)
+        return metrics
 
-    def _estimate(self, rollout: Rollout, costs: Floats, batch: LearningBatch) -> tuple[Floats, Floats]:
-        """Advantages and value targets of the reward and the costs [T, B, k], both [N, C]."""
+    def _estimate(self, rollout: Rollout, costs: Floats, batch: LearningBatch) -> Estimates:
+        """Estimate advantages and value targets of the reward and the costs, [T, B, k]."""
         config = self._config
         signals = np.concatenate([rollout.rewards[..., None], costs], axis=2)
         require_finite("rewards and costs", signals)
-        values = batch.per_sample(self._critics.values(batch.rows)).reshape(signals.shape)
+        ended = rollout.terminated | rollout.truncated
+        if config.value_scale == "running" and not self._value_scale.is_known:
+            zeros = np.zeros_like(signals)
+            first_returns = generalised_advantages(
+                signals,
+                zeros,
+                zeros,
+                ended=ended,
+                discount=config.discount,
+                trace_decays=np.ones(signals.shape[2]),
+            )
+            self._value_scale.add((first_returns**2).mean(axis=(0, 1)))
+        values = batch.per_sample(self._values(batch.rows)).reshape(signals.shape)
         beyond = np.concatenate([rollout.final_observations, rollout.last_observations])
-        beyond_values = self._critics.values(torch.as_tensor(beyond))
+        beyond_values = self._values(torch.as_tensor(self._encoder(beyond)))
         num_final = len(rollout.final_observations)
         following = next_values(
             values,
@@ -215,22 +241,43 @@ class ActorCritic:
             final_values=beyond_values[:num_final],
             last_values=beyond_values[num_final:],
         )
-        ended = rollout.terminated | rollout.truncated
         decays = np.array(
             [config.reward_trace_decay] + [config.cost_trace_decay] * self._cmdp.num_costs, dtype=np.float64
         )
         advantages = generalised_advantages(
             signals, values, following, ended=ended, discount=config.discount, trace_decays=decays
         )
-        if config.value_target == "lambda-return":
-            targets = advantages + values
-        else:
-            ones = np.ones_like(decays)
-            targets = values + generalised_advantages(
-                signals, values, following, ended=ended, discount=config.discount, trace_decays=ones
-            )
-        num_signals = signals.shape[2]
-        return advantages.reshape(-1, num_signals), targets.reshape(-1, num_signals)
+        returns = values + generalised_advantages(
+            signals,
+            values,
+            following,
+            ended=ended,
+            discount=config.discount,
+            trace_decays=np.ones_like(decays),
+        )
+        targets = advantages + values if config.value_target == "lambda-return" else returns
+        flat = (-1, signals.shape[2])
+        return Estimates(
+            advantages.reshape(flat), targets.reshape(flat), values.reshape(flat), returns.reshape(flat)
+        )
+
+    def _values(self, rows: Tensor) -> Floats:
+        """The values of every row in the task's units, [U, n] -> [U, C]."""
+        values = self._critics.values(rows)
+        return values * self._value_scale.values if self._config.value_scale == "running" else values
+
+    def _scaled(self, targets: Floats) -> tuple[Floats, Floats]:
+        """Include the targets, [N, C], in their running scale; return them in it, and the scale, [C].
+
+        The critics' last layers change by as much as the scale, so that the values stay what they are.
+        """
+        if self._config.value_scale == "none":
+            return targets, np.ones(targets.shape[1])
+        before = self._value_scale.values
+        self._value_scale.add((targets**2).mean(axis=0))
+        scale = self._value_scale.values
+        self._critics.rescale(np.where(before > 0.0, quotient(before, scale), 1.0))
+        return quotient(targets, scale), scale
 
     def _fit_critics(self, batch: LearningBatch, targets: Floats) -> dict[str, float]:
         """Regress all critics on their targets, [N, C]; they share no parameter, so one loss serves all.
@@ -242,6 +289,7 @@ class ActorCritic:
             The mean squared errors over the last pass, each sample's before the step that it was part of.
         """
         config = self._config
+        targets, scale = self._scaled(targets)
         num_parts = batch.num_parts(config.minibatch_size)
         steps = max(config.critic_steps, config.critic_passes * num_parts)
         regression_on = lru_cache(maxsize=1)(lambda part: row_targets(part, targets))
@@ -250,14 +298,14 @@ class ActorCritic:
             means, spread = regression_on(part)
             losses.append(self._critics.differentiate(part.rows, part.row_weights, means) + spread)
             self._critic_optimiser.step()
-        mean = torch.stack(losses[-num_parts:]).mean(dim=0).numpy(force=True)
+        mean = torch.stack(losses[-num_parts:]).mean(dim=0).numpy(force=True) * scale**2
         require_finite("value losses", mean)
         return {"value_loss_reward": float(mean[0])} | indexed("value_loss_cost", mean[1:])
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32]) -> dict[str, float]:
         """Make the policy more random once; see ``recrl.agents.noise``."""
         with self._on_its_device():
-            metrics = self._policy.add_noise(noise, observations, self._config.noise_form)
+            metrics = self._policy.add_noise(noise, self._encoder(observations), self._config.noise_form)
         self._noisy = True
         self._policy.publish()
         require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
@@ -295,6 +343,37 @@ class ActorCritic:
         return nullcontext() if device.type == "cpu" else device
 
 
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What a rollout says about the signals, all [N, C].
+
+    Attributes:
+        advantages: generalised advantage estimates.
+        targets: what the critics learn.
+        values: what the critics said before they saw the rollout.
+        returns: discounted sums of the signals up to the episode's or the rollout's end, where the last value
+            stands for the rest.
+    """
+
+    advantages: Floats
+    targets: Floats
+    values: Floats
+    returns: Floats
+
+    def explained_variances(self) -> dict[str, float]:
+        """The critics' explained variance of fresh returns, 1 - Var(returns - values) / Var(returns).
+
+        1 is perfect, 0 is no better than a constant, NaN where all returns are equal. The last value in the
+        returns is the critics' own, which flatters them a little.
+        """
+        spread = self.returns.var(axis=0)
+        unexplained = (self.returns - self.values).var(axis=0)
+        shares = np.where(spread > 0.0, 1.0 - quotient(unexplained, spread), np.nan)
+        return {"explained_variance_reward": float(shares[0])} | indexed(
+            "explained_variance_cost", shares[1:]
+        )
+
+
 def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
     """What to regress on at each row so that the mean squared error over the samples is minimal.
 
@@ -329,14 +408,20 @@ def fresh_student(
         make_rule: the student's rule for a policy.
     """
     generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
-    num_observations = observation_size(cmdp.observation_space)
+    encoder = Encoder(
+        observation_size(cmdp.observation_space),
+        cmdp.components,
+        scales=config.proximity_scales if config.encoder == "proximity" else (),
+        normalise=config.normalise_observations,
+    )
     form = NetworkForm(config.hidden_sizes, INITIALISERS[config.initialisation])
-    policy = StochasticPolicy(num_observations, cmdp.action_space, form, config.last_layer_scale, generator)
-    critics = Critics(num_observations, cmdp.num_costs, form, generator)
+    policy = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
+    critics = Critics(encoder.size, cmdp.num_costs, form, generator)
     order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))
     return ActorCritic(
         cmdp,
         config,
+        encoder=encoder,
         policy=policy,
         critics=critics,
         rule=make_rule(policy),

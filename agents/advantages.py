@@ -80,20 +80,20 @@ def reward_spread(advantages: Floats) -> float:
     return max(float(advantages[:, 0].std()), SMALLEST_STD)
 
 
-def scaled_advantages(advantages: Floats, form: str) -> tuple[Floats, Floats]:
-    """Reward advantages standardised, [N]; cost advantages centred and in the unit ``form`` says, [N, k].
+def scaled_advantages(advantages: Floats) -> tuple[Floats, Floats]:
+    """Centre all advantages and divide them by the standard deviation of the reward's.
 
-    Beside standardised rewards, raw costs make the multiplier's meaning drift: on RiverGrid a step's cost
-    advantage is tens of times a reward's, and grows further as the reward's spread falls. ``reward-scaled``
-    divides both by the same number, so that the multiplier is the CMDP's own.
+    Divided by the same number, rewards and costs trade as they do in the CMDP.
 
     Args:
         advantages: raw, [N, 1 + k].
-        form: ``reward-scaled`` or ``centred``.
+
+    Returns:
+        Of the reward, [N], and of the costs, [N, k].
     """
     centred = advantages - advantages.mean(axis=0)
-    std = reward_spread(centred)
-    return centred[:, 0] / std, centred[:, 1:] / (std if form == "reward-scaled" else 1.0)
+    scaled = centred / reward_spread(centred)
+    return scaled[:, 0], scaled[:, 1:]
 
 
 def penalised_advantages(rewards: Floats, costs: Floats, multipliers: Floats) -> Floats:

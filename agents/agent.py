@@ -36,6 +36,7 @@ class Rollout:
             the end of the rollout cuts.
         carried_costs: undiscounted costs so far of the episodes that were under way when the rollout began,
             float64 [B, k].
+        carried_lengths: steps so far of those episodes, int64 [B].
     """
 
     observations: npt.NDArray[np.float32]
@@ -47,6 +48,18 @@ class Rollout:
     final_observations: npt.NDArray[np.float32]
     last_observations: npt.NDArray[np.float32]
     carried_costs: Floats
+    carried_lengths: npt.NDArray[np.int64]
+
+    def finished_lengths(self) -> npt.NDArray[np.int64]:
+        """Steps of the E episodes that ended in the rollout, those before it included, [E], by (t, b)."""
+        ended = self.terminated | self.truncated
+        lengths = np.empty(ended.shape, np.int64)
+        so_far = self.carried_lengths.copy()
+        for step, over in enumerate(ended):
+            so_far += 1
+            lengths[step] = so_far
+            so_far[over] = 0
+        return lengths[ended]
 
 
 class Policy(Protocol):

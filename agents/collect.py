@@ -4,6 +4,11 @@ Knows no algorithm and no limits. Between two calls it keeps the current observa
 episodes under way, so episodes go on across rollouts; ``state_dict`` holds both and a resumed collector
 continues exactly. The environments' own state and the generator's are the caller's to save.
 
+Where an episode is longer than a rollout, environments that all begin together also end together: most
+rollouts would finish no episode, and each would see one part of an episode only. With ``staggered`` the first
+episodes are cut short at evenly spread lengths, each at the end of a rollout, so that from then on every
+rollout finishes its share of the episodes. A cut episode is learnt from but is not a finished episode.
+
 Letters: T steps, B environments, k costs, n observation components, E finished episodes, M truncated steps.
 """
 
@@ -47,14 +52,19 @@ class Collector:
     Args:
         environments: B environments of one task.
         num_steps: T, steps a rollout takes in each environment, at least 1.
+        staggered: spread the environments over an episode's steps at the start, where the task has a horizon
+            of more than T steps.
     """
 
-    def __init__(self, environments: CMDPVectorEnv, *, num_steps: int) -> None:
+    def __init__(self, environments: CMDPVectorEnv, *, num_steps: int, staggered: bool = False) -> None:
         if num_steps < 1:
             raise ValueError(f"num_steps must be at least 1, got {num_steps}")
         self._environments = environments
         self._num_steps = num_steps
         self._observations: npt.NDArray[np.float32] | None = None
+        horizon = environments.cmdp.horizon
+        self._stages = -(-horizon // num_steps) if staggered and horizon is not None else 1
+        self._rollouts = 0
         num_envs, num_costs = environments.num_envs, environments.cmdp.num_costs
         self._lengths = np.zeros(num_envs, dtype=np.int64)
         self._returns = np.zeros(num_envs, dtype=np.float64)
@@ -64,9 +74,8 @@ class Collector:
         """Seed the environments and begin B new episodes."""
         observations, _ = self._environments.reset(seed=seed)
         self._observations = observation_rows(self._environments.cmdp.observation_space, observations)
-        self._lengths[:] = 0
-        self._returns[:] = 0.0
-        self._costs[:] = 0.0
+        self._rollouts = 0
+        self._forget(slice(None))
 
     def collect(
         self, policy: Policy, generator: np.random.Generator
@@ -83,6 +92,7 @@ class Collector:
         Raises:
             RuntimeError: neither ``reset`` nor ``load_state_dict`` was called before.
         """
+        self._stagger()
         if self._observations is None:
             raise RuntimeError("a collector must be reset or restored before it collects")
         environments = self._environments
@@ -97,7 +107,26 @@ class Collector:
         else:
             rollout = self._collect_by_observation(self._observations, policy, generator)
         self._observations = rollout.last_observations
+        self._rollouts += 1
         return rollout, self._finished(rollout)
+
+    def _stagger(self) -> None:
+        """Cut the first episodes of the environments whose turn it is: group j of J before rollout j."""
+        stage, num_envs = self._rollouts, self._environments.num_envs
+        if not 0 < stage < self._stages:
+            return
+        groups = np.arange(num_envs) * self._stages // num_envs
+        turn = np.flatnonzero(groups == stage)
+        if len(turn):
+            observations = self._environments.restart(turn)
+            self._observations = observation_rows(self._environments.cmdp.observation_space, observations)
+            self._forget(turn)
+
+    def _forget(self, index: slice | npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> None:
+        """Start the sums of some environments' episodes from 0."""
+        self._lengths[index] = 0
+        self._returns[index] = 0.0
+        self._costs[index] = 0.0
 
     def _collect_by_observation(
         self, current: npt.NDArray[np.float32], policy: Policy, generator: np.random.Generator
@@ -138,6 +167,7 @@ class Collector:
             final_observations=np.concatenate([observations[0, :0], *final_observations]),
             last_observations=current,
             carried_costs=self._costs.copy(),
+            carried_lengths=self._lengths.copy(),
         )
 
     def _collect_by_table(
@@ -157,6 +187,7 @@ class Collector:
             final_observations=observations[steps.successors[steps.truncated]],
             last_observations=observations[environments.states],
             carried_costs=self._costs.copy(),
+            carried_lengths=self._lengths.copy(),
         )
 
     def _finished(self, rollout: Rollout) -> tuple[FinishedEpisode, ...]:
@@ -169,9 +200,7 @@ class Collector:
             self._returns += rollout.rewards[step]
             self._costs += rollout.costs[step]
             lengths[step], returns[step], costs[step] = self._lengths, self._returns, self._costs
-            self._lengths[over] = 0
-            self._returns[over] = 0.0
-            self._costs[over] = 0.0
+            self._forget(over)
         columns = (*np.nonzero(ended), lengths[ended], returns[ended], costs[ended])
         return tuple(
             FinishedEpisode(step, environment, length, episode_return, tuple(episode_costs))
@@ -185,6 +214,7 @@ class Collector:
         if self._observations is None:
             raise RuntimeError("a collector has no state before it is reset")
         return {
+            "rollouts": self._rollouts,
             "observations": self._observations.copy(),
             "lengths": self._lengths.copy(),
             "returns": self._returns.copy(),
@@ -202,6 +232,7 @@ class Collector:
                 f"the saved sums of costs have the shape {state['costs'].shape}, "
                 f"these environments need {self._costs.shape}"
             )
+        self._rollouts = int(state["rollouts"])
         self._observations = np.array(state["observations"], dtype=np.float32)
         self._lengths = np.array(state["lengths"], dtype=np.int64)
         self._returns = np.array(state["returns"], dtype=np.float64)

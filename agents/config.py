@@ -27,6 +27,9 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "critic_steps": 80,
     "minibatch_size": None,
     "value_target": "reward-to-go",
+    "value_scale": "none",
+    "encoder": "none",
+    "constraint_window": 1,
     "noise_form": "match-mixture",
 }
 
@@ -34,17 +37,10 @@ STARTER_AGENTS_ASCENT: Mapping[str, Any] = {"policy_learning_rate": 3e-4, "polic
 STARTER_AGENTS_TRUST_REGION: Mapping[str, Any] = {"metric_samples": None}
 STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
     "multiplier_rule": "softplus-adam",
+    "multiplier_unit": "cost",
     "multiplier_initial": 1.0,
     "multiplier_step": 0.05,
 }
-
-
-def _is_unset(value: object) -> bool:
-    """Whether an option that came after sweeps had been run has the value with which it changes nothing.
-
-    It is then left out of what a trial is known by: so an older version's sweep goes on under a newer one.
-    """
-    return not value
 
 
 class StudentConfig(BaseModel):
@@ -68,6 +64,19 @@ class StudentConfig(BaseModel):
         default=0.01,
         description="Factor on the policy's last initial weights, so that it begins nearly uniform "
         "(Andrychowicz et al. 2021; paper 1).",
+    )
+    encoder: Literal["proximity", "none"] = Field(
+        default="proximity",
+        description="What networks see beside the observation: where a task declares a lidar, features that "
+        "resolve small distances (ours), or nothing (paper).",
+    )
+    proximity_scales: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=8)] = Field(
+        default=(0.15, 0.4),
+        description="Length scales of the proximity features, metres (ours).",
+    )
+    normalise_observations: bool = Field(
+        default=False,
+        description="Standardise observations by their running mean and standard deviation (ours).",
     )
     discount: Share = Field(default=0.99, description="gamma of the critics, per step (paper).")
     reward_trace_decay: Share = Field(
@@ -98,9 +107,13 @@ class StudentConfig(BaseModel):
         description="alpha of the CVaR, which is the mean of the worst share 1 - alpha of the episodes; only "
         "with the constraint cvar (ours).",
     )
+    constraint_window: Count = Field(
+        default=1,
+        description="Episodes, at least, from which a mean cost is estimated: where fewer finish in an "
+        "update, those of the updates before it count as well (ours).",
+    )
     limit_margin: NonNegative = Field(
         default=0.0,
-        exclude_if=_is_unset,
         description="Standard errors of an update's mean episode cost that are added to it before it is "
         "compared with its limit; only with the constraint mean (ours).",
     )
@@ -109,12 +122,16 @@ class StudentConfig(BaseModel):
         description="What critics learn: advantage plus value (ours), or the bootstrapped discounted "
         "reward-to-go (paper).",
     )
+    value_scale: Literal["running", "none"] = Field(
+        default="running",
+        description="Whether critics learn their targets divided by the targets' running root mean square, "
+        "so that the size of rewards and costs does not matter (ours), or the targets themselves (paper).",
+    )
     target_kl: Positive = Field(
         default=0.01, description="Size of the trust region, mean KL in nats an update (paper)."
     )
     noisy_target_kl: Positive | None = Field(
         default=None,
-        exclude_if=_is_unset,
         description="target_kl of an update from samples of a policy to which the teacher added noise, which "
         "has to be undone beside what is learnt, or in which it rewards entropy; null for target_kl (ours).",
     )
@@ -184,10 +201,12 @@ class MultiplierConfig(StudentConfig):
     multiplier_initial: NonNegative = Field(
         default=0.0, description="First value of every multiplier (ours; paper 1)."
     )
-    multiplier_unit: Literal["limit", "cost"] = Field(
-        default="limit",
-        description="What the steps and gains of PID and projected ascent are per: max(d, 1) of episode "
-        "cost, so that limits of 1 and of 25 are answered alike (ours), or 1 of episode cost (paper).",
+    multiplier_unit: Literal["relative", "cost"] = Field(
+        default="relative",
+        description="What violations and multipliers are counted in. relative: violations per limit and "
+        "standard error, multipliers per ratio of the running spreads of reward and cost advantages, so that "
+        "no unit of the task matters (ours). cost: violations in episode cost, multipliers in standard "
+        "deviations of the reward advantages per unit of cost (paper).",
     )
     multiplier_step: Positive = Field(
         default=0.1,
@@ -201,13 +220,11 @@ class MultiplierConfig(StudentConfig):
     )
     multiplier_geometric: bool = Field(
         default=False,
-        exclude_if=_is_unset,
         description="Let the integral I of PID grow and fall by shares of 1 + I, so that a price that had to "
         "be high is not high for long; only with the rule pid (ours).",
     )
     multiplier_waits: bool = Field(
         default=False,
-        exclude_if=_is_unset,
         description="Sum up no violation that the teacher may have caused: in an update from samples of a "
         "policy with added noise, or in which it rewards entropy, the integral of PID stays, and the other "
         "rules' multipliers (ours).",
@@ -274,7 +291,6 @@ class PPOLagConfig(AscentConfig, MultiplierConfig):
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_ASCENT,
         **STARTER_AGENTS_MULTIPLIERS,
-        "cost_advantages": "centred",
         "penalty": "separate",
     }
 
@@ -283,11 +299,6 @@ class PPOLagConfig(AscentConfig, MultiplierConfig):
     )
     entropy_bonus: NonNegative = Field(
         default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
-    )
-    cost_advantages: Literal["reward-scaled", "centred"] = Field(
-        default="reward-scaled",
-        description="Unit of the cost advantages: divided by the reward advantages' standard deviation, so "
-        "that the multiplier is that of the CMDP (ours), or as they are beside standardised rewards (paper).",
     )
     penalty: Literal["combined", "separate"] = Field(
         default="combined",
@@ -376,7 +387,6 @@ class SettlingConfig(TrustRegionConfig):
 
     temperature: NonNegative = Field(
         default=0.0,
-        exclude_if=_is_unset,
         description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
         "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
         "(ours).",
@@ -388,7 +398,6 @@ class LinearisedConstraintConfig(SettlingConfig):
 
     cross_fitting: bool = Field(
         default=False,
-        exclude_if=_is_unset,
         description="Judge what a step does to a cost on samples that did not choose it, and let a violation "
         "count for more as far as less is confirmed; where observations are many and noisy, as on Safety Gym "
         "(ours).",
@@ -414,15 +423,9 @@ class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_TRUST_REGION,
         **STARTER_AGENTS_MULTIPLIERS,
-        "cost_advantages": "centred",
         "temperature": 0.0,
     }
 
-    cost_advantages: Literal["reward-scaled", "centred"] = Field(
-        default="reward-scaled",
-        description="Unit of the cost advantages: divided by the reward advantages' standard deviation, so "
-        "that the multiplier is that of the CMDP (ours), or as they are beside standardised rewards (paper).",
-    )
     temperature: NonNegative = Field(
         default=1.0,
         description="lambda, what a nat of KL must be worth in the surrogate, that is 1 + the multipliers "

@@ -96,7 +96,7 @@ def tail_costs(
 
 
 def standard_errors(costs: Floats) -> Floats:
-    """Of the mean of E costs, [E, k] -> [k]; 0 where one cost alone says nothing of its spread.
+    """Return the standard errors of the means of E costs, [E, k] -> [k]; 0 where E is less than 2.
 
     >>> standard_errors(np.array([[1.0], [3.0]]))
     array([1.])
@@ -105,6 +105,54 @@ def standard_errors(costs: Floats) -> Floats:
         return np.zeros(costs.shape[1])
     errors: Floats = costs.std(axis=0, ddof=1) / math.sqrt(len(costs))
     return errors
+
+
+class RecentEpisodes:
+    """The last finished episodes: those of the newest update, and of so many before it as a window needs.
+
+    Args:
+        window: the fewest episodes that will do, at least 1; there are fewer only before as many finished.
+        num_costs: k.
+    """
+
+    def __init__(self, window: int, num_costs: int) -> None:
+        self._window = window
+        self._updates: list[tuple[Floats, npt.NDArray[np.int64]]] = []
+        self._nothing = np.empty((0, num_costs)), np.empty(0, np.int64)
+
+    def add(self, costs: Floats, lengths: npt.NDArray[np.int64]) -> tuple[Floats, npt.NDArray[np.int64]]:
+        """Include the episodes that finished in an update, and return those of the window.
+
+        Args:
+            costs: undiscounted, [E, k].
+            lengths: steps, [E].
+
+        Returns:
+            Costs and lengths of all episodes of the window; of none if E is 0, since then nothing is new.
+        """
+        if not len(costs):
+            return self._nothing
+        self._updates.append((costs, lengths))
+        while sum(len(each) for each, _ in self._updates[1:]) >= self._window:
+            del self._updates[0]
+        return np.concatenate([each for each, _ in self._updates]), np.concatenate(
+            [each for _, each in self._updates]
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The window's episodes, and how many of them finished in each of its updates."""
+        return {
+            "costs": np.concatenate([self._nothing[0], *(costs for costs, _ in self._updates)]),
+            "lengths": np.concatenate([self._nothing[1], *(lengths for _, lengths in self._updates)]),
+            "episodes": np.array([len(costs) for costs, _ in self._updates], np.int64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        ends = np.cumsum(state["episodes"])[:-1]
+        costs = np.split(np.array(state["costs"], np.float64), ends)
+        lengths = np.split(np.array(state["lengths"], np.int64), ends)
+        self._updates = list(zip(costs, lengths, strict=True)) if len(state["episodes"]) else []
 
 
 class MeanCost:
@@ -151,7 +199,7 @@ class TailCost:
 
         Args:
             rollout: the steps.
-            episode_costs: of the episodes that finished in it, [E, k]; with E = 0 the value at risk stays.
+            episode_costs: of the last finished episodes, [E, k]; with E = 0 the value at risk stays.
             limits: d, [k], possibly infinite.
 
         Returns:

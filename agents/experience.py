@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from recrl.agents.advantages import reward_spread, scaled_advantages
-from recrl.agents.agent import Rollout
 from recrl.agents.batch import LearningBatch
+from recrl.agents.constraint_forms import standard_errors
 from recrl.agents.distributions import Distribution
 from recrl.agents.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
@@ -27,41 +27,47 @@ class Constraints:
 
     Attributes:
         limits: d, [k], possibly infinite.
-        gaps: constrained value of the finished episodes (their mean undiscounted cost, with a margin where
-            one is asked for, or its CVaR) minus limit, [k]; -inf where the limit is infinite, NaN where no
-            episode finished.
-        episode_length: mean steps of an episode, above 0: environment steps over finished episodes; NaN if
-            none finished.
+        gaps: constrained value of the episodes (their mean undiscounted cost, with a margin where one is
+            asked for, or its CVaR) minus limit, [k]; -inf where the limit is infinite, NaN where it is
+            finite and no episode finished.
+        standard_errors: of the episodes' mean costs, [k], at least 0; 0 of fewer than two episodes.
+        episode_length: mean steps of these episodes, at least 1; NaN if none finished.
         noisy: whether the teacher added noise to the policy that collected them, or rewards its entropy.
     """
 
     limits: Floats
     gaps: Floats
+    standard_errors: Floats
     episode_length: float
     noisy: bool = False
 
     @classmethod
     def measure(
         cls,
-        rollout: Rollout,
-        num_episodes: int,
+        costs: Floats,
+        lengths: npt.NDArray[np.int64],
         values: Floats,
         limits: Floats,
-        horizon: int | None,
         *,
         noisy: bool = False,
     ) -> Constraints:
-        """Compare the constrained values of E finished episodes, [k], with the limits, [k]."""
-        if num_episodes == 0:
-            return cls(limits, np.full_like(limits, np.nan), float("nan"), noisy)
-        length = rollout.rewards.size / num_episodes
-        # A rollout that ends few of the episodes it carries on would make them look longer than they can be.
-        return cls(limits, values - limits, min(length, horizon or length), noisy)
+        """Compare the constrained values of E episodes with the limits.
+
+        Args:
+            costs: undiscounted costs of the episodes, [E, k].
+            lengths: their steps, [E].
+            values: what is constrained, [k]; NaN if E is 0.
+            limits: d, [k].
+            noisy: see the attribute.
+        """
+        gaps = np.where(np.isfinite(limits), values - limits, -np.inf)
+        length = float(lengths.mean()) if len(lengths) else float("nan")
+        return cls(limits, gaps, standard_errors(costs), length, noisy)
 
     @property
     def known(self) -> bool:
-        """Whether any episode finished."""
-        return not bool(np.isnan(self.episode_length))
+        """Whether the gap of every finite limit is known."""
+        return not bool(np.isnan(self.gaps).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,5 +163,5 @@ class Experience:
             Of the reward, [N]; of the costs that have a limit, [N, j]; and their violations c, [j].
         """
         active = ActiveConstraints.of(self.constraints)
-        rewards, costs = scaled_advantages(self.advantages, "reward-scaled")
+        rewards, costs = scaled_advantages(self.advantages)
         return rewards, costs[:, active.index], active.violations / reward_spread(self.advantages)

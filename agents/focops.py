@@ -26,7 +26,6 @@ import torch
 from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.advantages import penalised_advantages, scaled_advantages
 from recrl.agents.ascent import Objective, climb
 from recrl.agents.config import FOCOPSConfig
 from recrl.agents.distributions import Distribution, mean_divergence
@@ -93,18 +92,17 @@ class FirstOrderConstrainedOptimisation:
         """Move the multipliers, then the policy."""
         config = self._config.in_update(noisy=experience.constraints.noisy)
         start = policy.parameters.values.clone()
-        multipliers = self._multipliers.answer(experience.constraints)
-        rewards, costs = scaled_advantages(experience.advantages, "reward-scaled")
+        penalty = self._multipliers.update(experience)
         objective = partial(
             projection_objective,
-            advantages=penalised_advantages(rewards, costs, multipliers),
+            advantages=penalty.advantages,
             temperature=config.temperature,
             radius=config.target_kl,
         )
         metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
         if config.trust_region == "kept":
             keep_near(policy, experience, start, config.target_kl)
-        return {**metrics, **indexed("multiplier", multipliers)}
+        return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 
 def make_focops(cmdp: CMDPSpec, config: FOCOPSConfig, seed: np.random.SeedSequence) -> ActorCritic:

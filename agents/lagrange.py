@@ -20,12 +20,14 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 
+from recrl.agents.scales import quotient
 from recrl.environments.cmdp import Floats
 
 MultiplierState = Mapping[str, Floats]
 
 ADAM_BETAS = (0.9, 0.999)
 ADAM_EPSILON = 1e-8
+LARGEST_RELATIVE_GAP = 10.0
 
 
 def start_projected_ascent(num_costs: int, initial: float) -> dict[str, Floats]:
@@ -107,8 +109,8 @@ def start_pid(num_costs: int, initial: float) -> dict[str, Floats]:
 def pid(
     state: MultiplierState,
     gaps: Floats,
-    limits: Floats,
     *,
+    largest: float | Floats,
     proportional: float | Floats,
     integral: float | Floats,
     derivative: float | Floats,
@@ -117,27 +119,27 @@ def pid(
 ) -> dict[str, Floats]:
     """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
 
-    I <- clip(I + K_I min(gap, max(d, 1)), 0, maximum);
+    I <- clip(I + K_I min(gap, largest), 0, maximum);
     lambda = clip(K_P gap + I + K_D max(0, gap - last gap), 0, maximum).
 
     The derivative acts only on growing violations, as in the source. The integral is held within what the
     multiplier itself can be, so that neither a long satisfied nor a long hopeless constraint winds it up; it
     includes its gain, so that a changed K_I does not make lambda jump.
 
-    The gap that is summed up is held, too. An episode costs at least 0, so it is never further than d below
-    the limit, but an untrained policy may be any distance above it: what ten updates of a cost of 50 sum up
-    under a limit of 1, no 400 later ones can take back. So a violation counts no more than the best that can
-    undo it. (The 1 is for limits near 0, which still must be answered.)
+    The gap that is summed up is bounded, too. An episode costs at least 0, so it is never further than d
+    below the limit, but an untrained policy may be any distance above it: what ten updates of a cost of 50
+    sum up under a limit of 1, no 400 later ones can take back. So a violation counts no more than the best
+    that can undo it.
 
-    ``geometric`` (ours) sums up in the logarithm of 1 + I: I <- (1 + I) exp(K_I min(gap, max(d, 1))) - 1. A
+    ``geometric`` (ours) sums up in the logarithm of 1 + I: I <- (1 + I) exp(K_I min(gap, largest)) - 1. A
     price that had to be high comes down by shares of itself, as it went up; near 0 it moves as without.
 
     Args:
         state: ``multipliers``, ``integral``, ``last_gap``.
-        gaps: J - d, [k]; -inf where there is no constraint.
-        limits: d, [k], each at least 0, possibly infinite.
-        proportional: K_P, at least 0, multiplier units per unit of episode cost, one number or [k]; so are
-            the next two.
+        gaps: J - d in any unit, [k]; -inf where there is no constraint.
+        largest: the largest violation that is summed up, in that unit, one number or [k].
+        proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k]; so are the
+            next two.
         integral: K_I.
         derivative: K_D.
         maximum: the largest multiplier, possibly infinite.
@@ -146,7 +148,7 @@ def pid(
     active = np.isfinite(gaps)
     gap = np.where(active, gaps, 0.0)
     rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
-    change = integral * np.minimum(gap, limit_units(limits))
+    change = integral * np.minimum(gap, largest)
     if geometric:
         change = (1.0 + state["integral"]) * np.expm1(change)
     summed = np.clip(state["integral"] + change, 0.0, maximum)
@@ -158,13 +160,25 @@ def pid(
     }
 
 
-def limit_units(limits: Floats) -> Floats:
-    """What a gap is large or small against: max(d, 1) of each limit, [k]; 1 where there is no limit.
+def relative_gaps(gaps: Floats, limits: Floats, standard_errors: Floats) -> Floats:
+    """Divide gaps by what they are large or small against: (J - d) / sqrt(d^2 + s^2), [k].
 
-    A gap of 1 is nothing under a limit of 25 and everything under one of 1. Limits below 1 count as 1, so
-    that a limit of 0 has a unit, too.
+    A gap of 1 is nothing under a limit of 25, and everything under one of 1; and a gap of one standard error
+    s says little, however small the limit. The result has no unit, is at least -1, and is cut off at 10,
+    which matters where both d and s are 0.
+
+    Args:
+        gaps: J - d, [k]; -inf where there is no constraint.
+        limits: d, [k], possibly infinite.
+        standard_errors: s, of J, [k], at least 0.
+
+    >>> relative_gaps(np.array([10.0, -4.0, 2.0]), np.array([4.0, 4.0, 0.0]), np.array([3.0, 3.0, 0.0]))
+    array([ 2. , -0.8, 10. ])
     """
-    return np.where(np.isfinite(limits), np.maximum(limits, 1.0), 1.0)
+    active = np.isfinite(gaps)
+    sizes = np.hypot(np.where(active, limits, 1.0), standard_errors)
+    floors = np.maximum(sizes, np.abs(np.where(active, gaps, 0.0)) / LARGEST_RELATIVE_GAP)
+    return np.where(active, quotient(np.where(active, gaps, 0.0), floors), -np.inf)
 
 
 def restarted(

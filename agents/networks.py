@@ -393,6 +393,10 @@ class Critics:
         """The values of every row, [U, n] -> float64 [U, 1 + k]."""
         return self._stack.outputs(rows)[..., 0].numpy(force=True).T.astype(np.float64)
 
+    def rescale(self, factors: npt.NDArray[np.float64]) -> None:
+        """Multiply each critic's values by a factor, [1 + k] (van Hasselt et al. 2016, section 2.2)."""
+        self._stack.layers[-1].mul_(torch.as_tensor(factors, dtype=torch.get_default_dtype())[:, None, None])
+
     def differentiate(self, rows: Tensor, row_weights: Tensor, targets: Tensor) -> Tensor:
         """The squared errors of each critic, and their sum's gradient, which the block then holds.
 

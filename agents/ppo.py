@@ -34,7 +34,7 @@ class ProximalPolicyOptimisation:
     ) -> dict[str, float]:
         """Climb the reward's surrogate."""
         config = self._config
-        rewards, _ = scaled_advantages(experience.advantages, "centred")
+        rewards, _ = scaled_advantages(experience.advantages)
 
         def objective(part: Experience) -> Objective:
             signed = SignedAdvantages.split(part.batch, rewards)

@@ -18,7 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.advantages import penalised_advantages, scaled_advantages
+from recrl.agents.advantages import penalised_advantages
 from recrl.agents.ascent import Objective, climb, with_entropy
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import PPOLagConfig
@@ -74,15 +74,15 @@ class PPOLagrangian:
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
         config = self._config
-        multipliers = self._multipliers.answer(experience.constraints)
-        rewards, costs = scaled_advantages(experience.advantages, config.cost_advantages)
+        penalty = self._multipliers.update(experience)
+        gain_of = GAINS[config.penalty]
 
         def objective(part: Experience) -> Objective:
-            gain = GAINS[config.penalty](part.batch, rewards, costs, multipliers, config.clip)
+            gain = gain_of(part.batch, penalty.rewards, penalty.costs, penalty.multipliers, config.clip)
             return with_entropy(gain, part.batch, config.entropy_bonus)
 
         metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
-        return {**metrics, **indexed("multiplier", multipliers)}
+        return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 
 def make_ppo_lag(cmdp: CMDPSpec, config: PPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:

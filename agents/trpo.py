@@ -94,7 +94,7 @@ class TrustRegionPolicyOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one step up the reward's surrogate."""
-        rewards, _ = scaled_advantages(experience.advantages, "centred")
+        rewards, _ = scaled_advantages(experience.advantages)
         metrics = step_up(
             policy, experience, rewards, self._config, generator, temperature=self._config.temperature
         )

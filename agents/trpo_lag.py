@@ -15,7 +15,6 @@ from __future__ import annotations
 import numpy as np
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.advantages import penalised_advantages, scaled_advantages
 from recrl.agents.config import TRPOLagConfig
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
@@ -36,13 +35,16 @@ class TRPOLagrangian:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
-        multipliers = self._multipliers.answer(experience.constraints)
-        rewards, costs = scaled_advantages(experience.advantages, self._config.cost_advantages)
-        objective = penalised_advantages(rewards, costs, multipliers)
+        penalty = self._multipliers.update(experience)
         metrics = step_up(
-            policy, experience, objective, self._config, generator, temperature=self._config.temperature
+            policy,
+            experience,
+            penalty.advantages,
+            self._config,
+            generator,
+            temperature=self._config.temperature,
         )
-        return {**metrics, **indexed("multiplier", multipliers)}
+        return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 
 def make_trpo_lag(cmdp: CMDPSpec, config: TRPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:

@@ -17,19 +17,34 @@ import io
 import json
 import zipfile
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from recrl.analysis.frames import ROWS, TRIAL, Sweep, TrialFacts, assemble, drawn_columns
+from recrl.analysis.frames import (
+    EVENT_COLUMNS,
+    PHASE_COLUMNS,
+    ROWS,
+    TRIAL,
+    Sweep,
+    TrialFacts,
+    assemble,
+    drawn_columns,
+)
+from recrl.environments.registry import TASKS, task_options
 from recrl.orchestrator.archives import UNREADABLE, unpacked
 from recrl.orchestrator.errors import DamagedError, RecrlError, missing
+from recrl.orchestrator.foreign import LimitValues, checked_name
 from recrl.orchestrator.row_files import Extent
 from recrl.orchestrator.small_files import write_atomically
 from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.store import EVALUATION_COLUMNS, UPDATE_COLUMNS
+from recrl.orchestrator.validation import sentences
 
 SUFFIX = ".zip"
 FORMAT = 2
@@ -37,6 +52,22 @@ WITHOUT_DIGESTS = 1  # the format before: its tables are read as they are
 DIGITS = 6
 ROUNDED = ("updates", "policies")
 MAX_BYTES = 512 * 2**20  # unpacked; about 50 times the largest sweep so far
+# Columns that every frame must have if it has rows, those that it has for each cost, and those of text.
+REQUIRED = {
+    "phases": PHASE_COLUMNS,
+    "updates": drawn_columns(UPDATE_COLUMNS),
+    "evaluations": EVALUATION_COLUMNS,
+    "events": EVENT_COLUMNS,
+    "policies": ("state", "action_0"),
+}
+COSTLY = {
+    "phases": ("cost",),
+    "updates": ("cost", "limit"),
+    "evaluations": ("cost",),
+    "events": (),
+    "policies": (),
+}
+TEXTS = ("phase", "policy", "event")
 LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: zip knows none before
 
 
@@ -91,21 +122,93 @@ def load(path: Path) -> Sweep:
     except FileNotFoundError as error:
         raise RecrlError(f"{path}: {missing(path)}") from error
     except UNREADABLE as error:
-        raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({error})") from error
+        reason = getattr(error, "strerror", None) or error
+        raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({reason})") from error
     found = told.get("format") if isinstance(told, dict) else None
     if found not in (FORMAT, WITHOUT_DIGESTS):
-        raise RecrlError(f"{path}: its format must be {FORMAT} or {WITHOUT_DIGESTS}, got {found!r}")
-    if found == FORMAT:
+        raise RecrlError(f"{path}: its format must be {FORMAT} or {WITHOUT_DIGESTS}, got {found!r:.60}")
+    try:
+        checked = _SweepFile.model_validate(told)
         for name, data in zip(names[1:], frames, strict=True):
-            if Extent.of(data).sha256 != told["digests"][name]:
-                raise DamagedError(f"{path}: its {name} is not what was written: export the sweep again")
-    return assemble(
-        told["name"],
-        [_facts(trial, told["provenance"]) for trial in told["trials"]],
-        **rows,
-        grid=told["grid"],
-        notes=told["notes"],
-    )
+            if found == FORMAT and Extent.of(data).sha256 != checked.digests.get(name):
+                raise DamagedError(f"{path}: its {name} is not what was written; export the sweep again")
+        facts = [_facts(trial, checked.provenance) for trial in told["trials"]]
+        for name, frame in rows.items():
+            _check_rows(name, frame, facts)
+        checked_name(checked.name)
+        if any(it.start_limits and len(it.start_limits) != len(it.spec.deploy_limits) for it in facts):
+            raise ValueError("start_limits must be as many as deploy_limits")
+        for task in {json.dumps([it.spec.task.name, it.spec.task.options]) for it in facts}:
+            _check_task(*json.loads(task))
+    except ValidationError as error:
+        place, sentence = next(sentences(error, None))
+        raise RecrlError(f"{path}: sweep.json: {'.'.join(map(str, place))}: {sentence}") from error
+    except (ValueError, IndexError, OverflowError) as error:
+        raise RecrlError(f"{path}: is no sweep's compact file: {error}") from error
+    return assemble(checked.name, facts, **rows, grid=checked.grid, notes=checked.notes)
+
+
+class _TrialFile(BaseModel):
+    """What sweep.json says of a trial, but for its spec, which ``TrialSpec`` checks itself."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    spec: dict[str, Any]
+    status: Literal["waiting", "running", "complete", "failed", "damaged"]
+    error: str
+    env_steps: int = Field(ge=0, le=10**15)
+    cpu_seconds: float = Field(ge=0, le=1e12)
+    start_limits: LimitValues | None
+    provenance: int = Field(ge=0)
+
+
+class _SweepFile(BaseModel):
+    """The content of sweep.json."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+    format: int
+    name: str
+    notes: list[str]
+    grid: str
+    provenance: list[str]
+    trials: list[_TrialFile]
+    digests: dict[str, str] = Field(default_factory=dict)
+
+
+def _check_task(name: str, options: dict[str, Any]) -> None:
+    """Check the options of a task of ours: its optimum and its maps are computed from them.
+
+    Raises:
+        ValueError: they are wrong.
+    """
+    if name in TASKS:
+        try:
+            task_options(name, options)
+        except ValidationError as error:
+            place, sentence = next(sentences(error, None))
+            raise ValueError(f"the options of {name}: {'.'.join(map(str, place))}: {sentence}") from error
+
+
+def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> None:
+    """Check that a frame has the columns that the others rely on, and numbers where these are numbers.
+
+    Raises:
+        ValueError: it has not.
+    """
+    columns = list(map(str, rows))
+    if TRIAL not in columns:
+        raise ValueError(f"{name}.csv has no column {TRIAL!r}")
+    if not len(rows):
+        return
+    costs = max(len(it.spec.deploy_limits) for it in facts) if facts else 0
+    for column in (*REQUIRED[name], *(f"{kind}_{i}" for kind in COSTLY[name] for i in range(costs))):
+        if column not in columns:
+            raise ValueError(f"{name}.csv has no column {column!r}")
+    for column in columns:
+        if column not in TEXTS and not pd.api.types.is_numeric_dtype(rows[column].dtype):
+            raise ValueError(f"{name}.csv: the column {column!r} must hold numbers")
+    trials = rows[TRIAL].to_numpy()
+    if trials.dtype.kind != "i" or trials.min() < 0 or trials.max() >= len(facts):
+        raise ValueError(f"{name}.csv: the column {TRIAL!r} must be positions from 0 to {len(facts) - 1}")
 
 
 def _told(sweep: Sweep) -> dict[str, Any]:

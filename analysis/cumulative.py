@@ -51,7 +51,7 @@ from recrl.analysis.frames import GROUP, KEY, Sweep
 from recrl.analysis.tables import number
 from recrl.environments.cmdp import Floats, Phase
 from recrl.environments.finite_cmdp import FiniteVectorEnv
-from recrl.environments.plugins import UnknownNameError
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.environments.registry import find_task, make_vector, task_options
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
@@ -264,7 +264,7 @@ def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | 
     try:
         if find_task(name).optimum is None:  # no finite task is without, and others can be slow to build
             return None
-    except UnknownNameError:  # not installed here
+    except (UnknownNameError, UntrustedNameError):  # not installed here
         return None
     return _sizes_of(name, task_options(name, options).model_dump_json(), cost)
 
@@ -281,7 +281,9 @@ def _sizes_of(name: str, canonical: str, cost: int) -> TaskSizes | None:
 def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
     """The discount gamma of a CPO student, None for others: Lemma 1 is not about them."""
     options = sweep.agent_options[str(trial["agent"])]
-    return float(options.get("discount", math.nan)) if trial["agent_name"] == "cpo" else None
+    discount = options.get("discount")
+    is_known = trial["agent_name"] == "cpo" and isinstance(discount, int | float)
+    return float(discount) if is_known else math.nan if trial["agent_name"] == "cpo" else None
 
 
 def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:

@@ -44,9 +44,10 @@ import numpy.typing as npt
 import pandas as pd
 
 from recrl.environments.cmdp import Phase
-from recrl.environments.plugins import UnknownNameError
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.environments.registry import optimal_return
-from recrl.orchestrator.errors import DamagedError
+from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
+from recrl.orchestrator.foreign import checked_name
 from recrl.orchestrator.phase_totals import phase_totals
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import (
@@ -263,6 +264,10 @@ def assemble(
         notes: what the source has to say.
     """
     keys, doubles = _keys([it.spec for it in facts])
+    try:
+        checked_name(name)
+    except ValueError as error:
+        raise RecrlError(str(error)) from error
     optima, unknown = _optima([it.spec for it in facts])
     costs = range(max((len(it.spec.deploy_limits) for it in facts), default=0))
     cost_columns, limit_columns = [f"cost_{i}" for i in costs], [f"limit_{i}" for i in costs]
@@ -410,9 +415,12 @@ def _optima(specs: Sequence[TrialSpec]) -> tuple[list[float], list[str]]:
         task = spec.task
         try:
             optimum = optimal_return(task.name, task.options, spec.deploy_limits)
-        except UnknownNameError as error:
+        except (UnknownNameError, UntrustedNameError) as error:
             optimum = None
             notes[task.label] = f"{task.label}: {UNKNOWN_OPTIMUM} {error}"
+        except USERS_ERRORS as error:
+            optimum = None
+            notes[task.label] = f"{task.label}: {UNKNOWN_OPTIMUM} {described(error)}"
         optima.append(math.nan if optimum is None else optimum)
     return optima, list(notes.values())
 

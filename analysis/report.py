@@ -30,7 +30,8 @@ import dataclasses
 import json
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -50,7 +51,7 @@ from recrl.analysis.metrics import MEAN, Averaging, Measure, interquartile
 from recrl.analysis.page import Section
 from recrl.analysis.policy_map import policy_maps
 from recrl.analysis.profiles import performance_profiles
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.spec import TrialState
 
 BOOTSTRAP_SEED = 0
@@ -88,12 +89,17 @@ def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Pat
 
     Raises:
         NothingToDrawError: no trial has committed a policy update yet.
+        Exception: what went wrong in the first figure that could not be drawn; all others and the report,
+            which names it, are there.
     """
-    drawn = []
+    drawn, mistakes = [], _Mistakes()
     for stem, make in drawings(sweep, averaging=averaging).items():
-        if (figure := make()) is not None:
-            drawn += styles.save(figure, folder, stem)
-    return _with_pages(sweep, folder, drawn)
+        with mistakes.kept(stem):
+            if (figure := make()) is not None:
+                drawn += styles.save(figure, folder, stem)
+    written = _with_pages(_noted(sweep, mistakes.notes), folder, drawn)
+    mistakes.raise_first()
+    return written
 
 
 def sketch(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
@@ -104,11 +110,42 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[P
         folder: where the files go.
         averaging: of the learning curves.
     """
-    drawn = []
+    drawn, mistakes = [], _Mistakes()
     for stem, make in drawings(sweep, averaging=averaging).items():
-        if SKETCHED.fullmatch(stem) and (figure := make()) is not None:
-            drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
-    return _with_pages(dataclasses.replace(sweep, notes=(*sweep.notes, UNFINISHED)), folder, drawn)
+        with mistakes.kept(stem):
+            if SKETCHED.fullmatch(stem) and (figure := make()) is not None:
+                drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
+    written = _with_pages(_noted(sweep, [*mistakes.notes, UNFINISHED]), folder, drawn)
+    mistakes.raise_first()
+    return written
+
+
+class _Mistakes:
+    """What went wrong in single figures: the others are drawn all the same, and the report says it."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self._first: Exception | None = None
+
+    @contextmanager
+    def kept(self, stem: str) -> Iterator[None]:
+        """Keep what is raised while one figure is drawn."""
+        try:
+            yield
+        except OSError:
+            raise
+        except Exception as error:
+            self.notes.append(f"the figure {stem} could not be drawn ({described(error)})")
+            self._first = self._first or error
+
+    def raise_first(self) -> None:
+        """Raise the first of them, now that all else is done."""
+        if self._first is not None:
+            raise self._first
+
+
+def _noted(sweep: Sweep, notes: list[str]) -> Sweep:
+    return dataclasses.replace(sweep, notes=(*sweep.notes, *notes))
 
 
 def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
@@ -120,10 +157,11 @@ def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
         text += ["", f"## {heading}", "", tables.markdown(table)]
     if not shown:
         text += ["", NO_TABLE]
-    state = [_count(sweep), "", *(f"- {sentence}" for sentence in missing(sweep))]
+    state = [_count(sweep), "", *(f"- {tables.markdown_text(sentence)}" for sentence in missing(sweep))]
+    title = f"# {tables.markdown_text(sweep.name)}"
     reports = [
         tables.write_text(_html(sweep, pictures, shown), folder / "report.html"),
-        tables.write_text("\n".join([f"# {sweep.name}", "", *state, "", *text]), folder / "report.md"),
+        tables.write_text("\n".join([title, "", *state, "", *text]), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
 

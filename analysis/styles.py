@@ -8,6 +8,7 @@ a ``with`` block.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -16,9 +17,12 @@ from typing import Any, Literal
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from recrl.analysis.frames import METHOD_ORDER, ordered
 
+# The formulas in figures: ours, and those that matplotlib makes of numbers on an axis.
+OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$")
 TEXT_WIDTH = 7.0  # inches, of a page with two columns
 PNG_DPI = 200
 LIMIT_COLOUR = "#00b7c7"
@@ -136,6 +140,14 @@ def save_png(figure: Figure, path: Path) -> Path:
         path: of the file; its folder is made if it is not there.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    _show_dollars(figure)
     with context():
         figure.savefig(path, dpi=PNG_DPI, metadata={"Software": None})
     return path
+
+
+def _show_dollars(figure: Figure) -> None:
+    """Let a label that holds a dollar sign be text and not TeX, which it need not be right as."""
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and "$" in OUR_FORMULAS.sub("", text.get_text()):
+            text.set_parse_math(False)

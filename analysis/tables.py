@@ -14,10 +14,25 @@ import pandas as pd
 
 from recrl.analysis.frames import GROUP
 from recrl.analysis.metrics import Measure
+from recrl.orchestrator.redaction import printable
 
 DASH = "–"
 TOO_FEW = "†"
-LATEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "±": r"$\pm$", "≤": r"$\leq$", TOO_FEW: r"$\dagger$"}
+LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "&": r"\&",
+    "%": r"\%",
+    "_": r"\_",
+    "#": r"\#",
+    "±": r"$\pm$",
+    "≤": r"$\leq$",
+    TOO_FEW: r"$\dagger$",
+}
 
 
 def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
@@ -123,7 +138,19 @@ def markdown(table: pd.DataFrame) -> str:
     | 1a | 9.50 |
     """
     lines = [list(map(str, table)), ["---"] * len(table.columns), *table.astype(str).to_numpy().tolist()]
-    return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(map(markdown_text, line)) + " |" for line in lines)
+
+
+def markdown_text(text: str) -> str:
+    r"""A text that Markdown shows as it is where it would be HTML, a link or the end of a cell.
+
+    >>> markdown_text("<img src=x> [a](b) | c")
+    '&lt;img src=x&gt; [a]\\(b) \\| c'
+    """
+    text = " ".join(printable(text).split())
+    for mark, escaped in {"<": "&lt;", ">": "&gt;", "](": r"]\(", "|": r"\|"}.items():
+        text = text.replace(mark, escaped)
+    return text
 
 
 def latex(table: pd.DataFrame) -> str:

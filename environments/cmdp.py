@@ -35,6 +35,32 @@ class Phase(StrEnum):
 
 
 @dataclass(frozen=True)
+class ObservationComponent:
+    """A named run of consecutive numbers of a flattened observation, and what they measure.
+
+    Attributes:
+        name: for example ``hazards_lidar``.
+        size: how many numbers, at least 1.
+        lidar_range: of a lidar, its range in metres: each number v in [0, 1] is then one direction, and the
+            nearest object in it is at the distance ``(1 - v) * lidar_range``, with 0 where there is none;
+            None for any other measurement.
+    """
+
+    name: str
+    size: int
+    lidar_range: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.size < 1:
+            raise ValueError(f"observation component {self.name}: size must be at least 1, got {self.size}")
+        if self.lidar_range is not None and not 0.0 < self.lidar_range < math.inf:
+            raise ValueError(
+                f"observation component {self.name}: lidar_range must be finite and above 0 metres, "
+                f"got {self.lidar_range}"
+            )
+
+
+@dataclass(frozen=True)
 class CMDPSpec:
     """What a task fixes of a CMDP: spaces, cost functions and horizon, but not the limits d.
 
@@ -44,6 +70,7 @@ class CMDPSpec:
         action_space: of one environment; ``Discrete`` or a bounded or unbounded ``Box``.
         cost_names: names of the k >= 1 cost functions, in the order of every cost vector.
         horizon: steps after which an episode is truncated, or None if it never is.
+        components: the parts of a flattened observation in their order, or none if the task does not say.
     """
 
     name: str
@@ -51,12 +78,25 @@ class CMDPSpec:
     action_space: gymnasium.Space[Any]
     cost_names: tuple[str, ...]
     horizon: int | None
+    components: tuple[ObservationComponent, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.cost_names:
             raise ValueError(f"{self.name}: a CMDP needs at least one cost function, got none")
         if len(set(self.cost_names)) != len(self.cost_names):
             raise ValueError(f"{self.name}: cost names must differ, got {self.cost_names}")
+        declared, size = sum(part.size for part in self.components), self._observation_size
+        if self.components and size is not None and declared != size:
+            raise ValueError(
+                f"{self.name}: the observation components must add up to the {size} numbers of an "
+                f"observation, got {declared}"
+            )
+
+    @property
+    def _observation_size(self) -> int | None:
+        """The numbers of an observation where that is an array, else None."""
+        shape = self.observation_space.shape
+        return None if shape is None else math.prod(shape)
 
     @property
     def num_costs(self) -> int:

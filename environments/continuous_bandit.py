@@ -94,6 +94,13 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
         rewards: Floats = 1.0 - (1.0 - pull[:, 0]) ** 2
         return self._observations(), rewards, np.zeros(self.num_envs, np.bool_), truncated, info
 
+    def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[np.float32]:
+        """Begin new episodes in some environments; see ``recrl.environments.vector``."""
+        if self._elapsed is None:
+            raise ValueError(f"{self.cmdp.name}: call reset before restart")
+        self._elapsed[index] = 0
+        return self._observations()
+
     def state_dict(self) -> dict[str, Any]:
         """The steps taken in each episode."""
         if self._elapsed is None:

@@ -201,6 +201,15 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self.states = states
         return self.observations[states], self._rewards[pairs], terminated, truncated, info
 
+    def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[np.float32]:
+        """Begin new episodes in some environments; see ``recrl.environments.vector``."""
+        if self._elapsed is None:
+            raise ValueError(f"{self.cmdp.name}: call reset before restart")
+        self.states = self.states.copy()  # what step returned may still be held
+        self.states[index] = self._first_states(len(index))
+        self._elapsed[index] = 0
+        return self.observations[self.states]
+
     @property
     def follows_tables(self) -> bool:
         """Whether ``step`` is this class's own, so that ``follow`` is the same."""

@@ -2,19 +2,64 @@
 
 A name is, in this order: one of ours; an entry point of an installed package; an import path
 ``package.module:attribute``. Imports nothing but the standard library.
+
+An import path runs whatever code it names, and names come from files that others may have made. So a process
+that only reads such files calls ``refuse_import_paths`` before: then only what somebody has installed here,
+as an entry point, is imported. SECURITY.md says which commands do.
 """
 
 from __future__ import annotations
 
 import difflib
 import importlib
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import entry_points
 from typing import Any
 
 
 class UnknownNameError(ValueError):
     """A task, student or teacher that nobody provides."""
+
+
+class UntrustedNameError(Exception):
+    """An import path that this process does not follow.
+
+    No ValueError: pydantic would take it for a mistake in the options.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__(f"{path!r} was not imported, because a file that is only read must run no code")
+        self.path = path
+
+
+IMPORT_PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
+_refused = False  # of the whole process: threads must not be let off
+
+
+@contextmanager
+def refuse_import_paths() -> Iterator[None]:
+    """Follow no import path in this process until the end of the ``with`` block."""
+    global _refused  # noqa: PLW0603
+    before, _refused = _refused, True
+    try:
+        yield
+    finally:
+        _refused = before
+
+
+def require_trust(path: str) -> None:
+    """Let an import path from a file pass, unless this process refuses them.
+
+    Args:
+        path: ``package.module:attribute``, or an id of Gymnasium's with a module in front.
+
+    Raises:
+        UntrustedNameError: it does.
+    """
+    if _refused:
+        raise UntrustedNameError(path)
 
 
 def load_attribute(path: str) -> Any:
@@ -28,6 +73,10 @@ def load_attribute(path: str) -> Any:
         return getattr(importlib.import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
         raise UnknownNameError(f"cannot import {path!r}: {error}") from error
+    except SystemExit as error:
+        raise UnknownNameError(
+            f"cannot import {path!r}: it ends the process (exit code {error.code})"
+        ) from error
 
 
 def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any:
@@ -41,13 +90,15 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
 
     Raises:
         UnknownNameError: nobody provides it; the message names the nearest known names.
+        UntrustedNameError: it is an import path, and this process follows none.
     """
     if name in ours:
         return ours[name]
     plugged = {point.name: point for point in entry_points(group=group)}
     if name in plugged:
         return plugged[name].load()
-    if ":" in name:
+    if IMPORT_PATH.fullmatch(name):
+        require_trust(name)
         return load_attribute(name)
     known = sorted({*ours, *plugged})
     near = difflib.get_close_matches(name, known, n=1)

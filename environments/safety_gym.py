@@ -24,8 +24,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field
 
-from recrl.environments.cmdp import CMDPSpec, Floats
-from recrl.environments.safety_tasks import HORIZON, SAFETY_TASKS, SUBSTEPS, SafetyTask
+from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.safety_tasks import HORIZON, LIDAR_RANGE, SAFETY_TASKS, SUBSTEPS, SafetyTask
 from recrl.environments.vector import CMDPVectorEnv
 
 if TYPE_CHECKING:
@@ -79,6 +79,14 @@ def _find(task: str) -> SafetyTask:
     if task not in SAFETY_TASKS:
         raise ValueError(f"task must be one of {', '.join(SAFETY_TASKS)}, got {task!r}")
     return SAFETY_TASKS[task]
+
+
+def observation_components(task: SafetyTask) -> tuple[ObservationComponent, ...]:
+    """The parts of a task's observation: the robot's sensors, and a lidar for each kind of object."""
+    return tuple(
+        ObservationComponent(name, size, LIDAR_RANGE if name.endswith("_lidar") else None)
+        for name, size in task.components
+    )
 
 
 def _observation_space(task: SafetyTask) -> Box:
@@ -191,6 +199,7 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
             self.single_action_space,
             cost_names(found, self.options),
             self.options.horizon,
+            observation_components(found),
         )
         self.worlds = _make_worlds(found, num_envs, self.options)
 
@@ -221,6 +230,13 @@ class SafetyGymVectorEnv(CMDPVectorEnv):
             observations = worlds.observations()
         return observations, outcome.rewards, outcome.terminated, outcome.truncated, info
 
+    def restart(self, index: npt.NDArray[np.intp]) -> Observations:
+        """Begin new episodes in some environments; see ``recrl.environments.vector``."""
+        if not self.worlds.generators:
+            raise ValueError(f"{self.cmdp.name}: call reset before restart")
+        self.worlds.restart(index)
+        return self.worlds.observations()
+
     def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
         """One RGB picture of each environment, [height, width, 3]."""
         return self._camera.frames(self.worlds)
@@ -250,6 +266,7 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
 
     Attributes:
         cost_names: names of the k costs in ``info["cost"]``, an array [k].
+        observation_components: the parts of an observation, in their order.
         worlds: what is stepped: a single world.
     """
 
@@ -263,6 +280,7 @@ class SafetyGymEnv(gymnasium.Env[Any, Any]):
         self._camera = _Camera(render_mode)
         self.metadata = {**self.metadata, "render_fps": frames_per_second(found)}
         self.cost_names = cost_names(found, self.options)
+        self.observation_components = observation_components(found)
         self.observation_space = _observation_space(found)
         self.action_space = _action_space()
         self.worlds = _make_worlds(found, 1, self.options)

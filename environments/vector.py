@@ -9,6 +9,7 @@ Every task reaches the agents as a ``CMDPVectorEnv``. What crosses, and nothing 
       ended (elsewhere its content means nothing); it is present only if one ended.
 - An environment whose episode ended is reset in the same step (Gymnasium's ``SAME_STEP``), so row i of
   the returned observations is then the first of the next episode.
+- ``restart(index)`` cuts the episodes of some environments short and begins new ones in them.
 - Actions that mean nothing (a wrong shape, a number that is no action, NaN) and a step before the first reset
   raise a ValueError. Continuous actions outside their bounds are clipped to them.
 - ``state_dict`` holds everything that the future depends on, generators included; a tree of dicts,
@@ -22,6 +23,8 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from recrl.environments.cmdp import CMDPSpec
@@ -36,6 +39,20 @@ class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
 
     cmdp: CMDPSpec
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    @abstractmethod
+    def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
+        """Begin new episodes in some environments, whatever they were doing.
+
+        Args:
+            index: which of the B environments, [M], each at most once.
+
+        Returns:
+            What all environments now observe, [B, ...].
+
+        Raises:
+            ValueError: ``reset`` was not called before.
+        """
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:

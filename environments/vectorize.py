@@ -7,8 +7,9 @@ is lost to whoever reads ``info["cost"]``. Here it stays.
 What a scalar environment must do: report ``info["cost"]``, a number or k numbers, at every step; have a
 ``Discrete`` or a bounded or unbounded floating-point ``Box`` action space; and be a function of its seed and
 its actions: ``reset(seed=...)`` must determine an episode. It may name its costs in an attribute
-``cost_names``. Observations of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``),
-actions clipped to their bounds.
+``cost_names``, and the parts of its flattened observation in ``observation_components`` (a sequence of
+``recrl.environments.cmdp.ObservationComponent``), which tell agents what is a lidar. Observations of any kind
+are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to their bounds.
 
 Every episode is started by ``reset(seed=...)`` with a new seed drawn here, which makes an exact checkpoint
 possible without asking the environment for its state and without pickling it: the seed and the actions so
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,7 +32,8 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
 
-from recrl.environments.cmdp import CMDPSpec, Floats
+from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.plugins import require_trust
 from recrl.environments.vector import CMDPVectorEnv
 
 Environment = gymnasium.Env[Any, Any]
@@ -58,7 +61,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if not factories:
             raise ValueError(f"{name}: num_envs must be at least 1, got 0")
         self.num_envs = len(factories)
-        self._environments = [factory() for factory in factories]
+        self._environments = [_made(name, factory) for factory in factories]
         first = self._environments[0]
         self._raw_observation_space = first.observation_space
         self.single_observation_space = _float32_vectors(name, first.observation_space)
@@ -70,9 +73,16 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             cost_names = (
                 first.get_wrapper_attr("cost_names") if first.has_wrapper_attr("cost_names") else ("cost",)
             )
+        if isinstance(cost_names, str) or not all(isinstance(each, str) for each in cost_names):
+            raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(cost_names)}")
         horizon = first.spec.max_episode_steps if first.spec is not None else None
         self.cmdp = CMDPSpec(
-            name, self.single_observation_space, self.single_action_space, tuple(cost_names), horizon
+            name,
+            self.single_observation_space,
+            self.single_action_space,
+            tuple(cost_names),
+            horizon,
+            _declared_components(first),
         )
         self._costless = costless
         self._episode_seeds = [0] * self.num_envs
@@ -99,11 +109,13 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
         costs = np.zeros((self.num_envs, self.cmdp.num_costs))
         for index, environment in enumerate(self._environments):
-            observation, reward, ended, timed_out, step_info = environment.step(actions[index])
+            observation, reward, ended, timed_out, step_info = self._step(environment, actions[index])
             last_observations[index] = self._flat(observation)
-            rewards[index], terminated[index], truncated[index] = reward, ended, timed_out and not ended
+            rewards[index] = self._number(reward)
+            terminated[index], truncated[index] = ended, timed_out and not ended
             costs[index] = self._reported_costs(step_info)
             self._episode_actions[index].append(actions[index])
+        self._check(last_observations, rewards)
         info: dict[str, Any] = {"cost": costs}
         self._observations = last_observations
         if (terminated | truncated).any():
@@ -112,6 +124,14 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             for index in np.flatnonzero(terminated | truncated).tolist():
                 self._observations[index] = self._start_episode(index)
         return self._observations.copy(), rewards, terminated, truncated, info
+
+    def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[np.float32]:
+        """Begin new episodes in some environments; see ``recrl.environments.vector``."""
+        if self._observations is None:
+            raise ValueError(f"{self.cmdp.name}: call reset before restart")
+        for environment in index.tolist():
+            self._observations[environment] = self._start_episode(environment)
+        return self._observations.copy()
 
     def render(self) -> tuple[Any, ...]:
         """One frame per environment, in the environment's own render mode."""
@@ -166,10 +186,53 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
     def _start_episode(self, index: int) -> npt.NDArray[np.float32]:
         self._episode_seeds[index] = int(self.np_random.integers(SEED_BOUND))
         self._episode_actions[index] = []
-        return self._flat(self._environments[index].reset(seed=self._episode_seeds[index])[0])
+        returned = self._environments[index].reset(seed=self._episode_seeds[index])
+        if not isinstance(returned, tuple) or len(returned) != 2:
+            raise ValueError(
+                f"{self.cmdp.name}: reset must return (observation, info), got {_brief(returned)}"
+            )
+        observation = self._flat(returned[0])
+        self._check(observation[np.newaxis])
+        return observation
+
+    def _step(self, environment: Environment, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        returned = environment.step(action)
+        if not isinstance(returned, tuple) or len(returned) != 5 or not isinstance(returned[4], dict):
+            raise ValueError(
+                f"{self.cmdp.name}: step must return (observation, reward, terminated, truncated, info), "
+                f"got {_brief(returned)}"
+            )
+        return returned
+
+    def _number(self, reward: Any) -> float:
+        try:
+            return float(reward)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{self.cmdp.name}: a reward must be a number, got {_brief(reward)}") from error
+
+    def _check(self, observations: npt.NDArray[np.float32], rewards: Floats | None = None) -> None:
+        """Name the task where it is at fault: later it would be the policy that returns no numbers."""
+        if not np.isfinite(observations).all():
+            bad = observations[~np.isfinite(observations).all(axis=-1)][0]
+            raise ValueError(f"{self.cmdp.name}: an observation must be finite, got {_brief(bad)}")
+        if rewards is not None and not np.isfinite(rewards).all():
+            bad = rewards[~np.isfinite(rewards)][0]
+            raise ValueError(f"{self.cmdp.name}: a reward must be finite, got {bad:g}")
 
     def _flat(self, observation: Any) -> npt.NDArray[np.float32]:
-        return np.asarray(spaces.flatten(self._raw_observation_space, observation), np.float32)
+        try:
+            flat = np.asarray(spaces.flatten(self._raw_observation_space, observation), np.float32)
+        except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+            flat = None
+            cause: Exception | None = error
+        else:
+            cause = None
+        if flat is None or flat.shape != self.single_observation_space.shape:
+            raise ValueError(
+                f"{self.cmdp.name}: an observation must lie in {self._raw_observation_space}, "
+                f"got {_brief(observation)}"
+            ) from cause
+        return flat
 
     def _checked(self, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
         space = self.single_action_space
@@ -194,12 +257,17 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 f"{self.cmdp.name}: the environment must report info['cost'] at every step, got only "
                 f"{sorted(info)} (for zero costs: the task gymnasium with costless: true)"
             )
-        costs = np.asarray(info["cost"], np.float64).reshape(-1)
+        try:
+            costs = np.asarray(info["cost"], np.float64).reshape(-1)
+        except (TypeError, ValueError):
+            costs = np.empty(0)
         if costs.shape != (self.cmdp.num_costs,) or not np.isfinite(costs).all():
             raise ValueError(
                 f"{self.cmdp.name}: info['cost'] must be a finite number for each of "
                 f"{', '.join(self.cmdp.cost_names)}, got {info['cost']}"
             )
+        if costs.min() < 0.0:
+            raise ValueError(f"{self.cmdp.name}: info['cost'] must be at least 0, got {info['cost']}")
         return costs
 
 
@@ -224,10 +292,17 @@ class GymnasiumOptions(BaseModel):
     @field_validator("id")
     @classmethod
     def _registered(cls, identifier: str) -> str:
+        module, separator, registered = identifier.rpartition(":")
+        if separator and not module.startswith("recrl.environments."):
+            require_trust(identifier)
         try:
-            gymnasium.spec(identifier)
-        except (gymnasium.error.Error, ImportError) as error:
+            if separator:
+                importlib.import_module(module)
+            gymnasium.spec(registered)
+        except (gymnasium.error.Error, ImportError, ValueError) as error:
             raise ValueError(str(error)) from error
+        except SystemExit as error:
+            raise ValueError(f"importing {module} ends the process (exit code {error.code})") from error
         return identifier
 
 
@@ -269,6 +344,31 @@ class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, terminated, truncated, {**info, "cost": np.zeros(self._num_costs)}
+
+
+def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
+    """What an environment says of the parts of its flattened observation; none if it says nothing."""
+    if not environment.has_wrapper_attr("observation_components"):
+        return ()
+    return tuple(environment.get_wrapper_attr("observation_components"))
+
+
+def _made(name: str, factory: Callable[[], Environment]) -> Environment:
+    """A new environment, if that is what the factory makes."""
+    environment = factory()
+    if not isinstance(environment, gymnasium.Env):
+        raise ValueError(f"{name} must return a Gymnasium environment, got {_brief(environment)}")
+    return environment
+
+
+def _brief(value: Any) -> str:
+    """A value as a message shows it."""
+    if value is None:
+        return "None"
+    kind = type(value).__name__
+    shape = f" of shape {value.shape}" if isinstance(value, np.ndarray) else ""
+    text = " ".join(repr(value).split())
+    return f"{kind}{shape} {text[:77]}..." if len(text) > 80 else f"{kind}{shape} {text}"
 
 
 def _float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:

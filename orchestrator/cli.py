@@ -8,11 +8,14 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib.metadata
+import math
 import os
+import re
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TypeAlias
+from typing import NoReturn, TypeAlias
 
 from recrl.orchestrator.errors import (
     ClusterError,
@@ -57,9 +60,22 @@ Exit codes:
   5    plan --check: a launch would have something to do
   130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
 
+# Paths that cannot be: a file for a folder, a name that is too long, links in a circle.
+NO_PATH = (
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.ENOENT,
+    errno.EINVAL,
+)
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
-WRONG_KIND = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+LISTS = ("--only", "--option")  # each takes several KEY=VALUE
+PAIR = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*=.*(?<!\.yaml)(?<!\.yml)")
+LONGEST_LINE = 1000  # characters of an error
+VIDEOS = ("gif", "mp4")
 SWEEP_HELP = "a sweep's name, or its grid file; may be left out where there is only one"
 
 
@@ -73,6 +89,7 @@ def parser() -> argparse.ArgumentParser:
 
     plan = _command(commands, "plan", "say what a launch would do, and about how long it takes")
     _add_grid(plan)
+    _add_trust(plan)
     _add_selection(plan)
     plan.add_argument(
         "--check", action="store_true", help="end with 5 if a launch would have something to do"
@@ -85,7 +102,9 @@ def parser() -> argparse.ArgumentParser:
     )
     room.add_argument("--cores", type=_at_least_one, metavar="N", help="estimate for so many cores")
 
-    _add_grid(_command(commands, "validate", "check a grid file; all mistakes at once, with their lines"))
+    validate = _command(commands, "validate", "check a grid file; all mistakes at once, with their lines")
+    _add_grid(validate)
+    _add_trust(validate)
 
     status = _command(commands, "status", "say how far a sweep is, from its files alone")
     _add_sweep(status)
@@ -121,23 +140,18 @@ def main(given: Sequence[str] | None = None) -> int:
         An exit code.
     """
     given = list(sys.argv[1:] if given is None else given)
-    arguments = parser().parse_args(given)
+    arguments = parser().parse_args(spread(given))
     arguments.given = given
     try:
-        from rich.console import Console  # noqa: PLC0415  (--help is to be quick)
-
-        from recrl.orchestrator.commands import COMMANDS  # noqa: PLC0415
-
-        # a file or a pipe has no width that tables would have to fit in
-        console = Console() if sys.stdout.isatty() else Console(width=160)
-        return COMMANDS[arguments.command](arguments, console)
+        return _run(arguments)
     except GridError as error:
-        print(error, file=sys.stderr)
+        _complain(str(error))
         mistakes = f"{len(error.problems)} mistake{'s' if len(error.problems) > 1 else ''}"
-        print(f"{mistakes} in {arguments.grid}; nothing was started", file=sys.stderr)
+        grid = getattr(arguments, "grid", None) or arguments.sweep
+        _complain(f"{mistakes} in {grid}; nothing was started")
         return ExitCode.WRONG_INPUT
     except RecrlError as error:
-        print(f"recrl-sweep: {error}", file=sys.stderr)
+        _complain(f"recrl-sweep: {error}")
         return _code_of(error)
     except KeyboardInterrupt:
         again = "; go on with the same command" if arguments.command == "launch" else ""
@@ -147,14 +161,63 @@ def main(given: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
     except OSError as error:
-        if error.errno not in (*NO_ROOM, *WRONG_KIND) or (error.errno in WRONG_KIND and not error.filename):
+        if error.errno not in (*NO_ROOM, *NO_PATH):
             raise
         where = error.filename or getattr(arguments, "root", None) or arguments.to
-        remedy = (
-            "what was saved stays" if error.errno in NO_ROOM else "move it away; nothing else was touched"
-        )
-        print(f"recrl-sweep: {where}: {error.strerror}; {remedy}", file=sys.stderr)
-        return ExitCode.CANNOT_RUN
+        _complain(f"recrl-sweep: {where}: {error.strerror}; what was saved stays")
+        return ExitCode.CANNOT_RUN if error.errno in NO_ROOM else ExitCode.WRONG_INPUT
+
+
+def _run(arguments: argparse.Namespace) -> ExitCode:
+    """Do it, without code that a file names unless that is asked for."""
+    from recrl.environments.plugins import refuse_import_paths  # noqa: PLC0415  (--help is to be quick)
+    from recrl.orchestrator.commands import COMMANDS  # noqa: PLC0415
+    from recrl.orchestrator.output import TextConsole, logging_to_stderr  # noqa: PLC0415
+
+    # a file or a pipe has no width that tables would have to fit in
+    console = TextConsole() if sys.stdout.isatty() else TextConsole(width=160)
+    trusted = arguments.command == "launch" or getattr(arguments, "trust", False)
+    try:
+        with logging_to_stderr(), nullcontext() if trusted else refuse_import_paths():
+            return COMMANDS[arguments.command](arguments, console)
+    except SystemExit as error:
+        raise RecrlError(f"something that the sweep names ended the process ({error.code})") from error
+
+
+def spread(given: Sequence[str]) -> list[str]:
+    """The arguments, so that no list swallows the grid file or the sweep behind it.
+
+    >>> spread(["--only", "method=none", "seed=0", "grid.yaml"])
+    ['--only', 'method=none', '--only', 'seed=0', 'grid.yaml']
+    >>> spread(["--video", "demo"]), spread(["--video", "mp4", "demo"])
+    (['--video=gif', 'demo'], ['--video=mp4', 'demo'])
+    """
+    plain: list[str] = []
+    rest = list(given)
+    while rest:
+        argument = rest.pop(0)
+        if argument == "--video":
+            plain.append(f"--video={rest.pop(0) if rest and rest[0] in VIDEOS else VIDEOS[0]}")
+        elif argument in LISTS and rest:
+            plain += [argument, rest.pop(0)]
+            while rest and PAIR.fullmatch(rest[0]):
+                plain += [argument, rest.pop(0)]
+        else:
+            plain.append(argument)
+    return plain
+
+
+def _complain(sentence: str) -> None:
+    """Say on the standard error what is wrong; a sentence may quote a file that somebody else made."""
+    print(_answer(sentence), file=sys.stderr)
+
+
+def _answer(sentence: str) -> str:
+    """What may be shown of a sentence, its lines cut where they quote something endless."""
+    from recrl.orchestrator.redaction import shown  # noqa: PLC0415
+
+    lines = shown(sentence).split("\n")
+    return "\n".join(line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..." for line in lines)
 
 
 def _code_of(error: RecrlError) -> ExitCode:
@@ -164,8 +227,14 @@ def _code_of(error: RecrlError) -> ExitCode:
     return ExitCode.CANNOT_RUN if cannot_run else ExitCode.WRONG_INPUT
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong with the arguments, which may hold a password, and exit."""
+        super().error(_answer(message))
+
+
 def _parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser:
-    return argparse.ArgumentParser(
+    return _Parser(
         prog=name,
         description=description,
         epilog=epilog,
@@ -249,6 +318,7 @@ def _add_evaluate(commands: Commands) -> None:
         help="the beginning of its id, title or folder, or of several; by default all that have a checkpoint",
     )
     _add_only(evaluate)
+    _add_trust(evaluate)
     evaluate.add_argument(
         "--episodes",
         type=_at_least_one,
@@ -269,9 +339,7 @@ def _add_evaluate(commands: Commands) -> None:
     )
     evaluate.add_argument(
         "--video",
-        choices=("gif", "mp4"),
-        nargs="?",
-        const="gif",
+        choices=VIDEOS,
         help="also film one episode of each policy, as a GIF or, with the package av, as MP4; MLflow gets it",
     )
     _add_tracking(evaluate)
@@ -280,8 +348,9 @@ def _add_evaluate(commands: Commands) -> None:
 def _add_figures(commands: Commands) -> None:
     figures = _command(commands, "figures", "draw the figures, tables and report of what is there so far")
     _add_source(figures)
+    _add_trust(figures)
     figures.add_argument(
-        "--to", type=Path, metavar="FOLDER", help="where to; by default the sweep's figures folder"
+        "--to", type=_folder, metavar="FOLDER", help="where to; by default the sweep's figures folder"
     )
     figures.add_argument(
         "--band",
@@ -309,7 +378,7 @@ def _add_merge(commands: Commands) -> None:
     merge = _command(commands, "merge", "join files that export wrote, of a sweep that ran in several places")
     merge.add_argument(
         "parts",
-        type=Path,
+        type=_path,
         nargs="+",
         metavar="FILE.zip",
         help="the first gives the name; of a trial that several have, the one that got furthest is taken",
@@ -320,9 +389,10 @@ def _add_merge(commands: Commands) -> None:
 def _add_bound(commands: Commands) -> None:
     bound = _command(commands, "bound", "what training cost beside its bounds; which d_t a budget allows")
     _add_source(bound)
+    _add_trust(bound)
     bound.add_argument(
         "--budget",
-        type=float,
+        type=_cost,
         metavar="COST",
         help="cost above d_d that may be spent over all training episodes: say the largest d_t for it",
     )
@@ -336,13 +406,13 @@ def _add_replay(commands: Commands) -> None:
         commands, "replay", "what limits another teacher would have set on the recorded episodes"
     )
     _add_sweep(replay)
+    _add_trust(replay)
     replay.add_argument(
         "--teacher", required=True, metavar="NAME", help="a method of the sweep, or any teacher by its name"
     )
     replay.add_argument(
         "--option",
-        nargs="+",
-        action="extend",
+        action="append",
         default=[],
         metavar="KEY=VALUE",
         help="options of the teacher other than the sweep's, window=8",
@@ -355,7 +425,7 @@ def _add_ui(commands: Commands) -> None:
     _add_sweep(user_interface)
     _add_tracking(user_interface)
     user_interface.add_argument(
-        "--port", type=int, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)"
+        "--port", type=_port, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)"
     )
 
 
@@ -369,7 +439,16 @@ def _add_sync(commands: Commands) -> None:
 
 
 def _add_grid(command: argparse.ArgumentParser) -> None:
-    command.add_argument("grid", type=Path, metavar="GRID.yaml", help="what the sweep is made of")
+    command.add_argument("grid", type=_path, metavar="GRID.yaml", help="what the sweep is made of")
+
+
+def _add_trust(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--trust",
+        action="store_true",
+        help="import and call what the file names by an import path, package.module:attribute: do so only "
+        "with files whose author you trust; launch always does",
+    )
 
 
 def _add_sweep(command: argparse.ArgumentParser) -> None:
@@ -390,8 +469,7 @@ def _add_source(command: argparse.ArgumentParser) -> None:
 def _add_only(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--only",
-        nargs="+",
-        action="extend",
+        action="append",
         default=[],
         metavar="KEY=VALUE",
         help="only these trials: task, agent or method by label, or seed; several values with commas, "
@@ -432,33 +510,73 @@ def _add_tracking(command: argparse.ArgumentParser) -> None:
 
 
 def _folder(text: str) -> Path:
+    from recrl.orchestrator.redaction import redacted  # noqa: PLC0415
+
     if "://" in text:  # trials append to their files and hold locks, which object stores know nothing of
         raise argparse.ArgumentTypeError(
             "must be a folder, on a file system that all nodes share where there are several; an object "
-            f"store is given by --storage, got {text!r}"
+            f"store is given by --storage, got {redacted(text)!r}"
         )
+    path = _path(text)
+    try:
+        if path.exists() and not path.is_dir():
+            raise argparse.ArgumentTypeError(f"must be a folder, got the file {text!r}")
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(_no_path(text, error)) from error
+    return path
+
+
+def _path(text: str) -> Path:
+    if "\0" in text:
+        raise argparse.ArgumentTypeError("must hold no NUL character")
     return Path(text)
+
+
+def _no_path(text: str, error: OSError | ValueError) -> str:
+    reason = getattr(error, "strerror", None) or error
+    return f"cannot be used ({reason}), got {text[:60]!r}{'...' if len(text) > 60 else ''}"
 
 
 def _zip_file(text: str) -> Path:
     """What export and merge write: all commands tell it from a sweep's name by its ending."""
-    path = Path(text)
-    if path.suffix != ".zip" or path.is_dir():
-        raise argparse.ArgumentTypeError(f"must be a file that ends with .zip, got {text!r}")
+    path = _path(text)
+    try:
+        if path.suffix != ".zip" or path.is_dir():
+            raise argparse.ArgumentTypeError(f"must be a file that ends with .zip, got {text!r}")
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(_no_path(text, error)) from error
     return path
 
 
 def _at_least_one(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
-    return number
+    return _whole(text, least=1)
 
 
 def _at_least_zero(text: str) -> int:
+    return _whole(text, least=0)
+
+
+def _port(text: str) -> int:
+    return _whole(text, least=1, most=65535)
+
+
+def _whole(text: str, *, least: int, most: int = 2**63 - 1) -> int:
+    if not re.fullmatch(r"[+-]?[0-9]{1,20}", text):
+        raise argparse.ArgumentTypeError(f"must be a whole number, written with digits only, got {text!r}")
     number = int(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"must be at least 0, got {number}")
+    if not least <= number <= most:
+        limit = f"at least {least}" if number < least else f"at most {most}"
+        raise argparse.ArgumentTypeError(f"must be {limit}, got {number}")
+    return number
+
+
+def _cost(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"must be a finite number, got {text!r}")
     return number
 
 

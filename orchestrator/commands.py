@@ -22,20 +22,23 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 from rich.console import Console
 
-from recrl.environments.plugins import UnknownNameError
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.orchestrator import display
 from recrl.orchestrator.errors import (
+    USERS_ERRORS,
     DamagedError,
     RecrlError,
     StorageError,
     TrackingError,
-    without_password,
+    UncalledError,
+    described,
 )
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.grid import GridSpec, read_grid
+from recrl.orchestrator.grid import GridSpec, read_grid, read_name
 from recrl.orchestrator.origins import has_other_code, no_curriculum_sentence, other_code_sentence
 from recrl.orchestrator.plan import Plan, estimate, make_plan, select, trials_at_once
+from recrl.orchestrator.redaction import redacted, shown
 from recrl.orchestrator.refresh import refreshing
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
@@ -71,7 +74,11 @@ Command = Callable[[argparse.Namespace, Console], ExitCode]
 
 def run_validate(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Check a grid file; nothing is started or written."""
-    grid = read_grid(arguments.grid)
+    try:
+        grid = read_grid(arguments.grid)
+    except UncalledError as error:
+        _say(console, f"{error}; all else is right")
+        return ExitCode.OK
     sizes = (len(grid.tasks), len(grid.agents), len(grid.methods), len(grid.seeds))
     product = " x ".join(str(size) for size in sizes)
     _say(
@@ -341,7 +348,18 @@ def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Draw the figures and tables of what is on disk, in a compact file or in MLflow."""
     sweep, folder = _source(arguments)
     _say_warnings(sweep, console)
-    _draw(sweep, arguments.to or folder, console, band=arguments.band, whole=not arguments.sketch)
+    folder = arguments.to or folder
+    try:
+        _draw(sweep, folder, console, band=arguments.band, whole=not arguments.sketch)
+    except (RecrlError, OSError):
+        raise
+    except Exception as error:
+        if not str(arguments.sweep).endswith(".zip"):
+            raise
+        raise RecrlError(
+            f"{arguments.sweep}: not all figures could be drawn ({described(error)}); the others are in "
+            f"{folder}"
+        ) from error
     return ExitCode.OK
 
 
@@ -391,8 +409,8 @@ def _source(arguments: argparse.Namespace) -> tuple[Sweep, Path]:
     from recrl.analysis import compact, frames, tracked  # noqa: PLC0415  (imports pandas and SciPy)
 
     given: str | None = arguments.sweep
-    if arguments.tracking_uri:
-        name = read_grid(Path(given)).name if given and given.endswith((".yaml", ".yml")) else given
+    if arguments.tracking_uri is not None:
+        name = read_name(Path(given)) if given and given.endswith((".yaml", ".yml")) else given
         sweep = tracked.load(checked_uri(arguments.tracking_uri), name)
         return sweep, Path(f"{sweep.name}-figures")
     if given and given.endswith(compact.SUFFIX):
@@ -407,6 +425,8 @@ def run_bound(arguments: argparse.Namespace, console: Console) -> ExitCode:
 
     sweep, _ = _source(arguments)
     _say_warnings(sweep, console)
+    if arguments.cost > sweep.num_costs:
+        raise RecrlError(f"--cost: {sweep.name} has {sweep.num_costs} costs, got {arguments.cost}")
     rows = cumulative.cumulative_costs(sweep, cost=arguments.cost - 1)
     if not len(rows):
         raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
@@ -478,8 +498,12 @@ def _teacher(store: SweepStore, arguments: argparse.Namespace) -> Choice:
     except ValidationError as error:
         mistakes = "; ".join(f"{'.'.join(map(str, it['loc']))}: {it['msg']}" for it in error.errors())
         raise RecrlError(f"teacher {method.name}: {mistakes}, got {options}") from error
+    except UntrustedNameError as error:
+        raise RecrlError(f"{error}; if you trust it, add --trust") from error
     except UnknownNameError as error:
         raise RecrlError(str(error)) from error
+    except USERS_ERRORS as error:
+        raise RecrlError(f"teacher {method.name!r} cannot be used: {described(error)}") from error
     return Choice(method.name, options, method.label)
 
 
@@ -547,7 +571,7 @@ def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> Sw
         listed = f"say which one: {', '.join(names)}" if names else "launch one first"
         raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
     if sweep.endswith((".yaml", ".yml")):
-        sweep = read_grid(Path(sweep)).name
+        sweep = read_name(Path(sweep))
     if sweep not in names:
         listed = f" (there: {', '.join(names)})" if names else ", nothing was launched there yet"
         raise RecrlError(f"{place}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
@@ -719,8 +743,8 @@ def _say_mirrored(
     if arguments.root != DEFAULT_ROOT:
         place += ["--root", str(arguments.root)]
     if arguments.tracking_uri:
-        place += ["--tracking-uri", without_password(arguments.tracking_uri)]
-    where = without_password(uri) if arguments.tracking_uri else _short(store.mlflow_database)
+        place += ["--tracking-uri", redacted(arguments.tracking_uri)]
+    where = redacted(uri) if arguments.tracking_uri else _short(store.mlflow_database)
     _say(console, f"MLflow     {where}")
     _say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
     if not result.mirrored:  # a mirror that came to no end leaves the report of an earlier pass
@@ -771,9 +795,8 @@ def _short(path: Path) -> Path:
 
 
 def _say(console: Console, sentence: str) -> None:
-    """One line as it is, but for passwords in addresses: no markup, no colours, no wrapping."""
-    sentence = re.sub(r"(://[^\s:/@]*):[^\s@]+@", r"\1:***@", sentence)
-    console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+    """One line as it is, but for secrets and control characters: no markup, no colours, no wrapping."""
+    console.print(shown(sentence), markup=False, highlight=False, soft_wrap=True)
 
 
 COMMANDS: Mapping[str, Command] = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from pathlib import Path
 
 
@@ -17,6 +16,24 @@ class GridError(RecrlError):
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
         self.problems = problems
+
+
+class UncalledError(RecrlError):
+    """A grid has no mistake that could be found without code that it names, which was not run.
+
+    Attributes:
+        source: the grid file's name.
+        uncalled: where the import paths are, and what they are.
+    """
+
+    def __init__(self, source: str, uncalled: list[str]) -> None:
+        what = "was not called" if len(uncalled) == 1 else "were not called"
+        super().__init__(
+            f"{source}: {', '.join(uncalled)} {what}, because a file that is only read must run no code; "
+            "if you trust it, add --trust"
+        )
+        self.source = source
+        self.uncalled = uncalled
 
 
 class CheckpointError(RecrlError):
@@ -59,13 +76,15 @@ class TrackingError(RecrlError):
     """MLflow cannot be used in the way that was asked for; training does not depend on it."""
 
 
-def without_password(uri: str) -> str:
-    """The address as it may be shown.
+# What a user's own task, student or teacher may raise, and what must not end more than its own work.
+USERS_ERRORS = (Exception, SystemExit)
 
-    >>> without_password("postgresql://me:secret@host/mlflow")
-    'postgresql://me:***@host/mlflow'
-    """
-    return re.sub(r"(://[^/:@]*):[^@]*@", r"\1:***@", uri)
+
+def described(error: BaseException) -> str:
+    """An error as one line: ``KeyError: 'window'``; of one that ends the process, its exit code."""
+    if isinstance(error, SystemExit):
+        return f"it ended the process (exit code {error.code})"
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def missing(path: Path) -> str:

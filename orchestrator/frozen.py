@@ -24,8 +24,9 @@ from recrl.agents.agent import Agent
 from recrl.agents.evaluation import FrozenPolicy, Shot, film
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.plugins import UntrustedNameError
 from recrl.environments.registry import NotDrawnError, make_drawn, make_vector
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.row_files import write_rows
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.store import TrialStore
@@ -78,11 +79,12 @@ class FrozenTrial:
             agent = make_agent(spec.agent.name, cmdp, spec.agent.options, seed)
             agent.load_state_dict(tree["agent"])
             return cls(store, spec, agent, cmdp, tree["update"], tree["env_steps"])
-        except Exception as error:  # a user's own task or student may raise anything
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+        except UntrustedNameError as error:
+            raise RecrlError(f"{spec.title}: {error}; if you trust it, add --trust") from error
+        except USERS_ERRORS as error:
             raise RecrlError(
                 f"{spec.title}: its checkpoint cannot be used with the task and the student as they are "
-                f"installed: {reason}"
+                f"installed: {described(error)}"
             ) from error
 
     def evaluate(
@@ -95,9 +97,12 @@ class FrozenTrial:
             num_episodes: of each, at least 1.
             seed: of the environments and the policy, at least 0; None for the trial's own.
         """
-        rows = evaluation_rows(
-            self.agent, self.spec, policies, num_episodes=num_episodes, seed=self._seed_sequence(seed)
-        )
+        try:
+            rows = evaluation_rows(
+                self.agent, self.spec, policies, num_episodes=num_episodes, seed=self._seed_sequence(seed)
+            )
+        except USERS_ERRORS as error:
+            raise RecrlError(f"{self.spec.title}: cannot be evaluated: {described(error)}") from error
         path = self.store.evaluations_folder / f"{self._file_name(seed)}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_rows(path, rows)
@@ -122,8 +127,8 @@ class FrozenTrial:
             environment = make_drawn(self.spec.task.name, options=self.spec.task.options)
         except NotDrawnError as error:
             raise RecrlError(f"{self.spec.title}: {error}") from error
-        except Exception as error:
-            raise RecrlError(f"{self.spec.title}: cannot be drawn: {error}") from error
+        except USERS_ERRORS as error:
+            raise RecrlError(f"{self.spec.title}: cannot be drawn: {described(error)}") from error
         speed = float(environment.metadata.get("render_fps") or DEFAULT_PICTURES_PER_SECOND)
         every = stride(video_format, pictures_per_second=speed, longest=self.cmdp.horizon)
         shots = film(

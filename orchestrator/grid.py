@@ -27,13 +27,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from recrl.agents.registry import agent_config
 from recrl.environments.cmdp import CMDPSpec, CostLimits
-from recrl.environments.plugins import UnknownNameError
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.environments.registry import make_vector, task_options
-from recrl.orchestrator.errors import GridError, missing
+from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
 from recrl.orchestrator.grid_file import (
     Entry,
     Exclusion,
@@ -41,6 +41,7 @@ from recrl.orchestrator.grid_file import (
     Limits,
     Resources,
     Run,
+    SweepName,
     TaskEntry,
 )
 from recrl.orchestrator.located_yaml import Place, Problem, parse
@@ -49,6 +50,7 @@ from recrl.orchestrator.validation import nearest, sentences, shown
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000
+ROLLOUT_STEPS = 64  # by default: short rollouts of many environments make many updates
 # d_t: infinite, so that the teacher measures its start. Nobody but the user can say d_d.
 DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
 
@@ -128,14 +130,10 @@ def read_grid(path: Path) -> GridSpec:
 
     Raises:
         GridError: the file is missing or wrong; one located sentence for every mistake in it.
+        UncalledError: no mistake was found, but something was not checked, as this process follows no
+            import paths.
     """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise GridError([f"{path}: {missing(path)}"]) from error
-    except OSError as error:
-        raise GridError([f"{path}: cannot be read: {error.strerror}"]) from error
-    return parse_grid(data, source=str(path))
+    return parse_grid(_read(path), source=str(path))
 
 
 def parse_grid(data: bytes, *, source: str) -> GridSpec:
@@ -147,13 +145,47 @@ def parse_grid(data: bytes, *, source: str) -> GridSpec:
 
     Raises:
         GridError: one located sentence for every mistake.
+        UncalledError: see ``read_grid``.
     """
     check = _Check(data)
     grid = check.grid()
-    if grid is None or check.problems:
+    if check.problems:
         ordered = sorted(set(check.problems), key=lambda problem: (problem.line, str(problem.place)))
         raise GridError([f"{source}:{problem}" for problem in ordered])
+    if grid is None:
+        raise UncalledError(source, check.uncalled)
     return grid
+
+
+def read_name(path: Path) -> str:
+    """The name of the sweep that a grid file describes; nothing else of the file is checked, nothing called.
+
+    Raises:
+        GridError: the file is missing, no mapping, or its name is wrong.
+    """
+    document = parse(_read(path))
+    value = document.value
+    if not isinstance(value, dict):
+        problems = document.problems or (Problem(1, (), "a grid must be a mapping of settings"),)
+        raise GridError([f"{path}:{problem}" for problem in problems])
+    try:
+        return TypeAdapter(SweepName).validate_python(value.get("name"))
+    except ValidationError as error:
+        problem = Problem(document.line(("name",)), ("name",), next(sentences(error, None))[1])
+        raise GridError([f"{path}:{problem}"]) from error
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise GridError([f"{path}: {missing(path)}"]) from error
+    except (OSError, ValueError) as error:
+        raise GridError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from error
+
+
+class NotJsonError(Exception):
+    """Options that JSON has no words for."""
 
 
 class _Check:
@@ -167,6 +199,7 @@ class _Check:
         self._data = data
         self._document = parse(data)
         self.problems = list(self._document.problems)
+        self.uncalled: list[str] = []
         raw = self._document.value
         self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
 
@@ -180,7 +213,7 @@ class _Check:
         tasks = self._tasks()
         agents = self._choices("agents", Entry, agent_config)
         methods = self._choices("methods", Entry, teacher_config)
-        if file is None or self.problems:
+        if file is None or self.problems or self.uncalled:
             return None
         grid = GridSpec(
             name=file.name,
@@ -253,16 +286,18 @@ class _Check:
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
         try:
             options = options_of(entry.name, entry.options).model_dump(mode="json")
-            json.dumps(options, allow_nan=False)
+            _require_json(options)
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
                 self._add((*place, "options", *inner), sentence)
         except UnknownNameError as error:
             self._add(name_place, str(error))
-        except ValueError as error:
+        except UntrustedNameError as error:
+            self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
+        except NotJsonError as error:
             self._add((*place, "options"), f"must be finite JSON values ({error})")
-        except Exception as error:  # a user's own package may raise anything
-            self._add(name_place, f"{entry.name!r} cannot be used: {type(error).__name__}: {error}")
+        except USERS_ERRORS as error:
+            self._add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
         else:
             return options
         return None
@@ -283,8 +318,8 @@ class _Check:
         """What the task fixes, found by building one environment of it."""
         try:
             envs = make_vector(task.name, 1, options=task.options)
-        except Exception as error:  # a user's own task may raise anything
-            self._add(("tasks", index), f"{task.name} cannot be built: {type(error).__name__}: {error}")
+        except USERS_ERRORS as error:
+            self._add(("tasks", index), f"{task.name} cannot be built: {described(error)}")
             return None
         cmdp = envs.cmdp
         envs.close()
@@ -326,15 +361,12 @@ class _Check:
         return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
 
     def _rollout_steps(self, run: Run | None, label: str, cmdp: CMDPSpec) -> int | None:
-        """T: as given, or the task's horizon."""
+        """T: as given, or its default."""
         if run is None:
             return None
-        steps, num_envs = run.rollout_steps or cmdp.horizon, run.num_envs
-        if steps is None:
-            self._add(
-                ("run", "rollout_steps"), f"is required: {label} has no horizon that could be its default"
-            )
-        elif run.total_steps < num_envs * steps:
+        default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
+        steps, num_envs = run.rollout_steps or default, run.num_envs
+        if run.total_steps < num_envs * steps:
             self._add(
                 ("run", "total_steps"),
                 f"must be at least one update of {label}, "
@@ -369,8 +401,15 @@ def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:
     """The class of the options of ``name``, where it can be built without any."""
     try:
         return type(options_of(name, {}))
-    except ValidationError:
+    except (ValidationError, *USERS_ERRORS):
         return None
+
+
+def _require_json(options: Mapping[str, Any]) -> None:
+    try:
+        json.dumps(options, allow_nan=False)
+    except ValueError as error:
+        raise NotJsonError(str(error)) from error
 
 
 def _items(value: Any) -> list[Any]:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, model_validator
 
+from recrl.orchestrator.foreign import PlainText, ShortText
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.validation import shown
 
@@ -110,8 +111,8 @@ class _Written(BaseModel):
 class Entry(_Written):
     """A student or a method: its name, or a mapping."""
 
-    name: str = Field(min_length=1, description="Registry name, entry point or package.module:attribute.")
-    label: str = Field(
+    name: ShortText = Field(description="Registry name, entry point or package.module:attribute.")
+    label: PlainText = Field(
         default="", max_length=60, description="What tables and figures call it; the name by default."
     )
     options: dict[str, Any] = Field(
@@ -150,13 +151,18 @@ class Run(_Written):
     deploy_fraction: Number = Field(
         default=0.05, ge=0.0, le=0.9, description="Share of the steps in deployment (paper, section 5: 5%)."
     )
-    num_envs: Whole = Field(default=16, ge=1, le=4096, description="Environments stepped together (ours).")
+    num_envs: Whole = Field(
+        default=64,
+        ge=1,
+        le=4096,
+        description="Environments stepped together; many, so that an update sees many episodes (ours).",
+    )
     rollout_steps: Whole | None = Field(
         default=None,
         ge=1,
         le=10_000_000,
-        description="T, steps of each environment between two policy updates; by default the task's horizon, "
-        "so that every environment finishes an episode an update.",
+        description="T, steps of each environment between two policy updates; by default 64, or the task's "
+        "horizon where that is shorter. Episodes go on from one update to the next (ours).",
     )
     evaluation_episodes: Whole = Field(
         default=100, ge=0, le=1_000_000, description="Episodes of each frozen-policy evaluation (ours)."

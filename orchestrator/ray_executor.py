@@ -39,12 +39,29 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import ray
 from ray import cloudpickle, tune
-from ray.exceptions import RayTaskError
+from ray.exceptions import (
+    ActorDiedError,
+    ActorUnavailableError,
+    NodeDiedError,
+    OutOfMemoryError,
+    RayTaskError,
+    TaskCancelledError,
+    WorkerCrashedError,
+)
 from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import ClusterError, StorageError, TeacherUnavailableError
 from recrl.orchestrator.own_package import copy_package
 from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
+from recrl.orchestrator.ray_services import (
+    RAY_FOLDER,
+    TOKEN,
+    TOKEN_VARIABLE,
+    LostServices,
+    end_processes,
+    end_processes_of_the_dead,
+)
+from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.remote_sweep import RemoteSweep, StopObject
 from recrl.orchestrator.scratch import scratch_folder
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -93,6 +110,7 @@ SELDOM: Mapping[str, int] = {
     "prestart_worker_first_driver": 0,  # a worker without work wakes a hundred times a second
     "raylet_check_gc_period_milliseconds": 10_000,
 }
+LOOPBACK = "127.0.0.1"
 # Processes that ``ray start`` can leave out and ``ray.init`` cannot: one copies the workers' output to the
 # driver, which does not want it (trials have logs), the other asks for machines where there are none.
 LEFT_OUT: Mapping[str, Any] = {"include_log_monitor": False, "no_monitor": True}
@@ -142,12 +160,13 @@ class RayExecutor:
         """
         if not specs or stop.is_set():
             return
-        with _environment(QUIET | WORKER), self._cluster(), self._stop_sign(store) as stop_sign:
+        lost = LostServices()
+        with _environment(QUIET | WORKER), lost.watched(self._cluster()), self._stop_sign(store) as stop_sign:
             if self.address and isinstance(stop_sign, StopObject):
                 check_nodes(stop_sign.key, stop_sign.uri)
             elif self.address:
                 check_nodes(stop_sign.place)
-            self._run_on_cluster(specs, store, stop, stop_sign)
+            self._run_on_cluster(specs, store, stop, stop_sign, lost)
 
     def _stop_sign(self, store: SweepStore) -> AbstractContextManager[StopFile | StopObject]:
         return StopObject.open(self.storage.objects) if self.storage else StopFile.open(store.folder)
@@ -165,10 +184,11 @@ class RayExecutor:
         store: SweepStore,
         stop: threading.Event,
         stop_sign: StopFile | StopObject,
+        lost: LostServices,
     ) -> None:
         queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
         silence = _Silence(store, self.silence_seconds, self.storage)
-        watch = _Watch(stop, stop_sign, queue, store, silence, storage=self.storage)
+        watch = _Watch(stop, stop_sign, queue, store, silence, lost=lost, storage=self.storage)
         service_name = f"teacher-{secrets.token_hex(8)}" if self.teacher == "service" else ""
         service = start_teacher_service(service_name) if service_name else None
         with scratch_folder(tempfile.gettempdir()) as scratch:
@@ -462,6 +482,7 @@ class _Watch(tune.Callback):
         store: SweepStore,
         silence: _Silence,
         *,
+        lost: LostServices,
         storage: RemoteSweep | None,
     ) -> None:
         self._stop = stop
@@ -470,6 +491,7 @@ class _Watch(tune.Callback):
         self._queue = queue
         self._store = store
         self._silence = silence
+        self._lost = lost
         self._last_event = time.monotonic()
         self.stopped_and_idle = False
 
@@ -480,6 +502,7 @@ class _Watch(tune.Callback):
         trials want. So it waits here while trials are long, and never for the stop event.
         """
         self._stop.wait(pause_seconds(time.monotonic() - self._last_event))
+        self._lost.check()
         self._silence.end(trials)
         if self._stop.is_set():
             if not self._queue.is_finished():
@@ -505,14 +528,15 @@ class _Watch(tune.Callback):
         """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
         self._last_event = time.monotonic()
         cause, spec = _last_error(trial), _spec_of(trial)
+        if self._lost.any_is_gone():  # not the trial's fault: it waits
+            return
         if isinstance(cause, StorageError):
             logger.warning("%s: %s; it waits", spec.title, cause)
             return
         self._refresh(spec)
         files = self._store.trial(spec)
         if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
-            what = f"{type(cause).__name__}: {_first_line(cause)}" if cause else "unknown"
-            error = f"failures of its process: {trial.num_failures}; the last: {what}"
+            error = shown(process_error(cause, trial.num_failures))
             try:
                 files.set_status(TrialState.FAILED, error=error)
             except StorageError as also:
@@ -548,8 +572,9 @@ class _StopWhenIdle(tune.Stopper):
 def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
     """A Ray cluster on this machine, for as long as the context lasts, that strangers cannot use.
 
-    Ray listens on all interfaces whatever one asks for: its token keeps others out. Ray opens its own folder
-    to everybody on the machine: the one around it, which also holds the token, is only this user's.
+    Its services listen at the loopback address and want the token, so that neither another machine nor
+    another user of this one can use them. Ray opens its own folder to everybody on the machine: the one
+    around it, which also holds the token, is only this user's.
 
     Args:
         num_cpus: cores it may use, at least 1; all of the machine's if None.
@@ -557,22 +582,28 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
     Raises:
         ClusterError: Ray does not start.
     """
+    end_processes_of_the_dead(_short_folder())
     with scratch_folder(_short_folder()) as folder:
-        token_path = folder / "token"
+        token_path = folder / TOKEN
         with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
             file.write(_token())
         seldom = {f"RAY_{name}": str(value) for name, value in SELDOM.items()}
-        with _environment(QUIET | WORKER | seldom | {"RAY_AUTH_TOKEN_PATH": str(token_path)}):
+        with _environment(QUIET | WORKER | seldom | {TOKEN_VARIABLE: str(token_path)}):
             for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
                 os.environ.pop(name, None)  # Ray looks at its mode only where it sets it itself
-            with _connection(
-                "cannot start Ray on this machine",
-                hint="",
-                address="local",
-                num_cpus=num_cpus,
-                include_dashboard=False,
-                object_store_memory=OBJECT_STORE_BYTES,
-                _temp_dir=f"{folder}/ray",
+            with (
+                _leaving_no_process(folder),
+                _at_loopback(),
+                _connection(
+                    "cannot start Ray on this machine",
+                    hint="",
+                    address="local",
+                    num_cpus=num_cpus,
+                    _node_ip_address=LOOPBACK,
+                    include_dashboard=False,
+                    object_store_memory=OBJECT_STORE_BYTES,
+                    _temp_dir=str(folder / RAY_FOLDER),
+                ),
             ):
                 yield
 
@@ -599,7 +630,8 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
         try:
             socket.create_connection((host, int(port)), timeout=CONNECT_SECONDS).close()
         except (OSError, ValueError) as error:
-            raise ClusterError(f"{failure}: {error}; is it running, and is this host:port?") from error
+            reason = getattr(error, "strerror", None) or error
+            raise ClusterError(f"{failure}: {reason}; is it running, and is this host:port?") from error
     hint = (
         "; is this machine a node of it (ray start --address=<host:port> --num-cpus=0), and does it want a "
         "token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
@@ -697,6 +729,31 @@ def _fewer_processes() -> Iterator[None]:
         module.RayParams = whole
 
 
+@contextmanager
+def _leaving_no_process(folder: Path) -> Iterator[None]:
+    """End at last what Ray leaves behind of the cluster in a folder: its agents, if its raylet was killed."""
+    try:
+        yield
+    finally:
+        end_processes(folder)
+
+
+@contextmanager
+def _at_loopback() -> Iterator[None]:
+    """Let Ray's services listen at this machine's own address only.
+
+    Where Ray is told such an address it takes the machine's outer one instead, unless it believes that there
+    can be no cluster on this system.
+    """
+    constants: Any = ray._private.ray_constants
+    before = constants.ENABLE_RAY_CLUSTER
+    constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        constants.ENABLE_RAY_CLUSTER = before
+
+
 @cache
 def _token() -> str:
     """This process's token for the clusters it starts: Ray reads a process's token only once."""
@@ -724,6 +781,28 @@ def _last_error(trial: Any) -> BaseException | None:
         return None
     error: BaseException = cloudpickle.loads(Path(path).read_bytes())  # Tune wrote it a moment ago
     return error.cause if isinstance(error, RayTaskError) else error
+
+
+def process_error(cause: BaseException | None, failures: int) -> str:
+    """What is said of a trial whose processes failed, so often that it is not started again.
+
+    Args:
+        cause: what Ray says of the last time, if it does.
+        failures: how often, at least 1.
+    """
+    times = "once" if failures == 1 else f"{failures} times"
+    if isinstance(cause, OutOfMemoryError):
+        why = "Ray ended it because the machine ran out of memory; let fewer trials run at once"
+    elif isinstance(cause, TaskCancelledError):
+        why = "Ray cancelled it"
+    elif isinstance(cause, ActorDiedError | ActorUnavailableError | WorkerCrashedError | NodeDiedError):
+        why = (
+            "it ended without a word: killed from outside, for want of memory, or by the task's or the "
+            "agent's own code"
+        )
+    else:
+        why = f"{type(cause).__name__}: {_first_line(cause)}" if cause else "nobody says why"
+    return f"its process failed {times}; the last time: {why}"
 
 
 def _first_line(error: BaseException) -> str:

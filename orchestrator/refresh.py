@@ -48,7 +48,16 @@ def refreshing(
 def sketch_command(store: SweepStore) -> list[str]:
     """The command that sketches the sweep's report."""
     root = ["--root", str(store.folder.parent)]
-    return [sys.executable, "-m", "recrl.orchestrator.cli", "figures", store.name, "--sketch", *root]
+    return [
+        sys.executable,
+        "-m",
+        "recrl.orchestrator.cli",
+        "figures",
+        store.name,
+        "--sketch",
+        "--trust",
+        *root,
+    ]
 
 
 def _refresh(store: SweepStore, over: threading.Event, wait: float, interval: float) -> None:

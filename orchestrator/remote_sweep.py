@@ -37,6 +37,7 @@ from typing import Any
 
 from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError, SweepBusyError
+from recrl.orchestrator.locks import open_lock
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.remote_trial import ALIVE, RemoteTrial, Upload, patiently, working_copy
 from recrl.orchestrator.small_files import read_sealed, write_atomically, write_sealed
@@ -481,6 +482,6 @@ def _boot() -> str:
 def _alone(store: SweepStore) -> Iterator[None]:
     """Be the only process and thread that writes the mirror."""
     store.folder.mkdir(parents=True, exist_ok=True)
-    with (store.folder / ".pull").open("w") as file:
+    with open_lock(store.folder / ".pull") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

@@ -31,6 +31,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import PurePosixPath
 from typing import Any, Self
 
 from recrl.orchestrator.beside import beside
@@ -306,7 +307,7 @@ class _Pulled:
         try:
             value = json.loads((trial.folder / PULLED).read_text())
             return cls(value["place"], Manifest.from_bytes(value["manifest"].encode()))
-        except (FileNotFoundError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError):
             return cls("", Manifest(TrialRecord(), {}))
 
     def write(self, trial: TrialStore) -> None:
@@ -601,6 +602,8 @@ def _newest_checkpoint(trial: TrialStore) -> tuple[list[str], dict[str, Extent]]
 
 def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
     """Put bytes into a file: behind those that are there, or in place of the whole file."""
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise StorageError(f"{trial.folder}: what is kept of it names a file outside it: {name!r}")
     path = trial.folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     if start == 0:

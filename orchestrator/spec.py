@@ -19,6 +19,7 @@ from enum import StrEnum
 from typing import Any
 
 from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.foreign import checked_spec
 from recrl.teachers.teacher import TeacherSpec
 
 
@@ -169,7 +170,12 @@ class TrialSpec:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrialSpec:
-        """The spec that ``to_json`` wrote."""
+        """The spec that ``to_json`` wrote.
+
+        Raises:
+            ValueError: it did not: what the mistake is, in one line.
+        """
+        value = checked_spec(value)
         return cls(
             **{
                 **value,

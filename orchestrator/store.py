@@ -69,6 +69,7 @@ from recrl.orchestrator.errors import (
     StorageError,
     SweepBusyError,
 )
+from recrl.orchestrator.locks import look_at_lock, open_lock
 from recrl.orchestrator.row_files import Extent, RowFile, digest_of, rows_text, shortage
 from recrl.orchestrator.small_files import (
     parsed_object,
@@ -382,7 +383,7 @@ class SweepStore:
     def is_locked(self) -> bool:
         """Whether some process runs the sweep."""
         try:
-            with (self.folder / "lock").open() as file:
+            with look_at_lock(self.folder / "lock") as file:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
@@ -403,7 +404,7 @@ class SweepStore:
                 _move_aside(path, self.folder / "aside")
         if self.trials_folder.exists() and not self.trials_folder.is_dir():
             _move_aside(self.trials_folder, self.folder / "aside")
-        with (self.folder / "lock").open("a+") as file:
+        with open_lock(self.folder / "lock") as file:
             if not _is_taken(file):
                 file.seek(0)
                 holder = file.read().strip() or "another process"
@@ -774,6 +775,7 @@ class TrialStore:
 
     def _begin(self, spec: TrialSpec) -> TrialWriter:
         with self.locked():
+            self.reserve_path.unlink(missing_ok=True)  # it might be a link
             self.reserve_path.write_bytes(secrets.token_bytes(RESERVE_BYTES))
             old = self._salvaged()
             if self.spec_path.name not in old.committed:
@@ -911,7 +913,7 @@ class TrialStore:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Exclude other writers of this trial on the same file system, for a moment."""
-        with (self.folder / ".lock").open("w") as file:
+        with open_lock(self.folder / ".lock") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
 

@@ -35,6 +35,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -44,7 +45,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recrl.orchestrator.errors import DamagedError, TrackingError
+from recrl.orchestrator.locks import open_lock
 from recrl.orchestrator.phase_totals import phase_totals
+from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.row_files import Extent
 from recrl.orchestrator.small_files import write_atomically, write_json
 from recrl.orchestrator.spec import TrialState
@@ -146,14 +149,21 @@ def checked_uri(given: str) -> str:
     Raises:
         TrackingError: MLflow has no such kind of store.
     """
+    if not given.isprintable() or " " in given:
+        raise TrackingError("the tracking address must hold no spaces and no control characters")
     scheme, separator, rest = given.partition("://")
+    if scheme != "sqlite" and re.search("[/?#].*@", rest):  # others would take a part of it for a host
+        raise TrackingError(
+            "the tracking address must have no @ behind its host; in a password write %2F for /, %3F for ?, "
+            "%23 for # and %40 for @"
+        )
     if scheme == "sqlite" and rest.startswith("/") and len(rest) > 1:
         return f"sqlite:///{Path(rest.removeprefix('/')).absolute()}"
     if separator and rest and scheme.partition("+")[0] in ("http", "https", "postgresql", "mysql", "mssql"):
         return given
     raise TrackingError(
         "the tracking address must be http(s)://host:port, sqlite:///file.db or another database that MLflow "
-        f"takes (postgresql, mysql, mssql), got {given!r}"
+        f"takes (postgresql, mysql, mssql), got {redacted(given)!r}"
     )
 
 
@@ -712,7 +722,7 @@ def _alone(store: SweepStore, uri: str) -> Iterator[None]:
     """Wait until no other process tells this store about this sweep; two would make every run twice."""
     folder = mirror_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("w") as file:
+    with open_lock(folder / "lock") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
@@ -759,4 +769,4 @@ def _milliseconds(seconds: float) -> int:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:500]
+    return " ".join(redacted(f"{type(error).__name__}: {error}").split())[:500]

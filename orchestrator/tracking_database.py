@@ -23,7 +23,8 @@ import numpy.typing as npt
 import pandas as pd
 
 from recrl.environments.cmdp import Floats
-from recrl.orchestrator.errors import TrackingError, without_password
+from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.redaction import redacted
 
 Ints = npt.NDArray[np.int64]
 
@@ -92,7 +93,7 @@ class Points:
 def unreadable(uri: str, error: Exception) -> TrackingError:
     """What is said where MLflow's store cannot be read."""
     reason = next(iter(str(error).splitlines()), type(error).__name__)
-    return TrackingError(f"MLflow at {without_password(uri)} cannot be read: {reason}")
+    return TrackingError(f"MLflow at {redacted(uri)} cannot be read: {redacted(reason)}")
 
 
 class Tables(Protocol):

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from recrl.orchestrator.redaction import RedactedStream
 from recrl.orchestrator.status import Standing, standing_of
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.tracking import ENVIRONMENT, SyncReport, Tracker, mirror_folder
@@ -62,7 +63,7 @@ def start_mirror(store: SweepStore, uri: str, *, interval_seconds: float) -> Mir
     folder = mirror_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "recrl.orchestrator.tracking_mirror", str(store.folder)]
-    with (folder / "log.txt").open("ab") as log:
+    with open(os.open(folder / "log.txt", os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600), "ab") as log:
         process = subprocess.Popen(
             [*command, "--interval", str(interval_seconds), "--parent", str(os.getpid())],
             # In the environment and not among the arguments, which other users can see.
@@ -84,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--interval", type=float, required=True, help="seconds between two passes")
     parser.add_argument("--parent", type=int, required=True, help="the process to end with")
     arguments = parser.parse_args(argv)
+    sys.stdout, sys.stderr = RedactedStream(sys.stdout), RedactedStream(sys.stderr)
     os.nice(POLITENESS)
     store = SweepStore(arguments.folder.parent, arguments.folder.name)
     tracker = Tracker(store, os.environ["MLFLOW_TRACKING_URI"])

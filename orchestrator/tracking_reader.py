@@ -30,7 +30,8 @@ from urllib.parse import unquote, urlparse
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.orchestrator.errors import TrackingError, without_password
+from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.tracking import ENVIRONMENT, PHASES_TAG, PROGRESS_TAG, SPEC_TAG, is_server
 from recrl.orchestrator.tracking_database import (
@@ -293,7 +294,7 @@ def find_sweep(uri: str, name: str | None) -> TrackedSweep:
     if name not in names:
         listed = f"it shows {', '.join(sorted(names))}" if names else "it shows none"
         which = f"no sweep {name!r}" if name else f"{len(names)} sweeps; say which one"
-        raise TrackingError(f"MLflow at {without_password(uri)} shows {which}; {listed}")
+        raise TrackingError(f"MLflow at {redacted(uri)} shows {which}; {listed}")
     runs = source.runs(names[name])
     parents = [run for run in runs if run.tags.get("recrl.kind") == "sweep"]
     newest = max(parents, key=lambda run: run.start_time, default=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import socket
 import subprocess
@@ -25,7 +26,9 @@ def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
     """
     if is_server(uri):
         return [sys.executable, "-m", "webbrowser", "-t", ui_url(store, uri)]
-    stores = ["--backend-store-uri", uri, "--artifacts-destination", str(store.mlflow_artifacts)]
+    stores = ["--artifacts-destination", str(store.mlflow_artifacts)]
+    if "@" not in uri and "?" not in uri:  # else it goes in the environment, which other users cannot see
+        stores += ["--backend-store-uri", uri]
     address = ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     return ["env", *SETTINGS, sys.executable, "-m", "mlflow", "server", *stores, *address]
 
@@ -79,8 +82,9 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 1
         return UI(url, None)
     command = ui_command(store, uri, port=port)
     log_path = mirror_folder(store, uri) / "ui.txt"
-    with log_path.open("wb") as log:
-        server = subprocess.Popen(command, stdout=log, stderr=log)
+    with open(os.open(log_path, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o600), "wb") as log:
+        environment = {**os.environ, "MLFLOW_BACKEND_STORE_URI": uri}
+        server = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
     end = time.monotonic() + timeout
     while time.monotonic() < end and server.poll() is None:
         if _answers(port):

@@ -13,11 +13,13 @@ any more; the student goes on learning. At the end the policy is frozen and eval
 from __future__ import annotations
 
 import logging
+import os
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from io import TextIOWrapper
 from typing import Any, Self
 
 import numpy as np
@@ -31,10 +33,19 @@ from recrl.environments.cmdp import EpisodeStats, Floats, Phase
 from recrl.environments.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.orchestrator.errors import LostLeaseError, RowError, StorageError, TeacherUnavailableError
+from recrl.orchestrator.errors import (
+    USERS_ERRORS,
+    LostLeaseError,
+    RowError,
+    StorageError,
+    TeacherUnavailableError,
+    described,
+)
 from recrl.orchestrator.heartbeat import Heartbeat
 from recrl.orchestrator.origins import code_of
 from recrl.orchestrator.provenance import collect as collect_provenance
+from recrl.orchestrator.redaction import shown
+from recrl.orchestrator.rollout_check import check_rollout
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.store import TrialStore, TrialWriter
 from recrl.teachers.registry import make_teacher
@@ -88,7 +99,7 @@ class Trial:
         self._environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
         self._cmdp = self._environments.cmdp
         self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, seeds.agent)
-        self._collector = Collector(self._environments, num_steps=spec.rollout_steps)
+        self._collector = Collector(self._environments, num_steps=spec.rollout_steps, staggered=True)
         tree = writer.restore()
         if tree is None:
             self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
@@ -114,6 +125,7 @@ class Trial:
         phase, lesson = self.phase, self._lesson
         clock = time.process_time()
         rollout, finished = self._collector.collect(self._agent, self._generator)
+        check_rollout(rollout, self.spec.task.label)
         collect_seconds, clock = time.process_time() - clock, time.process_time()
         episodes = self._number(finished, phase, lesson)
         self.env_steps += self.spec.steps_per_update
@@ -386,7 +398,7 @@ def _located(where: str, writer: TrialWriter) -> Iterator[None]:
     """Note on whatever is raised where that was, and what is left of the trial."""
     try:
         yield
-    except Exception as error:
+    except USERS_ERRORS as error:
         update = writer.store.saved_update
         saved = (
             f"the last good checkpoint is that of update {update}" if update else "no checkpoint before it"
@@ -443,11 +455,11 @@ def run_recorded(
         except StorageError as error:
             logger.error("%s", error)
             return _close(writer, TrialState.WAITING, error=str(error))
-        except Exception as error:
+        except USERS_ERRORS as error:
             logger.exception("failed after update %d", writer.record.update)
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
-            text = " ".join(f"{type(error).__name__}: {error}{notes}".split())
-            return _close(writer, TrialState.FAILED, error=text, traceback=traceback.format_exc())
+            text = shown(f"{described(error)}{notes}")
+            return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))
         return store.record().status
 
 
@@ -479,7 +491,18 @@ def _log_to(store: TrialStore) -> Iterator[None]:
 
 
 class _Log(logging.FileHandler):
-    """A log that loses lines rather than end a trial: on a full disk nothing is said about the log."""
+    """A log that loses lines rather than end a trial: on a full disk nothing is said about the log.
+
+    A link in its place is not followed: it might lead to another file of the user's.
+    """
+
+    def _open(self) -> TextIOWrapper:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
+        return open(os.open(self.baseFilename, flags, 0o644), "a", encoding=self.encoding)
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as text, without secrets and control characters."""
+        return shown(super().format(record))
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError):

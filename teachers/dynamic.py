@@ -30,7 +30,7 @@ the letter wherever it is defined.
   lie after the last noise.
 - *Limits never rise.* With the tolerance C may lie above d: the step is taken from min(C, d).
 - *Infinite limits.* C <= d holds, and line 7 takes d from infinity to about C: nothing goes wrong. But the
-  start may be measured instead (``start_updates``), and then nothing is judged until it is known.
+  start may be measured instead (``start_fraction``), and then nothing is judged until it is known.
 - *Several costs* (lines 5 to 7 say "for all i"). One cost that is still moving, or that cannot be kept,
   would hold the limits of all the others at d_t. Each limit goes its own way: it falls when the return and
   its own cost have converged and its own limit is kept; the policy gets noise when any converged cost is
@@ -54,7 +54,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from recrl.environments.cmdp import CostLimits
-from recrl.teachers.start import StartMeasurement
+from recrl.teachers.start import START_FRACTION, StartMeasurement
 from recrl.teachers.teacher import (
     Lesson,
     ProgressReport,
@@ -68,7 +68,7 @@ from recrl.teachers.windows import Stretch, WindowUnit, extend, last_two_windows
 
 # The pseudocode as it stands. W and eps_pi are not given in the paper: W is five updates of 16 episodes.
 PAPER = {
-    "start_updates": 0,
+    "start_fraction": 0.0,
     "window": 80,
     "window_unit": "episodes",
     "return_floor": 0.0,
@@ -90,11 +90,12 @@ class DynamicConfig(BaseModel):
         default="recommended",
         description="What fills in the settings that are not given: sound ones, or Algorithm 2 literally.",
     )
-    start_updates: int = Field(
-        default=1,
-        ge=0,
-        description="Policy updates over which the start is measured where train_limits is infinite; "
-        "0 starts at infinity, as Algorithm 2 does.",
+    start_fraction: float = Field(
+        default=START_FRACTION,
+        ge=0.0,
+        le=0.5,
+        description="Share of the training steps without limits in which the start is measured where "
+        "train_limits is infinite; 0 starts at infinity, as Algorithm 2 does.",
     )
     window: int = Field(
         default=5, ge=1, description="W of Algorithm 2, in window_unit; the paper does not give it."
@@ -324,7 +325,7 @@ class DynamicTeacher:
     def __init__(self, spec: TeacherSpec) -> None:
         self.spec = spec
         self.config = DynamicConfig.model_validate(dict(spec.options))
-        self.measurement = StartMeasurement(spec, self.config.start_updates)
+        self.measurement = StartMeasurement(spec, self.config.start_fraction)
 
     def start(self) -> tuple[Lesson, TeacherState]:
         """See ``Teacher.start``."""

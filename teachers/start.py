@@ -2,11 +2,19 @@
 
 A decay from infinity is not defined. Section 5.1 of the paper: "a finite initial cost limit should be used.
 For instance, the agent can be executed on the training model M_t for a few episodes, and the incurred costs
-can be used as the initial cost limits." So the first K policy updates are left unconstrained in the infinite
-dimensions, and then d_t := max(d_d, mean episode cost of these updates). If no episode has finished by then,
-the measurement goes on until one has.
+can be used as the initial cost limits."
 
-Letters: k the number of costs, K = ``start_updates``.
+Which episodes? An untrained agent may be the most expensive one, as on RiverGrid, where it wanders about in
+the river; or the cheapest, as on Safety Gym, where it hardly moves and an agent that earns reward costs twice
+as much. A limit measured there would be tight from the start. So for a share f of the training budget the
+agent learns without limits in the infinite dimensions, and then
+
+    d_t := max(d_d, the largest mean cost of any window of episodes so far),
+
+where windows are consecutive and of at least 32 episodes. If no episode has finished by then, the measurement
+goes on until one has.
+
+Notation: k the number of costs, B the training budget in environment steps, f = ``start_fraction``.
 """
 
 from __future__ import annotations
@@ -18,56 +26,70 @@ from typing import Any
 from recrl.environments.cmdp import CostLimits
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
+START_FRACTION = 0.05  # by default
+WINDOW_EPISODES = 32
+KEYS = ("start_limits", "start_episodes", "start_cost_sums", "start_peaks")
+
 
 @dataclass(frozen=True)
 class StartMeasurement:
     """The limits a curriculum starts from: d_t where it is finite, else measured.
 
-    It keeps three keys in the teacher's state: ``start_limits`` (the d_t that is really used, [k], None as
-    long as it is being measured), ``start_episodes`` and ``start_cost_sums`` [k] (what was measured).
+    It keeps four keys in the teacher's state: ``start_limits`` (the d_t that is really used, [k], None as
+    long as it is being measured); ``start_episodes`` and ``start_cost_sums`` [k] of the window under way; and
+    ``start_peaks``, the largest mean cost of a whole window, [k], None before the first.
 
     Attributes:
         spec: the teacher's.
-        start_updates: K; 0 takes d_t as it is, infinite or not.
+        start_fraction: f; 0 takes d_t as it is, infinite or not.
     """
 
     spec: TeacherSpec
-    start_updates: int
+    start_fraction: float
 
     def begin(self) -> dict[str, Any]:
-        """The three keys before any update."""
+        """The four keys before any update."""
         is_open = any(
             math.isinf(train) and math.isfinite(deploy)
             for train, deploy in zip(self.spec.train_limits, self.spec.deploy_limits, strict=True)
         )
-        measure = is_open and self.start_updates > 0
+        measure = is_open and self.start_fraction > 0.0
         return {
             "start_limits": None if measure else self.spec.train_limits.to_json(),
             "start_episodes": 0,
             "start_cost_sums": [0.0] * len(self.spec.train_limits),
+            "start_peaks": None,
         }
 
     def advance(self, state: TeacherState, report: ProgressReport) -> dict[str, Any]:
-        """The three keys after ``report``."""
-        keys = {key: state[key] for key in ("start_limits", "start_episodes", "start_cost_sums")}
+        """The four keys after ``report``."""
+        keys = {key: state[key] for key in KEYS}
         if keys["start_limits"] is not None:
             return keys
         episodes = keys["start_episodes"] + len(report.episodes)
-        cost_sums = [
+        sums = [
             math.fsum([so_far, *(episode.costs[i] for episode in report.episodes)])
             for i, so_far in enumerate(keys["start_cost_sums"])
         ]
-        measured = None
-        if report.update >= self.start_updates and episodes > 0:
-            measured = CostLimits(
-                tuple(
-                    train if math.isfinite(train) else max(deploy, cost_sum / episodes)
-                    for train, deploy, cost_sum in zip(
-                        self.spec.train_limits, self.spec.deploy_limits, cost_sums, strict=True
-                    )
-                )
-            ).to_json()
-        return {"start_limits": measured, "start_episodes": episodes, "start_cost_sums": cost_sums}
+        peaks = keys["start_peaks"]
+        is_over = report.env_steps >= self.start_fraction * self.spec.train_steps
+        # What is left of the last window counts only where there is no whole one.
+        if episodes >= WINDOW_EPISODES or (is_over and peaks is None and episodes > 0):
+            means = [cost_sum / episodes for cost_sum in sums]
+            peaks = means if peaks is None else [max(pair) for pair in zip(peaks, means, strict=True)]
+            episodes, sums = 0, [0.0] * len(sums)
+        measured = self._measured(peaks) if is_over and peaks is not None else None
+        return dict(zip(KEYS, (measured, episodes, sums, peaks), strict=True))
+
+    def _measured(self, peaks: list[float]) -> list[float | str]:
+        """d_t where it is finite, else the peak, but at least d_d, as JSON."""
+        spec = self.spec
+        return CostLimits(
+            tuple(
+                train if math.isfinite(train) else max(deploy, peak)
+                for train, deploy, peak in zip(spec.train_limits, spec.deploy_limits, peaks, strict=True)
+            )
+        ).to_json()
 
     def limits(self, keys: TeacherState) -> CostLimits:
         """The d_t in force: the start limits, or d_t itself while they are being measured, [k]."""

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.cmdp import CostLimits
-from recrl.teachers.start import StartMeasurement
+from recrl.teachers.start import START_FRACTION, StartMeasurement
 from recrl.teachers.teacher import (
     Lesson,
     ProgressReport,
@@ -86,13 +86,13 @@ class StaticTeacher:
     Args:
         spec: d_t, d_d and B.
         decay: how the limit falls.
-        start_updates: K, policy updates over which an infinite d_t is measured; 0 to keep it infinite.
+        start_fraction: share of B in which an infinite d_t is measured; 0 to keep it infinite.
     """
 
-    def __init__(self, spec: TeacherSpec, *, decay: Decay, start_updates: int = 0) -> None:
+    def __init__(self, spec: TeacherSpec, *, decay: Decay, start_fraction: float = 0.0) -> None:
         self.spec = spec
         self.decay = decay
-        self.measurement = StartMeasurement(spec, start_updates)
+        self.measurement = StartMeasurement(spec, start_fraction)
 
     def start(self) -> tuple[Lesson, TeacherState]:
         """See ``Teacher.start``."""
@@ -136,18 +136,19 @@ class DecayConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    start_updates: int = Field(
-        default=1,
-        ge=1,
-        description="Policy updates over which the start of the decay is measured where train_limits is "
-        "infinite (section 5.1 of the paper: 'a few episodes'); more if no episode finished.",
+    start_fraction: float = Field(
+        default=START_FRACTION,
+        gt=0.0,
+        le=0.5,
+        description="Share of the training steps without limits in which the start of the decay is measured "
+        "where train_limits is infinite (section 5.1 of the paper: 'a few episodes').",
     )
 
 
 def decay_teacher(spec: TeacherSpec, *, decay: Decay) -> StaticTeacher:
     """CLiC_L, CLiC_C or CLiC_E, from d_t, or from the measured costs where d_t is infinite."""
     return StaticTeacher(
-        spec, decay=decay, start_updates=DecayConfig.model_validate(spec.options).start_updates
+        spec, decay=decay, start_fraction=DecayConfig.model_validate(spec.options).start_fraction
     )
 
 

@@ -8,6 +8,8 @@ and again with the same command, while at random times (drawn from the seed) one
     worker    kill -9 of a process that runs a trial
     hang      SIGSTOP of such a process, which nobody lets go on: its silence must be noticed
     teacher   kill -9 of the teacher service
+    raylet    kill -9 of Ray's node service: the launch must end with exit code 4
+    gcs       kill -9 of Ray's head service: likewise
     driver    kill -9 of the launch
     group     SIGTERM to the launch's whole process group, as ``timeout`` or a terminal sends it
     stop      ``recrl-sweep stop``
@@ -50,7 +52,9 @@ seeds: 2
 run: {{total_steps: {steps}, evaluation_episodes: 10}}
 resources: {{silence_seconds: 15}}
 """
-WEIGHTS = {"worker": 8, "hang": 1, "teacher": 3, "driver": 2, "group": 1, "stop": 1, "mlflow": 2}
+WEIGHTS = {"worker": 8, "hang": 1, "teacher": 3, "raylet": 2, "gcs": 2}
+WEIGHTS |= {"driver": 2, "group": 1, "stop": 1, "mlflow": 2}
+SERVICES = {"raylet": "raylet", "gcs": "gcs_server"}
 MEAN_PAUSE_SECONDS = 8.0
 SILENT = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
 
@@ -126,7 +130,7 @@ class Chaos:
             kind = generator.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
             until = time.monotonic() + pause
             # half of the harm may come while a launch begins; the rest waits until there are trials to harm
-            patient = generator.random() < 0.5 or kind in ("worker", "hang", "teacher")
+            patient = generator.random() < 0.5 or kind in ("worker", "hang", "teacher", *SERVICES)
             while time.monotonic() < end and (time.monotonic() < until or (patient and not self.trials())):
                 if self.driver is None or self.driver.poll() is not None:
                     if self.driver is not None:
@@ -147,6 +151,8 @@ class Chaos:
             victims = self.trials()
         elif kind == "teacher":
             victims = self.processes("TeacherService")
+        elif kind in SERVICES:
+            victims = [pid for pid in descendants(self.driver.pid, "") if comm(pid) == SERVICES[kind]]
         if not victims or self.driver.poll() is not None:
             return
         victim = generator.choice(victims)
@@ -231,6 +237,16 @@ def descendants(root: int, title: str) -> Iterator[int]:
                 yield pid
         except OSError:
             continue
+
+
+def comm(pid: int) -> str:
+    """The name of a process; empty if it is over."""
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return ""
+    name, _, rest = status.partition("(")[2].rpartition(")")
+    return "" if rest.split()[0] == "Z" else name
 
 
 def differences(ours: TrialStore, theirs: TrialStore) -> Iterator[str]:

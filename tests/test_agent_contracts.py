@@ -190,7 +190,7 @@ def test_entropy_that_is_rewarded_rises_in_one_update_and_survives_a_checkpoint(
 def test_a_student_that_waits_sums_up_no_violation_of_a_noisy_policy(rule: str) -> None:
     options = {
         **{"multiplier_rule": rule, "multiplier_initial": 0.5, "multiplier_proportional": 0.0},
-        "multiplier_waits": True,
+        **{"multiplier_waits": True, "multiplier_unit": "cost"},
     }
     lessons, resumed = (Lessons("ppo-lag", "two-state", options) for _ in range(2))
     rollout, _ = lessons.collect()
@@ -213,9 +213,9 @@ def test_a_geometric_price_comes_down_faster_from_where_it_is_high(agent: str) -
         }
         lessons = Lessons(agent, "two-state", options)
         metrics = lessons.update(1e9)
-        fall[geometric] = 9.0 - metrics["multiplier_0"]
-    assert fall[False] == pytest.approx(0.1)
-    assert fall[True] == pytest.approx(10.0 * -math.expm1(-0.1))
+        fall[geometric] = metrics["multiplier_0"]
+    # Both begin at 9 and differ only in the unit that the multipliers are reported in.
+    assert fall[True] / fall[False] == pytest.approx((10.0 * math.exp(-0.1) - 1.0) / 8.9)
 
 
 def test_a_geometric_price_of_another_rule_is_refused() -> None:
@@ -264,11 +264,12 @@ def test_with_a_temperature_a_student_settles(agent: str) -> None:
     """Where nothing is left to gain, steps to the edge of the trust region lead anywhere."""
     late = {}
     for temperature in (0.0, 0.3):
-        lessons = Lessons(agent, "two-state", {"target_kl": 0.05, "temperature": temperature})
+        options = {"target_kl": 0.05, "temperature": temperature, "critic_steps": 40}
+        lessons = Lessons(agent, "two-state", options)
         entropies = [lessons.update(math.inf)["entropy"] for _ in range(60)]
         late[temperature] = max(entropies[30:])
     assert late[0.3] < 0.01
-    assert late[0.0] > 0.3
+    assert late[0.0] > 0.1
 
 
 def test_a_margin_of_the_worst_episodes_is_refused() -> None:

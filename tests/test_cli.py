@@ -190,7 +190,7 @@ def test_no_password_is_printed(
     assert main(["launch", "grid.yaml", *INLINE, "--tracking-uri", uri]) == ExitCode.TRIALS_FAILED
     del sys.modules["my_unlucky_student"]
     out = capsys.readouterr().out
-    assert "--tracking-uri postgresql://me:***@database/mlflow --retry-failed" in out
+    assert "--tracking-uri postgresql://***@database/mlflow --retry-failed" in out
     assert "hunter2" not in out
 
 
@@ -359,3 +359,53 @@ def test_a_disk_that_takes_nothing_is_a_sentence(folder: Path, capsys: pytest.Ca
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert code == ExitCode.CANNOT_RUN
     assert capsys.readouterr().err.endswith("File too large; what was saved stays\n")
+
+
+@pytest.mark.parametrize(
+    "sweep_command", ["status", "stop", "logs", "evaluate", "figures", "export", "bound", "ui"]
+)
+def test_a_wrong_grid_file_is_a_sentence_for_every_command(
+    folder: Path, capsys: pytest.CaptureFixture[str], sweep_command: str
+) -> None:
+    (folder / "bad.yaml").write_text(GRID.replace("name: small", "name: ../small"))
+    assert main([sweep_command, "bad.yaml"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "bad.yaml:1: name: must be a name for a folder: letters, digits and . _ - only, at most 64, got "
+        "'../small'\n1 mistake in bad.yaml; nothing was started\n"
+    )
+    assert main([sweep_command, "gird.yaml"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        f"gird.yaml: there is no such file in {folder}; did you mean 'grid.yaml'?\n"
+        "1 mistake in gird.yaml; nothing was started\n"
+    )
+
+
+def test_lists_and_films_do_not_swallow_what_follows(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plan", "--only", "method=none", "seed=0", "grid.yaml"]) == ExitCode.OK
+    assert "small: 1 trial: 1 new" in capsys.readouterr().out
+    assert main(["plan", "--only", "method=none,linear", "--only", "seed=0", "grid.yaml"]) == ExitCode.OK
+    assert "small: 2 trials: 2 new" in capsys.readouterr().out
+    assert main(["evaluate", "--video", "nope"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith("recrl-sweep: runs: holds no sweep 'nope'")
+
+
+@pytest.mark.parametrize(
+    ("option", "sentence"),
+    [
+        ("--cores=1e9", "argument --cores: must be a whole number, written with digits only, got '1e9'"),
+        ("--cores=0", "argument --cores: must be at least 1, got 0"),
+        ("--root=grid.yaml", "argument --root: must be a folder, got the file 'grid.yaml'"),
+        (
+            "--root=" + "x" * 999,
+            "argument --root: cannot be used (File name too long), got '" + "x" * 60 + "'...",
+        ),
+    ],
+)
+def test_a_wrong_option_is_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture[str], option: str, sentence: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["plan", "grid.yaml", option])
+    assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep plan: error: {sentence}"

@@ -110,6 +110,7 @@ def rollout_of(costs: Floats) -> Rollout:
         final_observations=nothing,
         last_observations=np.zeros((1, 1), np.float32),
         carried_costs=np.zeros((1, 1)),
+        carried_lengths=np.zeros(1, np.int64),
     )
 
 

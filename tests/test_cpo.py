@@ -42,7 +42,10 @@ def improve(
     policy, batch, advantages = sampled(space)
     before = policy.parameters.to_numpy()
     constraints = Constraints(
-        np.array(limits or [10.0, 10.0]), np.array(gaps), math.nan if math.isnan(gaps[0]) else LENGTH
+        np.array(limits or [10.0, 10.0]),
+        np.array(gaps),
+        np.zeros(2),
+        math.nan if math.isnan(gaps[0]) else LENGTH,
     )
     rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA), num_costs=2)
     experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
@@ -94,7 +97,9 @@ def test_without_a_finished_episode_the_policy_stays() -> None:
 
 
 def test_violations_enter_in_cost_per_step() -> None:
-    constraints = Constraints(np.array([25.0, math.inf, 1.0]), np.array([50.0, -math.inf, -0.5]), 1000.0)
+    constraints = Constraints(
+        np.array([25.0, math.inf, 1.0]), np.array([50.0, -math.inf, -0.5]), np.zeros(3), 1000.0
+    )
     active = ActiveConstraints.of(constraints)
     assert active.index.tolist() == [0, 2]
     assert active.violations.tolist() == pytest.approx([0.05, -0.0005])

@@ -98,7 +98,7 @@ def improve(
 ) -> tuple[dict[str, float], Floats]:
     """The metrics of one update, and the policy's parameters after it."""
     policy, batch, advantages = sampled(noise=noise)
-    constraints = Constraints(np.array([5.0]), np.array([gap]), LENGTH)
+    constraints = Constraints(np.array([5.0]), np.array([gap]), np.zeros(1), LENGTH)
     experience = Experience.of(policy, batch, advantages, constraints, num_envs=2)
     options: dict[str, Any] = {"cross_fitting": cross_fitting}
     rule = (
@@ -141,7 +141,7 @@ def test_the_share_is_that_of_the_cost_that_has_a_limit(compact: bool) -> None:
     advantages -= advantages.mean(axis=0)
     batch = LearningBatch.gather(observations, actions, compact=compact)
     assert (batch.row_of_sample is not None) == compact
-    constraints = Constraints(np.array([np.inf, 5.0]), np.array([-np.inf, 1.0]), LENGTH)
+    constraints = Constraints(np.array([np.inf, 5.0]), np.array([-np.inf, 1.0]), np.zeros(2), LENGTH)
     experience = Experience.of(policy, batch, advantages, constraints, num_envs=3)
     config = CPOConfig(cross_fitting=True, conjugate_gradient_steps=200, metric_samples=None)
     signs = halves(99, 3)

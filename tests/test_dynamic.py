@@ -450,10 +450,10 @@ def test_an_infinite_start_is_kept_until_the_first_judgement_or_measured() -> No
     def costs_65(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
         return 9.5, (65.0,)
 
-    kept = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40, start_updates=0)
+    kept = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40, start_fraction=0.0)
     assert kept.limits[8:10] == [(math.inf,), (50.0,)]  # 65 - 60 / 4: six windows are left
     assert kept.state["start_limits"] == ["inf"]
-    measured = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40)
+    measured = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40, start_fraction=0.02)
     assert measured.limits[0] == (65.0,)
     assert measured.limits[8:10] == [(65.0,), (50.0,)]
     assert measured.state["start_limits"] == [65.0]

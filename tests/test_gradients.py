@@ -43,7 +43,7 @@ def moved_policy(space: Space[object], compact: bool) -> tuple[StochasticPolicy,
     observations = generator.normal(size=(8, 3))[generator.integers(8, size=30)]
     actions = policy.sample(observations, generator)  # type: ignore[arg-type]
     batch = LearningBatch.gather(observations, actions, compact=compact)  # type: ignore[arg-type]
-    constraints = Constraints(np.array([1.0, 1.0]), np.array([0.3, -0.5]), 2.0)
+    constraints = Constraints(np.array([1.0, 1.0]), np.array([0.3, -0.5]), np.zeros(2), 2.0)
     advantages = generator.normal(size=(30, 3))
     experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
     policy.parameters.values.add_(0.1 * torch.randn(len(policy.parameters.values)))

@@ -91,7 +91,7 @@ def test_every_default_is_filled_in() -> None:
     assert spec.train_limits == CostLimits((math.inf,))
     assert spec.deploy_limits == CostLimits((2.0,))
     assert (spec.train_steps, spec.deploy_steps) == (3800, 200)
-    assert (spec.num_envs, spec.rollout_steps, spec.evaluation_episodes) == (16, 10, 100)
+    assert (spec.num_envs, spec.rollout_steps, spec.evaluation_episodes) == (64, 10, 100)
 
 
 def test_saying_a_default_changes_no_trial() -> None:
@@ -174,7 +174,7 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
             "4000",
             "100",
             "grid.yaml:6: run.total_steps: must be at least one update of two-state, "
-            "16 environments x 10 steps = 160, got 100",
+            "64 environments x 10 steps = 640, got 100",
         ),
         ("4000}", "4000, num_envs: 0}", "grid.yaml:6: run.num_envs: must be at least 1, got 0"),
         (
@@ -329,7 +329,7 @@ def test_a_task_that_cannot_be_built_is_a_sentence() -> None:
 
 def test_too_many_trials_are_refused() -> None:
     methods = ", ".join(
-        f"{{name: linear, label: l{i}, options: {{start_updates: {i + 1}}}}}" for i in range(11)
+        f"{{name: linear, label: l{i}, options: {{start_fraction: 0.{i + 10}}}}}" for i in range(11)
     )
     text = SMALL.replace("[none, linear]", f"[{methods}]").replace("seeds: 2", "seeds: 10000")
     assert _problems(text) == ["grid.yaml:1: a grid must have at most 100000 trials, got 110000"]

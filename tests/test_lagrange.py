@@ -10,9 +10,9 @@ import torch
 from recrl.agents.lagrange import (
     STARTS,
     MultiplierState,
-    limit_units,
     pid,
     projected_ascent,
+    relative_gaps,
     restarted,
     softplus_adam,
     start_pid,
@@ -58,12 +58,12 @@ def test_softplus_adam_equals_pytorch() -> None:
 
 def test_pid_adds_its_three_terms() -> None:
     gains: dict[str, Any] = {"proportional": 0.1, "integral": 0.01, "derivative": 1.0, "maximum": 100.0}
-    limits = np.array([20.0])
-    state = pid(start_pid(1, 0.0), np.array([10.0]), limits, **gains)
+    gains["largest"] = 20.0
+    state = pid(start_pid(1, 0.0), np.array([10.0]), **gains)
     assert state["multipliers"] == pytest.approx([1.1])  # 0.1 * 10 + 0.01 * 10; nothing to differ from yet
-    state = pid(state, np.array([12.0]), limits, **gains)
+    state = pid(state, np.array([12.0]), **gains)
     assert state["multipliers"] == pytest.approx([1.2 + 0.22 + 2.0])
-    state = pid(state, np.array([11.0]), limits, **gains)
+    state = pid(state, np.array([11.0]), **gains)
     assert state["multipliers"] == pytest.approx([1.1 + 0.33])  # a falling gap is not differentiated
 
 
@@ -72,7 +72,7 @@ def summed_geometrically(state: MultiplierState, gap: float, limit: float, maxim
     after = pid(
         state,
         np.array([gap]),
-        np.array([limit]),
+        largest=limit,
         proportional=0.0,
         integral=0.1,
         derivative=0.0,
@@ -104,25 +104,36 @@ def test_a_geometric_integral_is_held_within_what_a_multiplier_can_be() -> None:
 
 def test_pid_does_not_wind_up() -> None:
     gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 2.0}
-    state, limits = start_pid(2, 0.0), np.array([10.0, 10.0])
+    state, gains["largest"] = start_pid(2, 0.0), 10.0
     for _ in range(1000):
-        state = pid(state, np.array([10.0, -10.0]), limits, **gains)
+        state = pid(state, np.array([10.0, -10.0]), **gains)
     assert state["integral"].tolist() == [2.0, 0.0]
-    state = pid(state, np.array([-10.0, 10.0]), limits, **gains)
+    state = pid(state, np.array([-10.0, 10.0]), **gains)
     assert state["multipliers"].tolist() == [1.0, 1.0]
 
 
 def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates() -> None:
     gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
-    state, limits = start_pid(3, 1.0), np.array([5.0, 2.0, 0.0])
-    state = pid(state, np.array([60.0, 1.0, 60.0]), limits, **gains)
-    assert state["integral"].tolist() == pytest.approx([1.5, 1.1, 1.1])
-    state = pid(state, -limits, limits, **gains)
-    assert state["integral"].tolist() == pytest.approx([1.0, 0.9, 1.1])
+    state, gains["largest"] = start_pid(2, 1.0), np.array([5.0, 2.0])
+    state = pid(state, np.array([60.0, 1.0]), **gains)
+    assert state["integral"].tolist() == pytest.approx([1.5, 1.1])
+    state = pid(state, np.array([-5.0, -2.0]), **gains)
+    assert state["integral"].tolist() == pytest.approx([1.0, 0.9])
 
 
-def test_a_gap_is_measured_against_its_limit_and_limits_below_1_count_as_1() -> None:
-    assert limit_units(np.array([25.0, 1.0, 0.0, 0.5, math.inf])).tolist() == [25.0, 1.0, 1.0, 1.0, 1.0]
+def test_a_gap_counts_by_its_limit_and_by_how_well_it_is_known() -> None:
+    gaps = relative_gaps(
+        np.array([50.0, 50.0, 2.0, -25.0, -math.inf, 3.0, 0.0]),
+        np.array([25.0, 25.0, 0.0, 25.0, math.inf, 0.0, 0.0]),
+        np.array([0.0, 60.0, 4.0, 0.0, 1.0, 0.0, 0.0]),
+    )
+    assert gaps.tolist() == pytest.approx([2.0, 50.0 / 65.0, 0.5, -1.0, -math.inf, 10.0, 0.0])
+
+
+def test_a_relative_gap_has_no_unit() -> None:
+    values = np.array([30.0, -10.0]), np.array([25.0, 25.0]), np.array([7.0, 0.0])
+    larger = (1024.0 * each for each in values)
+    assert relative_gaps(*larger).tolist() == relative_gaps(*values).tolist()
 
 
 @pytest.mark.parametrize("rule", STARTS)
@@ -133,7 +144,7 @@ def test_no_limit_means_no_multiplier_and_leaves_no_trace(rule: str) -> None:
         "pid": lambda state, gaps: pid(
             state,
             gaps,
-            np.array([math.inf, 2.0]),
+            largest=2.0,
             proportional=0.1,
             integral=0.1,
             derivative=0.1,

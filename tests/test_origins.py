@@ -45,7 +45,10 @@ train_limits: 9
 run: {total_steps: 80, deploy_fraction: 0.5, num_envs: 2, rollout_steps: 10, evaluation_episodes: 2}
 """
 INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
-SENTENCE = "warning: 1 complete trial comes from other code than is installed now; launch --rerun-changed runs it again"
+SENTENCE = (
+    "warning: 1 complete trial comes from other code than is installed now; launch --rerun-changed runs it "
+    "again"
+)
 
 
 @pytest.fixture

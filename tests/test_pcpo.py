@@ -143,7 +143,7 @@ def improved(
     batch = LearningBatch.gather(observations, actions, compact=True)
     before, old = policy.parameters.to_numpy(), policy.distribution(batch.rows)
     length = math.nan if math.isnan(gaps[0]) else 10.0
-    constraints = Constraints(np.array(limits), np.array(gaps), length)
+    constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)
     experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
     metrics = improve_and_measure(rule_of(name, 2), policy, experience, np.random.default_rng(0))
     moved = old.divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]

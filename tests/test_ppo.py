@@ -52,7 +52,7 @@ def improved(
     """The metrics, and the policy's parameters afterwards."""
     policy, batch, advantages = sampled(space)
     length = math.nan if math.isnan(gaps[0]) else 10.0
-    constraints = Constraints(np.array(limits), np.array(gaps), length)
+    constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)
     experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
     rule = rule_of(name, policy, temperature)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
@@ -108,7 +108,7 @@ def test_with_a_temperature_a_step_is_as_long_as_the_gain_is_large_up_to_the_tru
 def test_where_no_action_is_better_trpo_stays() -> None:
     policy, batch, advantages = sampled(SPACES[0])
     before = policy.parameters.to_numpy()
-    constraints = Constraints(np.array([1.0]), np.array([0.0]), 10.0)
+    constraints = Constraints(np.array([1.0]), np.array([0.0]), np.zeros(1), 10.0)
     experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints, num_envs=1)
     metrics = improve_and_measure(rule_of("trpo", policy), policy, experience, np.random.default_rng(0))
     np.testing.assert_array_equal(policy.parameters.to_numpy(), before)
@@ -116,7 +116,7 @@ def test_where_no_action_is_better_trpo_stays() -> None:
     assert advantages.shape == (400, 3)
 
 
-UNKNOWN = Constraints(np.array([1.0, 1.0]), np.array([math.nan, math.nan]), math.nan)
+UNKNOWN = Constraints(np.array([1.0, 1.0]), np.array([math.nan, math.nan]), np.zeros(2), math.nan)
 
 
 def climbed(**options: object) -> tuple[float, bool, set[int]]:

@@ -9,7 +9,6 @@ from gymnasium.spaces import Discrete
 
 from recrl.agents.actor_critic import improve_and_measure
 from recrl.agents.advantages import scaled_advantages
-from recrl.agents.agent import Rollout
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import PPOLagConfig
 from recrl.agents.experience import Constraints, Experience
@@ -20,10 +19,11 @@ from recrl.agents.ppo_lag import GAINS, PPOLagrangian
 STATES = np.array([0, 0, 1, 1, 1, 2])
 ACTIONS = np.array([0, 1, 0, 1, 1, 0])
 ADVANTAGES = np.array([[1.0, 2.0], [-1.0, 0.0], [2.0, 1.0], [0.0, 0.0], [-3.0, 1.0], [1.0, 2.0]])
+EXCHANGE = float(ADVANTAGES[:, 0].std() / ADVANTAGES[:, 1].std())
 
 
 def measured(gap: float, limit: float = 5.0) -> Constraints:
-    return Constraints(np.array([limit]), np.array([gap]), 10.0)
+    return Constraints(np.array([limit]), np.array([gap]), np.zeros(1), 10.0)
 
 
 def fresh(**options: object) -> tuple[StochasticPolicy, PPOLagrangian, LearningBatch]:
@@ -54,23 +54,27 @@ def test_the_multiplier_answers_before_the_policy_moves() -> None:
 def test_equal_shares_of_the_limit_have_equal_multipliers_whatever_the_limit(rule: str) -> None:
     options = {"multiplier_rule": rule, "multiplier_step": 0.02, "multiplier_proportional": 0.0}
     found = [improved(share * 2.0, share, **options)["multiplier_0"] for share in (1.0, 5.0, 25.0)]
-    assert found == pytest.approx([0.04] * 3 if rule == "projected" else [0.02] * 3)  # PID sums up one limit
+    # Twice the limit too much; PID sums up one limit at most.
+    assert found == pytest.approx([0.04 * EXCHANGE if rule == "projected" else 0.02 * EXCHANGE] * 3)
 
 
 def test_a_pid_answers_half_a_limit_too_much_with_half_its_gain() -> None:
-    assert improved(2.5, 5.0)["multiplier_0"] == pytest.approx(0.5 * 1.0 + 0.5 * 0.1)
+    assert improved(2.5, 5.0)["multiplier_0"] == pytest.approx((0.5 * 1.0 + 0.5 * 0.1) * EXCHANGE)
 
 
 def test_without_a_finished_episode_the_multiplier_stays() -> None:
     policy, rule, batch = fresh(multiplier_initial=0.7)
-    unknown = Constraints(np.array([5.0]), np.array([math.nan]), math.nan)
-    assert improvement(rule, policy, batch, unknown)["multiplier_0"] == 0.7
+    unknown = Constraints(np.array([5.0]), np.array([math.nan]), np.zeros(1), math.nan)
+    assert improvement(rule, policy, batch, unknown)["multiplier_0"] == pytest.approx(0.7 * EXCHANGE)
 
 
 def test_a_pid_that_waits_still_answers_a_noisy_policys_violation_itself() -> None:
     policy, rule, batch = fresh(multiplier_waits=True)
-    gaps = (Constraints(np.array([5.0]), np.array([2.5]), 10.0, noisy) for noisy in (True, True, False))
-    found = [improvement(rule, policy, batch, gap)["multiplier_0"] for gap in gaps]
+    gaps = (
+        Constraints(np.array([5.0]), np.array([2.5]), np.zeros(1), 10.0, noisy)
+        for noisy in (True, True, False)
+    )
+    found = [improvement(rule, policy, batch, gap)["multiplier_0"] / EXCHANGE for gap in gaps]
     assert found == pytest.approx([0.5 * 1.0, 0.5 * 1.0, 0.5 * 1.0 + 0.5 * 0.1])
 
 
@@ -93,15 +97,14 @@ def test_a_reset_begins_the_multiplier_anew_only_when_the_limit_changes() -> Non
     assert found == pytest.approx([0.1, 0.2, 0.1, 0.2])
 
 
-def test_rewards_are_standardised_and_costs_scaled_as_the_form_says() -> None:
+def test_rewards_are_standardised_and_costs_divided_by_the_same_number() -> None:
     raw = np.array([[1.0, 4.0], [5.0, 10.0]])
-    rewards, costs = scaled_advantages(raw, "reward-scaled")
+    rewards, costs = scaled_advantages(raw)
     assert (rewards.tolist(), costs.tolist()) == ([-1.0, 1.0], [[-1.5], [1.5]])
-    assert scaled_advantages(raw, "centred")[1].tolist() == [[-3.0], [3.0]]
 
 
 def test_equal_rewards_are_no_division_by_zero() -> None:
-    rewards, _ = scaled_advantages(np.array([[1.0, 0.0], [1.0, 1.0]]), "reward-scaled")
+    rewards, _ = scaled_advantages(np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert rewards.tolist() == [0.0, 0.0]
 
 
@@ -124,7 +127,7 @@ def test_the_policy_climbs_the_penalised_advantages() -> None:
 
 def test_both_penalties_are_one_objective_before_anything_is_clipped() -> None:
     _, _, batch = fresh()
-    rewards, costs = scaled_advantages(ADVANTAGES, "reward-scaled")
+    rewards, costs = scaled_advantages(ADVANTAGES)
     ratios = 1.0 + 0.1 * torch.arange(len(batch.actions)) / 10.0
     combined, separate = (
         float(GAINS[penalty](batch, rewards, costs, np.array([2.0]), 0.2)(ratios))
@@ -146,11 +149,14 @@ def test_a_separate_penalty_is_not_clipped_by_hand() -> None:
     assert found["combined"] == pytest.approx(0.0)
 
 
-def test_the_mean_length_of_episodes_is_bounded_by_the_horizon() -> None:
-    zeros = np.zeros((10, 4))
-    rollout = Rollout(zeros, zeros, zeros, zeros[..., None], zeros, zeros, zeros, zeros, zeros)  # type: ignore[arg-type]
-    limits, one = np.array([1.0]), np.array([3.0])
-    assert Constraints.measure(rollout, 1, one, limits, None).episode_length == 40.0
-    assert Constraints.measure(rollout, 1, one, limits, 25).episode_length == 25.0
-    assert Constraints.measure(rollout, 1, one, limits, 25).gaps.tolist() == [2.0]
-    assert not Constraints.measure(rollout, 0, one, limits, 25).known
+def test_episodes_have_their_own_lengths_however_short_the_rollout() -> None:
+    lengths, costs = np.array([10, 30]), np.array([[2.0], [4.0]])
+    found = Constraints.measure(costs, lengths, np.array([3.0]), np.array([1.0]))
+    assert (found.episode_length, found.gaps.tolist(), found.standard_errors.tolist()) == (20.0, [2.0], [1.0])
+
+
+def test_without_an_episode_only_infinite_limits_are_known_to_be_kept() -> None:
+    nothing, unknown = np.empty((0, 2)), np.full(2, np.nan)
+    none = np.empty(0, np.int64)
+    assert not Constraints.measure(nothing, none, unknown, np.array([math.inf, 1.0])).known
+    assert Constraints.measure(nothing, none, unknown, np.array([math.inf, math.inf])).known

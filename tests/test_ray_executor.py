@@ -114,7 +114,10 @@ def test_equal_bytes_in_reused_workers_and_failures_stop_nobody(
     assert failed.error.startswith("ValidationError: ")
     crashed = store.trial(CRASHING).record()
     assert crashed.status is TrialState.FAILED
-    assert crashed.error.startswith("failures of its process: 1; the last: ActorDiedError: The actor died")
+    assert crashed.error == (
+        "its process failed once; the last time: it ended without a word: killed from outside, for want of "
+        "memory, or by the task's or the agent's own code"
+    )
     assert [path.name for path in store.folder.iterdir()] == ["trials"]
     assert capfd.readouterr().out == ""
 
@@ -312,6 +315,42 @@ def commands_running() -> Iterator[bytes]:
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):
             yield path.read_bytes()
+
+
+def listening_addresses(pids: set[int]) -> set[str]:
+    """The addresses, in the kernel's hexadecimal form, at which some processes take connections."""
+    sockets = set()
+    for pid in pids:
+        for link in Path(f"/proc/{pid}/fd").iterdir():
+            with suppress(OSError):
+                sockets.add(os.readlink(link))
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            _, local, _, state, *rest = line.split()
+            if state == "0A" and f"socket:[{rest[5]}]" in sockets:
+                found.add(local.partition(":")[0])
+    return found
+
+
+@pytest.mark.usefixtures("cluster")
+def test_nothing_of_a_cluster_of_ours_listens_beyond_this_machine() -> None:
+    worker = start_teacher_service("listening")
+    names = ("ray::", "raylet", "gcs_server")
+    pids = {os.getpid(), process_of(worker)}
+    for path in Path("/proc").glob("[0-9]*/comm"):
+        with suppress(OSError):
+            if path.read_text().startswith(names) and of_this_cluster(path.parent):
+                pids.add(int(path.parent.name))
+    assert len(pids) >= 6  # this process, head, node, two agents, a worker
+    mapped = "0000000000000000FFFF00000100007F"  # 127.0.0.1, in the table of IPv6
+    assert listening_addresses(pids) == {"0100007F", mapped}
+
+
+def of_this_cluster(process: Path) -> bool:
+    """Whether the process writes its log to the cluster's folder."""
+    folder = str(Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent)
+    return any(os.readlink(link).startswith(folder) for link in (process / "fd").iterdir())
 
 
 @pytest.mark.usefixtures("cluster")

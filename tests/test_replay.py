@@ -19,7 +19,7 @@ from recrl.orchestrator.trial import run_recorded
 SPEC = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
     agent=Choice("ppo-lag", {"hidden_sizes": [8], "policy_steps": 4, "critic_steps": 4}),
-    method=Choice("dynamic", {"window": 8, "start_updates": 3}),
+    method=Choice("dynamic", {"window": 8, "start_fraction": 0.1}),
     train_limits=CostLimits.unlimited(1),
     deploy_limits=CostLimits((1.0,)),
     train_steps=37 * 60 - 1,  # deployment begins within the last update

@@ -109,14 +109,25 @@ def test_an_infinite_start_is_measured_on_the_first_update() -> None:
     assert lesson.limits == CostLimits((60.0,))
 
 
-def test_a_start_is_measured_over_as_many_updates_as_asked_for() -> None:
-    curriculum = teacher("linear", train=(math.inf,), deploy=(20.0,), start_updates=2)
+def test_a_start_is_measured_for_as_large_a_share_of_the_training_as_asked_for() -> None:
+    curriculum = teacher("linear", train=(math.inf,), deploy=(20.0,), start_fraction=0.3)
     lesson, state = curriculum.start()
     lesson, state = curriculum.step(state, report(1, 25, [(60.0,), (120.0,)]))
     assert lesson.limits == CostLimits((math.inf,))
     lesson, state = curriculum.step(state, report(2, 50, [(120.0,)]))
     assert state["start_limits"] == [100.0]
     assert lesson.limits == CostLimits((60.0,))
+
+
+def test_a_start_is_the_most_expensive_window_of_32_episodes() -> None:
+    """The agent gets expensive as it learns, and then cheap again; the last window is not whole."""
+    curriculum = teacher("linear", train=(math.inf,), deploy=(20.0,), start_fraction=0.4)
+    _, state = curriculum.start()
+    for update, (number, cost) in enumerate([(20, 30.0), (12, 190.0), (32, 80.0), (31, 300.0)], start=1):
+        assert state["start_limits"] is None
+        lesson, state = curriculum.step(state, report(update, 10 * update, [(cost,)] * number))
+    assert state["start_limits"] == [90.0]
+    assert lesson.limits == CostLimits((62.0,))
 
 
 def test_measuring_goes_on_until_an_episode_has_finished() -> None:
@@ -130,7 +141,7 @@ def test_measuring_goes_on_until_an_episode_has_finished() -> None:
 
 
 def test_a_measured_start_is_at_least_d_d_and_leaves_finite_dimensions_alone() -> None:
-    curriculum = teacher("linear", train=(math.inf, 100.0), deploy=(20.0, 0.0), start_updates=2)
+    curriculum = teacher("linear", train=(math.inf, 100.0), deploy=(20.0, 0.0), start_fraction=0.3)
     _, state = curriculum.start()
     lesson, state = curriculum.step(state, report(1, 25, [(3.0, 7.0)]))
     assert lesson.limits == CostLimits((math.inf, 75.0))

@@ -19,9 +19,9 @@ from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherS
 # Every teacher under its defaults, and the dynamic one also where its settings lead elsewhere.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in TEACHERS),
-    ("linear", {"start_updates": 3}),
+    ("linear", {"start_fraction": 0.1}),
     ("dynamic", {"window": 1, "return_tolerance": 1.0, "cost_tolerance": 1.0}),
-    ("dynamic", {"window": 2, "window_unit": "episodes", "start_updates": 0}),
+    ("dynamic", {"window": 2, "window_unit": "episodes", "start_fraction": 0.0}),
     ("dynamic", {"preset": "paper", "window": 2, "return_tolerance": 0.5}),
     ("annealed", {"measured_at": 0.3, "arrival": 1.0, "noise_hold": 0.5, "noise_end": 0.5}),
 ]

@@ -83,8 +83,8 @@ def test_an_unknown_option_is_refused(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("linear", {"start_updates": 0}),
-        ("dynamic", {"start_updates": -1}),
+        ("linear", {"start_fraction": 0.0}),
+        ("dynamic", {"start_fraction": -0.1}),
         ("dynamic", {"window": 0}),
         ("dynamic", {"window_unit": "steps"}),
         ("dynamic", {"return_tolerance": -0.1}),

@@ -114,7 +114,7 @@ def test_physics_and_maps_interrupted_equal_themselves_uninterrupted(
         SPEC,
         task=Choice(task, {"horizon": 25}),
         agent=Choice(agent, QUICK),
-        method=Choice("dynamic", {"window": 2, "start_updates": 1}),
+        method=Choice("dynamic", {"window": 2, "start_fraction": 0.01}),
         train_steps=7 * 60,
     )
     assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 3, 0))

@@ -171,3 +171,62 @@ def test_action_spaces_that_no_student_handles_are_refused(space: spaces.Space[A
 def test_an_unknown_gymnasium_id_is_found_when_options_are_checked() -> None:
     with pytest.raises(ValueError, match="CartPoole"):
         task_options("gymnasium", {"id": "CartPoole-v1"})
+
+
+@pytest.mark.parametrize(
+    "identifier", ["recrl.environments.safety_gym:recrl/CarGoal2-v0", "gymnasium.envs:CartPole-v1"]
+)
+def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
+    costless = "CartPole" in identifier
+    options = {"id": identifier, "costless": costless}
+    assert task_options("gymnasium", options).model_dump()["id"] == identifier
+    environments = make_vector("gymnasium", 2, options=options)
+    observations, _ = environments.reset(seed=0)
+    assert observations.shape == (2, *environments.single_observation_space.shape)
+    assert environments.step(np.stack([environments.single_action_space.sample()] * 2))[4]["cost"].shape == (
+        2,
+        1,
+    )
+    environments.close()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        (
+            "observation",
+            np.array([np.nan]),
+            "wrong: an observation must be finite, got ndarray of shape ",
+        ),
+        ("observation", np.zeros(2), "wrong: an observation must lie in Box("),
+        ("observation", None, "wrong: an observation must lie in Box("),
+        ("reward", np.inf, "wrong: a reward must be finite, got inf"),
+        ("reward", None, "wrong: a reward must be a number, got None"),
+        ("cost", -1.0, "wrong: info['cost'] must be at least 0, got -1.0"),
+        ("cost", "x", "wrong: info['cost'] must be a finite number for each of cost, got x"),
+    ],
+)
+def test_what_an_environment_returns_is_looked_at(field: str, value: Any, sentence: str) -> None:
+    returned: dict[str, Any] = {"observation": np.zeros(1), "reward": 0.0, "cost": 0.0, field: value}
+
+    class Wrong(gymnasium.Env[Any, Any]):
+        observation_space = spaces.Box(-1.0, 1.0, (1,))
+        action_space = spaces.Discrete(2)
+
+        def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+            return np.zeros(1), {}
+
+        def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+            info = {"cost": returned["cost"]}
+            return returned["observation"], returned["reward"], False, False, info
+
+    environments = SyncCMDPVectorEnv("wrong", [Wrong])
+    environments.reset(seed=0)
+    with pytest.raises(ValueError) as caught:
+        environments.step(np.array([0]))
+    assert str(caught.value).startswith(sentence)
+
+
+def test_a_factory_that_makes_no_environment_is_named() -> None:
+    with pytest.raises(ValueError, match=r"^os:getpid must return a Gymnasium environment, got int 3$"):
+        SyncCMDPVectorEnv("os:getpid", [lambda: 3])  # type: ignore[list-item, return-value]

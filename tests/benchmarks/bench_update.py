@@ -155,6 +155,7 @@ def distinct_rollout(samples: int, generator: np.random.Generator) -> Rollout:
         final_observations=observations[-1],
         last_observations=observations[0],
         carried_costs=np.zeros((shape[1], 1)),
+        carried_lengths=np.zeros(shape[1], np.int64),
     )
 
 

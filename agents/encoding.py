@@ -1,0 +1,143 @@
+"""What an agent's networks see of an observation: its numbers, and features that they would not learn.
+
+Proximity. A lidar number v says how near the closest object of a kind is in one direction: it is at the
+distance (1 - v) r, r the lidar's range, and v = 0 where nothing is in range. Safety Gym's range is 3 m and
+its hazards have a radius of 0.2 m, so all that matters for the cost happens in the last 7% of v, in any of 16
+directions. A perceptron that is fitted to raw values predicts nothing of the cost to come. So for each lidar
+number and each length scale l the networks also see
+
+    exp(-(1 - v) r / l)    for v > 0,    0 for v = 0.
+
+Which numbers are a lidar, and its range, is what the task declares (``CMDPSpec.components``); without such a
+declaration, or with ``encoder: none``, networks see observations as they are.
+
+Normalisation. With ``normalise_observations`` each number is standardised by its mean and standard deviation
+over all observations of training so far, and clipped. The statistics are updated after each policy update,
+so that a rollout is learnt from as it was acted on; a policy that does not learn keeps them.
+
+Notation: N observations, n numbers in each, L lidar numbers, S length scales.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats, ObservationComponent
+
+Rows = npt.NDArray[np.float32]
+
+CLIP = 10.0
+"""Standard deviations beyond which a normalised number is clipped."""
+SMALLEST_VARIANCE = 1e-8
+"""Added to variances, so that a number that never changes becomes 0."""
+
+
+class RunningMoments:
+    """Mean and variance of each of n numbers over all observations seen (Chan, Golub and LeVeque 1983).
+
+    Args:
+        size: n.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._count = 0
+        self._mean: Floats = np.zeros(size)
+        self._scatter: Floats = np.zeros(size)
+
+    def add(self, observations: Rows) -> None:
+        """Include N more observations, [N, n]."""
+        count, mean = len(observations), observations.mean(axis=0, dtype=np.float64)
+        scatter = ((observations - mean) ** 2).sum(axis=0)
+        total, offset = self._count + count, mean - self._mean
+        self._mean = self._mean + offset * (count / total)
+        self._scatter = self._scatter + scatter + offset**2 * (self._count * count / total)
+        self._count = total
+
+    def standardised(self, observations: Rows) -> Rows:
+        """Observations [N, n] minus the mean, over the standard deviation, clipped to +-10."""
+        if self._count == 0:
+            return observations
+        spread = np.sqrt(self._scatter / self._count + SMALLEST_VARIANCE)
+        clipped = np.clip((observations - self._mean) / spread, -CLIP, CLIP)
+        return clipped.astype(np.float32)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The count, the means and the sums of squared deviations."""
+        return {"count": self._count, "mean": self._mean.copy(), "scatter": self._scatter.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._count = int(state["count"])
+        self._mean = np.array(state["mean"], np.float64)
+        self._scatter = np.array(state["scatter"], np.float64)
+
+
+class Encoder:
+    """Turns observations into what the networks see; the module's docstring says how.
+
+    Args:
+        num_observations: n.
+        components: the parts of an observation as the task declares them; none if it does not.
+        scales: length scales l of the proximity features in metres, each above 0; none for no features.
+        normalise: whether to standardise observations by running statistics.
+
+    Attributes:
+        size: numbers that the networks see, n + S L.
+    """
+
+    def __init__(
+        self,
+        num_observations: int,
+        components: Sequence[ObservationComponent],
+        *,
+        scales: Sequence[float],
+        normalise: bool,
+    ) -> None:
+        self._lidar, ranges = lidar_numbers(components)
+        self._rates = [(ranges / scale).astype(np.float32) for scale in scales] if len(ranges) else []
+        self._moments = RunningMoments(num_observations) if normalise else None
+        self._is_identity = not self._rates and not normalise
+        self.size = num_observations + len(self._rates) * len(ranges)
+
+    def __call__(self, observations: Rows) -> Rows:
+        """Encode observations, [N, n] -> [N, ``size``]."""
+        if self._is_identity:
+            return observations
+        kept = observations if self._moments is None else self._moments.standardised(observations)
+        if not self._rates:
+            return kept
+        values = observations[:, self._lidar]
+        seen, beyond = values > 0.0, values - np.float32(1.0)
+        return np.concatenate([kept, *(np.exp(beyond * rate) * seen for rate in self._rates)], axis=1)
+
+    def learn(self, observations: Rows) -> None:
+        """Include the observations of a rollout, [N, n], in the running statistics, if there are any."""
+        if self._moments is not None:
+            self._moments.add(observations)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The running statistics; empty without normalisation."""
+        return {} if self._moments is None else self._moments.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        if self._moments is not None:
+            self._moments.load_state_dict(state)
+
+
+def lidar_numbers(components: Sequence[ObservationComponent]) -> tuple[npt.NDArray[np.intp], Floats]:
+    """The places of all lidar numbers in an observation, [L], and the range of each in metres, [L].
+
+    >>> parts = (ObservationComponent("speed", 2), ObservationComponent("walls", 2, lidar_range=3.0))
+    >>> [values.tolist() for values in lidar_numbers(parts)]
+    [[2, 3], [3.0, 3.0]]
+    """
+    ranges = np.concatenate(
+        [np.empty(0), *(np.full(part.size, part.lidar_range or 0.0) for part in components)]
+    )
+    places = np.flatnonzero(ranges)
+    return places, ranges[places]

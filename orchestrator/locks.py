@@ -1,0 +1,53 @@
+"""Lock files that are opened without being led elsewhere.
+
+Folders of results are shared and copied: where the lock's name is a symbolic link, whoever truncates the lock
+would empty the file that it points to.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import IO
+
+from recrl.orchestrator.errors import StorageError
+
+FLAGS = os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
+
+
+def open_lock(path: Path) -> IO[str]:
+    """Open a lock for reading and writing, at its end; make it if it is not there.
+
+    Raises:
+        StorageError: it is a link, a folder or no file at all.
+    """
+    return os.fdopen(_opened(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "a+")
+
+
+def look_at_lock(path: Path) -> IO[str]:
+    """Open a lock for reading.
+
+    Raises:
+        FileNotFoundError: there is none.
+        StorageError: it is a link, a folder or no file at all.
+    """
+    return os.fdopen(_opened(path, os.O_RDONLY), "r")
+
+
+def _opened(path: Path, flags: int) -> int:
+    try:
+        descriptor = os.open(path, flags | FLAGS, 0o644)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise
+        raise _no_lock(path) from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _no_lock(path)
+    return descriptor
+
+
+def _no_lock(path: Path) -> StorageError:
+    return StorageError(f"{path}: is a lock, and must be a file and no link; delete it if nothing runs there")
