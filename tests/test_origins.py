@@ -80,13 +80,13 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     change(folder)
     (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1"))
     capsys.readouterr()
-    assert main(["plan", "grid.yaml"]) == ExitCode.OK
+    assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
     assert SENTENCE in capsys.readouterr().out.splitlines()
     assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
     capsys.readouterr()
     assert main(["status", "--brief"]) == ExitCode.OK
     assert SENTENCE in capsys.readouterr().out.splitlines()
-    assert main(["evaluate", "small", "--policy", "stochastic"]) == ExitCode.OK
+    assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
     assert f"{SENTENCE}; here their policies met the present code" in capsys.readouterr().out.splitlines()
     assert SENTENCE.removeprefix("warning: ") in report.missing(frames.load(store))
 
