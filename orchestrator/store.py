@@ -287,7 +287,13 @@ class SweepStore:
         self.folder.mkdir(parents=True, exist_ok=True)
         lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs).encode()
         of_lines, of_grid = Extent.of(lines).sha256, Extent.of(grid_text).sha256
-        told = {"name": self.name, "trials": len(specs), "lines": of_lines, "grid": of_grid}
+        told = {
+            "name": self.name,
+            "created": self._created(),
+            "trials": len(specs),
+            "lines": of_lines,
+            "grid": of_grid,
+        }
         header = sealed(told, version=SPECS_FORMAT)
         if grid_text:
             write_atomically(self.grid_path, grid_text)
@@ -329,9 +335,17 @@ class SweepStore:
         told = {key: value for key, value in header.items() if key not in ("format", "sha256")}
         if header != sealed(told, version=SPECS_FORMAT) or Extent.of(lines).sha256 != told["lines"]:
             raise DamagedError(f"{name} is not what was written: its checksum differs")
-        if told["name"] != self.name:
-            raise DamagedError(f"{name} is that of another sweep, {told['name']}")
+        created = self._created()
+        if told["name"] != self.name or (created and told["created"] not in (None, created)):
+            raise DamagedError(f"{name} is not of this sweep, or {self.info_path.name} is not")
         return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
+
+    def _created(self) -> float | None:
+        """When the sweep was first launched, seconds since 1970; None if nobody knows."""
+        try:
+            return self.info().get("created")
+        except StorageError:
+            return None
 
     def _was_launched(self) -> bool:
         try:
@@ -617,9 +631,9 @@ class TrialStore:
     def _short(self, record: TrialRecord) -> StorageError | None:
         """What is wrong with the lengths of the committed files, if anything is."""
         for name, length in record.committed.items():
-            if length == 0:
-                continue
             path = self.folder / name
+            if length == 0 and not path.is_dir():
+                continue
             try:
                 found = path.stat().st_size
             except FileNotFoundError:

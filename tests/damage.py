@@ -31,7 +31,7 @@ from recrl.orchestrator.cli import main as recrl_sweep
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.grid import read_grid
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.store import SweepStore
+from recrl.orchestrator.store import SweepStore, TrialStore
 from recrl.orchestrator.sweep import launch
 from recrl.orchestrator.tracking import sync, tracking_uri
 from recrl.orchestrator.trial import run_recorded
@@ -179,7 +179,7 @@ class Damage:
                 if self.kind == "a folder":
                     path.mkdir()
                     (path / "something").touch()
-                return True
+                return bool(before) or self.kind == "a folder"
         return path.read_bytes() != before
 
     def _others(self, folder: Path, other: Path) -> bytes:
@@ -346,11 +346,11 @@ def _wrong_tables(whole: dict[str, list[str]], found: dict[str, list[str]]) -> s
 def _wrong_results(whole: Path, found: Path) -> str:
     """Which results differ from those of the sweep that nobody damaged."""
     root = whole / "runs" / NAME / "trials"
-    for trial in sorted(root.iterdir()):
+    for folder in sorted(root.iterdir()):
+        one, other = TrialStore(folder), TrialStore(found / "runs" / NAME / "trials" / folder.name)
         for name in RESULTS:
-            one, other = trial / name, found / "runs" / NAME / "trials" / trial.name / name
-            if one.exists() and (not other.is_file() or one.read_bytes() != other.read_bytes()):
-                return f"{trial.name}/{name} is not what an undamaged sweep has"
+            if one.committed_bytes(folder / name) != other.committed_bytes(other.folder / name):
+                return f"{folder.name}/{name} is not what an undamaged sweep has"
     return ""
 
 
@@ -365,22 +365,26 @@ def damages_of(sweep: Sweep, generator: np.random.Generator) -> Iterator[Damage]
             yield Damage(path, kind, float(generator.uniform()), int(generator.integers(1, 256)))
 
 
-def run(folder: Path, *, cases: int, seed: int) -> tuple[int, list[str]]:
-    """Do at least so many cases; returns how many, and a sentence for each that is wrong.
-
-    Args:
-        folder: an empty one, to work in.
-        cases: at least 1.
-        seed: of places and bits.
-    """
-    generator = np.random.default_rng(seed)
+def prepared(folder: Path) -> list[Sweep]:
+    """Make the sweeps to damage, a complete and an interrupted one, in an empty folder."""
     other = make(folder / "other", interrupted=False, limit=0.75)
     commands = {**READING, **SLOW}
     make_database(folder)
-    sweeps = [
+    return [
         undamaged(make(folder / "complete", interrupted=False), other, commands),
         undamaged(make(folder / "interrupted", interrupted=True), other, commands),
     ]
+
+
+def run(sweeps: Sequence[Sweep], *, cases: int, seed: int) -> tuple[int, list[str]]:
+    """Do at least so many cases; returns how many, and a sentence for each that is wrong.
+
+    Args:
+        sweeps: of ``prepared``.
+        cases: at least 1.
+        seed: of places and bits, and of which damages the slow commands and launches meet.
+    """
+    generator, commands = np.random.default_rng(seed), {**READING, **SLOW}
     done, wrong = 0, list[str]()
     while True:
         for sweep in sweeps:
@@ -406,7 +410,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        done, wrong = run(Path(name), cases=arguments.cases, seed=arguments.seed)
+        done, wrong = run(prepared(Path(name)), cases=arguments.cases, seed=arguments.seed)
     print(f"seed {arguments.seed}: {done} cases, {len(wrong)} wrong")
     return 1 if wrong else 0
 
