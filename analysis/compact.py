@@ -2,7 +2,7 @@
 
 A zip archive of plain text, so that any tool can open it:
 
-    sweep.json         name, notes, grid file, and the trials: spec, standing, provenance
+    sweep.json         name, notes, grid file, the trials (spec, standing, provenance), digests of the tables
     phases.csv, ...    the other frames of ``recrl.analysis.frames`` but KEY: ``trial`` is the position of the
                        trial in sweep.json
 
@@ -38,14 +38,17 @@ from recrl.analysis.frames import (
 )
 from recrl.environments.registry import TASKS, task_options
 from recrl.orchestrator.archives import UNREADABLE, unpacked
-from recrl.orchestrator.errors import RecrlError, missing
+from recrl.orchestrator.errors import DamagedError, RecrlError, missing
 from recrl.orchestrator.foreign import LimitValues, checked_name
+from recrl.orchestrator.row_files import Extent
+from recrl.orchestrator.small_files import write_atomically
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.store import EVALUATION_COLUMNS, UPDATE_COLUMNS, write_atomically
+from recrl.orchestrator.store import EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.validation import sentences
 
 SUFFIX = ".zip"
-FORMAT = 1
+FORMAT = 2
+WITHOUT_DIGESTS = 1  # the format before: its tables are read as they are
 DIGITS = 6
 ROUNDED = ("updates", "policies")
 MAX_BYTES = 512 * 2**20  # unpacked; about 50 times the largest sweep so far
@@ -78,14 +81,17 @@ def save(sweep: Sweep, path: Path) -> Path:
     Raises:
         RecrlError: nobody would read it back, as it is too large, or its folder cannot be made.
     """
-    members = {"sweep.json": json.dumps(_told(sweep), indent=1, allow_nan=False) + "\n"}
+    tables = {}
     for name in ROWS:
         rows = sweep.rows(name)
         if name == "updates":
             rows = rows[[TRIAL, *drawn_columns(map(str, rows))]]
-        members[f"{name}.csv"] = (_rounded(rows) if name in ROUNDED else rows).to_csv(
+        tables[f"{name}.csv"] = (_rounded(rows) if name in ROUNDED else rows).to_csv(
             index=False, lineterminator="\n"
         )
+    digests = {name: Extent.of(text.encode()).sha256 for name, text in tables.items()}
+    told = json.dumps({**_told(sweep), "digests": digests}, indent=1, allow_nan=False) + "\n"
+    members = {"sweep.json": told, **tables}
     size = sum(len(text.encode()) for text in members.values())
     if size > MAX_BYTES:
         raise RecrlError(f"{path}: a compact file may unpack to {MAX_BYTES} bytes, this one has {size}")
@@ -119,10 +125,13 @@ def load(path: Path) -> Sweep:
         reason = getattr(error, "strerror", None) or error
         raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({reason})") from error
     found = told.get("format") if isinstance(told, dict) else None
-    if found != FORMAT:
-        raise RecrlError(f"{path}: its format must be {FORMAT}, got {found!r:.60}")
+    if found not in (FORMAT, WITHOUT_DIGESTS):
+        raise RecrlError(f"{path}: its format must be {FORMAT} or {WITHOUT_DIGESTS}, got {found!r:.60}")
     try:
         checked = _SweepFile.model_validate(told)
+        for name, data in zip(names[1:], frames, strict=True):
+            if found == FORMAT and Extent.of(data).sha256 != checked.digests.get(name):
+                raise DamagedError(f"{path}: its {name} is not what was written; export the sweep again")
         facts = [_facts(trial, checked.provenance) for trial in told["trials"]]
         for name, frame in rows.items():
             _check_rows(name, frame, facts)
@@ -144,7 +153,7 @@ class _TrialFile(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     spec: dict[str, Any]
-    status: Literal["waiting", "running", "complete", "failed"]
+    status: Literal["waiting", "running", "complete", "failed", "damaged"]
     error: str
     env_steps: int = Field(ge=0, le=10**15)
     cpu_seconds: float = Field(ge=0, le=1e12)
@@ -162,6 +171,7 @@ class _SweepFile(BaseModel):
     grid: str
     provenance: list[str]
     trials: list[_TrialFile]
+    digests: dict[str, str] = Field(default_factory=dict)
 
 
 def _check_task(name: str, options: dict[str, Any]) -> None:

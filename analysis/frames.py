@@ -31,10 +31,11 @@ Episode files can hold 500,000 rows a trial. ``load`` reads them one at a time a
 
 from __future__ import annotations
 
+import logging
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -45,7 +46,7 @@ import pandas as pd
 from recrl.environments.cmdp import Phase
 from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.environments.registry import optimal_return
-from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
 from recrl.orchestrator.foreign import checked_name
 from recrl.orchestrator.phase_totals import phase_totals
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -102,6 +103,9 @@ UNKNOWN_OPTIMUM = "the optimum is unknown here, because"
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
 
 
+logger = logging.getLogger("recrl.frames")
+
+
 @dataclass(frozen=True)
 class TrialFacts:
     """What is known of a trial as a whole.
@@ -113,7 +117,8 @@ class TrialFacts:
         env_steps: environment steps taken so far.
         cpu_seconds: CPU time so far.
         start_limits: the d_t that its teacher measured, [k], or None.
-        provenance: versions, commit and machine as its file has them; empty if unknown.
+        provenance: of each attempt versions, commit, machine and digests of the code, as its file has them;
+            empty if unknown.
     """
 
     spec: TrialSpec
@@ -186,23 +191,24 @@ class Sweep:
 def load(store: SweepStore) -> Sweep:
     """Read a finished or running sweep: the trials of its last launch, or else all that are on disk.
 
+    Every file is held against its committed length and digest. Of a damaged trial there is only its row in
+    ``trials``, with the status ``damaged`` and a sentence in ``error``.
+
     Args:
         store: the sweep's folder.
+
+    Raises:
+        DamagedError: the file that lists the trials is damaged.
     """
     specs, trials = _trials(store)
-
-    def rows(of: Callable[[TrialStore], pd.DataFrame]) -> pd.DataFrame:
-        return joined([of(trial) for trial in trials])
-
+    read = [_read(spec, trial) for spec, trial in zip(specs, trials, strict=True)]
+    grid, problem = store.grid_text()
     return assemble(
         store.name,
-        [_facts(spec, trial) for spec, trial in zip(specs, trials, strict=True)],
-        phases=rows(_phase_rows),
-        updates=rows(TrialStore.updates),
-        evaluations=rows(TrialStore.evaluation),
-        events=rows(_event_rows),
-        policies=rows(_policy_rows),
-        grid=store.grid_path.read_text(encoding="utf-8") if store.grid_path.exists() else "",
+        [facts for facts, _ in read],
+        **{name: joined([rows[name] for _, rows in read]) for name in ROWS},
+        grid=grid,
+        notes=[problem] if problem else [],
     )
 
 
@@ -219,7 +225,11 @@ def load_episodes(
     specs, trials = _trials(store)
 
     def rows(trial: TrialStore) -> pd.DataFrame:
-        episodes = trial.episodes()
+        try:
+            episodes = trial.episodes()
+        except DamagedError as error:
+            logger.warning("%s; its episodes are left out", error)
+            return pd.DataFrame()
         if phase is not None and len(episodes):
             episodes = episodes[episodes["phase"] == phase.value]
         return episodes if columns is None else episodes.reindex(columns=list(columns))
@@ -449,22 +459,32 @@ def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialStore]]:
     return specs, [store.trial(spec) for spec in specs]
 
 
-def _facts(spec: TrialSpec, trial: TrialStore) -> TrialFacts:
-    record, path = trial.record(), trial.provenance_path
-    return TrialFacts(
-        spec=spec,
-        status=record.status,
-        error=record.error,
-        env_steps=record.env_steps,
-        cpu_seconds=record.cpu_seconds,
-        start_limits=record.start_limits,
-        provenance=path.read_text(encoding="utf-8") if path.exists() else "",
-    )
-
-
-def _phase_rows(trial: TrialStore) -> pd.DataFrame:
-    episodes = trial.episodes()  # none where the trial was never started: then it has no spec on disk
-    return pd.DataFrame(phase_totals(episodes, trial.spec.deploy_limits.values) if len(episodes) else [])
+def _read(spec: TrialSpec, trial: TrialStore) -> tuple[TrialFacts, dict[str, pd.DataFrame]]:
+    """A trial's facts and its rows of the frames ROWS; none of a damaged one."""
+    record = trial.record()
+    if record.status is not TrialState.DAMAGED:
+        try:
+            rows = {
+                "phases": pd.DataFrame(phase_totals(trial.episodes(), spec.deploy_limits.values)),
+                "updates": trial.updates(),
+                "evaluations": trial.evaluation(),
+                "events": _event_rows(trial),
+                "policies": _policy_rows(trial),
+            }
+            facts = TrialFacts(
+                spec=spec,
+                status=record.status,
+                error=record.error,
+                env_steps=record.env_steps,
+                cpu_seconds=record.cpu_seconds,
+                start_limits=record.start_limits,
+                provenance=trial.committed_bytes(trial.provenance_path).decode(),
+            )
+            return facts, rows
+        except DamagedError as error:
+            record = replace(record, error=str(error).removeprefix(f"{trial.folder.name}: "))
+    damaged = TrialFacts(spec=spec, status=TrialState.DAMAGED, error=record.error)
+    return damaged, {name: pd.DataFrame() for name in ROWS}
 
 
 def _event_rows(trial: TrialStore) -> pd.DataFrame:

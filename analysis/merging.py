@@ -23,9 +23,9 @@ NAMED = 3  # trials that a note names, at most
 def merge(parts: Sequence[Sweep]) -> Sweep:
     """All trials of some sweeps, each once, as the part has it that got furthest with it.
 
-    A complete trial is further than any other; then its steps count, then whether it was begun; of equals the
-    first part is taken. Two parts can have completed a trial with different outcomes, as other machines and
-    versions round differently; then a note says so.
+    A damaged trial is less far than any other, a complete one further; then its steps count, then whether it
+    was begun; of equals the first part is taken. Two parts can have completed a trial with different
+    outcomes, as other machines and versions round differently; then a note says so.
 
     Args:
         parts: at least one. The first gives the name and the grid file; its trials come first, then those
@@ -52,8 +52,13 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
     )
 
 
-def _reached(trial: TrialFacts) -> tuple[bool, int, bool]:
-    return trial.status is TrialState.COMPLETE, trial.env_steps, trial.status is not TrialState.WAITING
+def _reached(trial: TrialFacts) -> tuple[bool, bool, int, bool]:
+    return (
+        trial.status is not TrialState.DAMAGED,
+        trial.status is TrialState.COMPLETE,
+        trial.env_steps,
+        trial.status is not TrialState.WAITING,
+    )
 
 
 def _taken(parts: Sequence[Sweep], name: str, taken: Mapping[str, int]) -> pd.DataFrame:

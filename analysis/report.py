@@ -43,6 +43,7 @@ from recrl.analysis import claims, figures, metrics, page, styles, tables
 from recrl.analysis.bound_figure import cumulative_bounds
 from recrl.analysis.cumulative import bound_table, cumulative_costs
 from recrl.analysis.diagnostics import curriculum_diagnostics
+from recrl.analysis.doubts import doubts
 from recrl.analysis.frames import GROUP, Sweep, ordered
 from recrl.analysis.frontier import return_against_cost
 from recrl.analysis.intervals import ENOUGH_RUNS
@@ -215,8 +216,9 @@ def _safe(label: str) -> str:
 
 def missing(sweep: Sweep) -> list[str]:
     """Sentences on what a reader might take for complete but is not; empty for a whole sweep."""
-    sentences = list(sweep.notes)
+    sentences = [*sweep.notes, *doubts(sweep)]
     for status, what in (
+        (TrialState.DAMAGED, "damaged"),
         (TrialState.FAILED, "failed"),
         (TrialState.RUNNING, "still running"),
         (TrialState.WAITING, "waiting to be run"),
@@ -302,7 +304,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str
 
 def _html(sweep: Sweep, pictures: list[Path], shown: list[tuple[str, pd.DataFrame]]) -> str:
     """The page: what is missing, figures, tables, settings, provenance."""
-    failed = bool((sweep.trials["status"] == TrialState.FAILED.value).any())
+    failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
     sections = []
     if sentences := missing(sweep):
         sections.append(Section("To be known", page.items(sentences, failed=failed)))

@@ -18,7 +18,8 @@ import safetensors.numpy
 
 from recrl.orchestrator.errors import CheckpointError
 
-MAGIC = b"recrl checkpoint 1\n"
+MAGIC = b"recrl checkpoint 2\n"
+_ANY_MAGIC = b"recrl checkpoint "
 _ARRAY = "__array__"
 
 
@@ -44,6 +45,12 @@ def decode(data: bytes, *, source: str) -> dict[str, Any]:
     Raises:
         CheckpointError: the bytes are not an intact checkpoint of this version.
     """
+    if data.startswith(_ANY_MAGIC) and not data.startswith(MAGIC):
+        number = data[len(_ANY_MAGIC) :].split(b"\n", 1)[0][:8].decode(errors="replace")
+        raise CheckpointError(
+            f"{source}: the checkpoint has format {number}, of another version of recrl, and this one reads "
+            f"format {MAGIC[len(_ANY_MAGIC) :].decode().strip()}"
+        )
     if not data.startswith(MAGIC):
         raise CheckpointError(f"{source}: not a checkpoint of this version of recrl")
     digest, payload = data[len(MAGIC) : len(MAGIC) + 32], data[len(MAGIC) + 32 :]

@@ -45,6 +45,7 @@ Going on:
   recrl-sweep stop demo                   from another terminal: trials save where they are, the launch ends
   recrl-sweep logs demo 3f2a --follow     a trial's log, by the beginning of its id or title
   recrl-sweep evaluate demo 3f2a --video  run its policy again, and film an episode
+  recrl-sweep check demo                  are all files what was committed? one line for each that is not
   recrl-sweep launch grids/demo.yaml --retry-failed
   recrl-sweep launch grids/demo.yaml --only method=dynamic task=rivergrid-1b
   recrl-sweep launch grids/demo.yaml --address auto --storage s3://bucket/folder
@@ -52,7 +53,7 @@ Going on:
 
 Exit codes:
   0    done, or nothing to do
-  1    some trials failed or could not be finished
+  1    some trials failed, are damaged or could not be finished
   2    the grid or the arguments are wrong; nothing was started
   3    another process is running this sweep
   4    Ray, MLflow or the storage could not be reached, or files could not be written
@@ -108,6 +109,10 @@ def parser() -> argparse.ArgumentParser:
     status = _command(commands, "status", "say how far a sweep is, from its files alone")
     _add_sweep(status)
     status.add_argument("--brief", action="store_true", help="one line, without the table of trials")
+
+    _add_sweep(
+        _command(commands, "check", "hold every file of a sweep against its committed length and digest")
+    )
 
     _add_sweep(
         _command(commands, "stop", "ask the launch that runs a sweep to save its trials and end, and wait")
@@ -476,6 +481,16 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
     _add_only(command)
     command.add_argument(
         "--retry-failed", action="store_true", help="try failed trials again, from their last checkpoint"
+    )
+    command.add_argument(
+        "--rerun-damaged",
+        action="store_true",
+        help="run damaged trials again that were complete or had failed; others are by themselves",
+    )
+    command.add_argument(
+        "--rerun-changed",
+        action="store_true",
+        help="run trials again that ran other code than is installed now; what they left is kept aside",
     )
     command.add_argument(
         "--max-concurrent",

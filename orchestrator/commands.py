@@ -26,6 +26,7 @@ from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.orchestrator import display
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
+    DamagedError,
     RecrlError,
     StorageError,
     TrackingError,
@@ -35,11 +36,12 @@ from recrl.orchestrator.errors import (
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import GridSpec, read_grid, read_name
+from recrl.orchestrator.origins import has_other_code, no_curriculum_sentence, other_code_sentence
 from recrl.orchestrator.plan import Plan, estimate, make_plan, select, trials_at_once
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.redaction import shown as text_shown
 from recrl.orchestrator.refresh import refreshing
-from recrl.orchestrator.spec import Choice, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
 from recrl.orchestrator.store import SweepStore, TrialStore
 from recrl.orchestrator.sweep import (
@@ -94,11 +96,23 @@ def run_plan(arguments: argparse.Namespace, console: Console) -> ExitCode:
     storage = _storage(store, arguments.storage)
     if storage is not None:
         _pull(storage, store)
-    plan = make_plan(grid.trials(), store, only=_only(arguments.only), retry_failed=arguments.retry_failed)
+    plan = make_plan(
+        grid.trials(),
+        store,
+        only=_only(arguments.only),
+        retry_failed=arguments.retry_failed,
+        rerun_damaged=arguments.rerun_damaged,
+        rerun_changed=arguments.rerun_changed,
+    )
     at_once, where = _room(grid, arguments)
     console.print(display.plan_table(plan))
     _say(console, "")
     _say_plan(plan, grid, console, at_once=at_once, where=where)
+    for line in display.damages_of_plan(plan):
+        _say(console, line)
+    _say_other_code(plan, console)
+    for problem in store.damages():
+        _say(console, f"damaged: {problem}")
     for orphan in plan.orphans:
         _say(console, f"not in the grid any more, left alone: {_short(orphan.folder)}")
     return ExitCode.TRIALS_LEFT if arguments.check and plan.to_do else ExitCode.OK
@@ -143,6 +157,8 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
             stop=stop,
             only=only,
             retry_failed=arguments.retry_failed,
+            rerun_damaged=arguments.rerun_damaged,
+            rerun_changed=arguments.rerun_changed,
             storage=storage,
             start_mirror=_mirror_to(uri) if uri else None,
             watch=watch,
@@ -158,13 +174,53 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
 def run_status(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Say how far a sweep is, from its files alone."""
     store = _store(arguments)
-    now = progress(store.specs(), store)
+    specs = store.specs()
+    now = progress(specs, store)
     if not arguments.brief:
         console.print(display.status_table(now))
         _say(console, "")
     _say(console, f"{store.name}: {display.status_sentence(now)}")
     _say_failures(now, store, console)
+    for problem in store.damages():
+        _say(console, f"damaged: {problem}")
+    _say_other_code(make_plan(specs, store), console)
+    none = [
+        trial.spec.title for trial in now.trials if trial.spec.is_no_curriculum(trial.record.start_limits)
+    ]
+    if sentence := no_curriculum_sentence(none):
+        _say(console, f"warning: {sentence}")
     return ExitCode.OK
+
+
+def run_check(arguments: argparse.Namespace, console: Console) -> ExitCode:
+    """Hold every file of a sweep against what was committed; a line for each that is wrong."""
+    store = _store(arguments)
+    problems = [f"{store.name}: {problem}" for problem in store.damages()]
+    with contextlib.suppress(StorageError):  # said above
+        for spec in store.specs():
+            problems += [f"{spec.title}: {problem}" for problem in store.trial(spec).damages()]
+    listed = {spec.folder_name for spec in _listed(store)}
+    orphans = [trial for trial in store.trials() if trial.folder.name not in listed]
+    problems += [f"{trial.title}: {problem}" for trial in orphans for problem in trial.damages()]
+    for problem in problems:
+        _say(console, problem)
+    trials = len(listed | {trial.folder.name for trial in orphans})
+    _say(
+        console,
+        f"{store.name}: {trials} trials checked, {len(problems) or 'no'} wrong "
+        f"file{'' if len(problems) == 1 else 's'}",
+    )
+    if problems:
+        _say(console, "launch goes on with damaged trials from what is whole; complete ones: --rerun-damaged")
+    return ExitCode.TRIALS_FAILED if problems else ExitCode.OK
+
+
+def _listed(store: SweepStore) -> list[TrialSpec]:
+    """The trials of the last launch, none where the file that lists them is damaged."""
+    try:
+        return store.specs()
+    except StorageError:
+        return []
 
 
 def run_stop(arguments: argparse.Namespace, console: Console) -> ExitCode:
@@ -208,7 +264,7 @@ def _trial(store: SweepStore, text: str) -> TrialStore:
         found = [trial for trial in found if standing_of(trial.record(), now=now) is Standing.RUNNING]
     if len(found) == 1:
         return found[0]
-    titles = [f"{trial.spec.trial_id} {trial.spec.title}" for trial in found[:10]]
+    titles = [f"{trial.trial_id} {trial.title}" for trial in found[:10]]
     more = f" and {len(found) - 10} more" if len(found) > 10 else ""
     which = f"say which one, by its id or title: {', '.join(titles)}{more}" if found else "status names them"
     what = f"trials on disk begin with {text!r}" if text else "trials are running"
@@ -228,6 +284,7 @@ def run_evaluate(arguments: argparse.Namespace, console: Console) -> ExitCode:
     thawed, left_out = [], []
     for trial in _chosen(store, arguments):
         try:
+            trial.require_whole()
             thawed.append(FrozenTrial.thaw(trial))
         except RecrlError as error:
             left_out.append(error)
@@ -245,6 +302,10 @@ def run_evaluate(arguments: argparse.Namespace, console: Console) -> ExitCode:
         _say(console, f"Episodes   {_short(path)}")
     for reason in left_out:
         _say(console, f"left out   {reason}")
+    changed = [frozen for frozen in thawed if has_other_code(frozen.store, frozen.spec)]
+    complete = sum(frozen.store.record().status is TrialState.COMPLETE for frozen in changed)
+    if sentence := other_code_sentence(complete, len(changed) - complete):
+        _say(console, f"warning: {sentence}; here their policies met the present code")
     if arguments.video:
         for frozen in thawed:
             for policy in policies:
@@ -258,7 +319,14 @@ def _chosen(store: SweepStore, arguments: argparse.Namespace) -> list[TrialStore
     """The trials on disk whose name begins so, and that ``--only`` leaves."""
     text = " ".join(arguments.trial)
     found = store.find(text)
-    kept = {spec.folder_name for spec in select([trial.spec for trial in found], _only(arguments.only))}
+    wanted = _only(arguments.only)
+    specs, damaged = [], set()
+    for trial in found:
+        try:
+            specs.append(trial.spec)
+        except StorageError:
+            damaged.add(trial.folder.name)
+    kept = {spec.folder_name for spec in select(specs, wanted)} | (set() if wanted else damaged)
     if not kept:
         begin = f" begin with {text!r}" if text else ""
         raise RecrlError(f"{store.name}: no trials on disk{begin}; status names them")
@@ -280,6 +348,7 @@ def _tell_mlflow(store: SweepStore, arguments: argparse.Namespace, console: Cons
 def run_figures(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Draw the figures and tables of what is on disk, in a compact file or in MLflow."""
     sweep, folder = _source(arguments)
+    _say_warnings(sweep, console)
     folder = arguments.to or folder
     try:
         _draw(sweep, folder, console, band=arguments.band, whole=not arguments.sketch)
@@ -301,6 +370,7 @@ def run_export(arguments: argparse.Namespace, console: Console) -> ExitCode:
 
     sweep, _ = _source(arguments)
     _say_file(compact.save(sweep, arguments.to or Path(f"{sweep.name}{compact.SUFFIX}")), sweep, console)
+    _say_warnings(sweep, console)
     return ExitCode.OK
 
 
@@ -315,7 +385,18 @@ def run_merge(arguments: argparse.Namespace, console: Console) -> ExitCode:
     _say_file(compact.save(sweep, arguments.to), sweep, console)
     for note in sweep.notes:
         _say(console, note)
+    _say_warnings(sweep, console)
     return ExitCode.OK
+
+
+def _say_warnings(sweep: Sweep, console: Console) -> None:
+    """Say which trials nothing was made of, and what else speaks against the numbers."""
+    from recrl.analysis.doubts import damages, doubts  # noqa: PLC0415  (imports pandas)
+
+    for sentence in damages(sweep):
+        _say(console, f"damaged: {sentence}")
+    for sentence in doubts(sweep):
+        _say(console, f"warning: {sentence}")
 
 
 def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
@@ -344,6 +425,7 @@ def run_bound(arguments: argparse.Namespace, console: Console) -> ExitCode:
     from recrl.analysis import cumulative  # noqa: PLC0415  (imports pandas and SciPy)
 
     sweep, _ = _source(arguments)
+    _say_warnings(sweep, console)
     if arguments.cost > sweep.num_costs:
         raise RecrlError(f"--cost: {sweep.name} has {sweep.num_costs} costs, got {arguments.cost}")
     rows = cumulative.cumulative_costs(sweep, cost=arguments.cost - 1)
@@ -374,12 +456,22 @@ def run_replay(arguments: argparse.Namespace, console: Console) -> ExitCode:
     method = _teacher(store, arguments)
     called = re.sub("[^A-Za-z0-9.+-]+", "-", method.label)
     folder, runs, summaries = store.folder / "replays", [], []
+    damaged = []
     for trial in (store.trial(spec) for spec in specs):
-        if trial.record().update:
-            rows = replay(trial, method)
+        record = trial.record()
+        if record.status is TrialState.DAMAGED:
+            damaged.append(f"{trial.title}: {record.error}")
+        elif record.update:
+            try:
+                rows = replay(trial, method)
+            except DamagedError as error:
+                damaged.append(str(error))
+                continue
             write_csv(rows, folder / f"{trial.folder.name}__{called}.csv")
             runs.append(Replayed(trial.spec, rows))
             summaries.append(replay_summary(trial, rows))
+    for sentence in damaged:
+        _say(console, f"damaged: {sentence}")
     if not runs:
         raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials has a policy update yet")
     _say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
@@ -472,7 +564,8 @@ def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> Sw
 
         names = sweeps_at(storage)
     else:
-        names = sorted(path.parent.name for path in root.glob("*/sweep.json"))
+        said = (*root.glob("*/sweep.json"), *root.glob("*/trials.jsonl"))
+        names = sorted({path.parent.name for path in said})
     if sweep is None:
         if len(names) == 1:
             return SweepStore(root, names[0])
@@ -623,11 +716,22 @@ def _say_plan(plan: Plan, grid: GridSpec, console: Console, *, at_once: int, whe
     _say(console, display.estimate_sentence(estimate(plan, concurrent=at_once), where))
 
 
+def _say_other_code(plan: Plan, console: Console) -> None:
+    """Say how many trials ran other code than is installed now."""
+    changed = plan.other_code
+    complete = sum(trial.record.status is TrialState.COMPLETE for trial in changed)
+    if sentence := other_code_sentence(complete, len(changed) - complete):
+        _say(console, f"warning: {sentence}")
+
+
 def _say_failures(now: SweepProgress, store: SweepStore, console: Console) -> None:
     def folder_of(trial: TrialProgress) -> str:
         return str(_short(store.trial(trial.spec).folder))
 
-    broken = [*now.standing(Standing.FAILED), *(t for t in now.standing(Standing.STOPPED) if t.record.error)]
+    broken = [
+        *now.standing(Standing.FAILED, Standing.DAMAGED),
+        *(t for t in now.standing(Standing.STOPPED) if t.record.error),
+    ]
     for line in display.failures(broken, folder_of):
         _say(console, line)
 
@@ -663,10 +767,14 @@ def _say_result(
     if result.stopped:
         _say(console, f"Stopped; nothing is lost. Go on with: {again}")
         return ExitCode.STOPPED
+    if damaged := result.progress.standing(Standing.DAMAGED):
+        them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
+        rerun = again if arguments.rerun_damaged else f"{again} --rerun-damaged"
+        _say(console, f"{them} left alone; what is damaged is moved aside and run again with: {rerun}")
     if result.failed:
         retry = again if arguments.retry_failed else f"{again} --retry-failed"
         _say(console, f"Try what failed again with: {retry}")
-    else:
+    elif not damaged:
         _say(console, f"Not everything could be finished. Go on with: {again}")
     return ExitCode.TRIALS_FAILED
 
@@ -697,6 +805,7 @@ COMMANDS: Mapping[str, Command] = {
     "plan": run_plan,
     "validate": run_validate,
     "status": run_status,
+    "check": run_check,
     "stop": run_stop,
     "logs": run_logs,
     "evaluate": run_evaluate,

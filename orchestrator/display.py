@@ -16,6 +16,7 @@ from rich.text import Text
 
 from recrl.orchestrator.beside import beside
 from recrl.orchestrator.plan import Estimate, Plan, Work
+from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, standing_of
 from recrl.orchestrator.store import TrialStore
 
@@ -28,6 +29,9 @@ _STYLES = {
     "complete": "green",
     "running": "cyan",
     "failed": "bold red",
+    "damaged": "bold red",
+    "repair": "yellow",
+    "rerun": "yellow",
     "interrupted": "yellow",
     "retry": "yellow",
     "resume": "yellow",
@@ -38,7 +42,8 @@ def plan_table(plan: Plan) -> Table:
     """Every trial and what a launch would do with it."""
     table = _table("trial", "seed", "work", "done", "id")
     for trial in plan.trials:
-        fraction = 1.0 if trial.work is Work.COMPLETE else trial.record.env_steps / trial.spec.total_steps
+        done = 0 if trial.work in (Work.REPAIR, Work.DAMAGED) else trial.record.env_steps
+        fraction = 1.0 if trial.work is Work.COMPLETE else done / trial.spec.total_steps
         table.add_row(
             f"{trial.spec.task.label} {trial.spec.agent.label} {trial.spec.method.label}",
             str(trial.spec.seed),
@@ -55,8 +60,11 @@ def plan_sentence(plan: Plan) -> str:
         Work.NEW: "new",
         Work.RESUME: "to resume",
         Work.RETRY: "to try again",
+        Work.REPAIR: "damaged, to go on from what is whole",
+        Work.RERUN: "to run again on the present code",
         Work.COMPLETE: "complete",
         Work.FAILED: "failed",
+        Work.DAMAGED: "damaged",
     }
     parts = [f"{number} {words[work]}" for work, number in plan.counts.items() if number]
     return f"{_counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
@@ -103,7 +111,7 @@ def status_sentence(progress: SweepProgress) -> str:
     ]
     parts += [
         f"{counts[standing]} {standing}"
-        for standing in (Standing.STOPPED, Standing.INTERRUPTED)
+        for standing in (Standing.STOPPED, Standing.INTERRUPTED, Standing.DAMAGED)
         if counts[standing]
     ]
     sentence = ", ".join(parts)
@@ -118,9 +126,18 @@ def status_sentence(progress: SweepProgress) -> str:
 def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress], str]) -> Iterator[str]:
     """For every trial that broke off: which, why, and where its log and traceback are."""
     for trial in trials:
-        word = "failed" if trial.standing is Standing.FAILED else "waiting"
+        broken = trial.standing in (Standing.FAILED, Standing.DAMAGED)
+        word = str(trial.standing) if broken else "waiting"
         yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was left'}"
-        yield f"        log and traceback: {folder_of(trial)}"
+        what = "its files" if trial.standing is Standing.DAMAGED else "log and traceback"
+        yield f"        {what}: {folder_of(trial)}"
+
+
+def damages_of_plan(plan: Plan) -> Iterator[str]:
+    """For every damaged trial: which, what is wrong, and what a launch does about it."""
+    for trial in plan.trials:
+        if trial.record.status is TrialState.DAMAGED:
+            yield f"damaged: {trial.spec.title}: {trial.record.error}"
 
 
 def lines_of(trial: TrialStore, *, follow: bool) -> Iterator[str]:

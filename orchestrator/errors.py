@@ -44,6 +44,18 @@ class StorageError(RecrlError):
     """A trial's files cannot be written, or read where they are kept; its last commit stands."""
 
 
+class DamagedError(StorageError):
+    """A file is not what was written: cut, changed, replaced, or of another trial."""
+
+
+class OtherFormatError(DamagedError):
+    """A file has the format of another version of recrl."""
+
+
+class RowError(RecrlError):
+    """A row does not have the columns of its file, or holds what is no cell."""
+
+
 class LostLeaseError(RecrlError):
     """Another attempt has taken this trial over; this one must write nothing more."""
 

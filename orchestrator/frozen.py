@@ -27,8 +27,9 @@ from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.plugins import UntrustedNameError
 from recrl.environments.registry import NotDrawnError, make_drawn, make_vector
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.row_files import write_rows
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.store import TrialStore, write_rows
+from recrl.orchestrator.store import TrialStore
 from recrl.orchestrator.trial import TrialSeeds, evaluation_rows
 from recrl.orchestrator.videos import VideoFormat, captioned, stride, write_video
 

@@ -17,7 +17,7 @@ def source_digest() -> str:
     """Ten hex digits that differ whenever a Python file of recrl does: a version alone does not say it."""
     digest = hashlib.sha256()
     for name in FOLDERS:
-        folder = _folder(name)
+        folder = folder_of(name)
         for path in sorted(folder.rglob("*.py")):
             digest.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
@@ -36,7 +36,7 @@ def copy_package(parent: Path) -> list[Path]:
     """
     package = parent / "package" / DISTRIBUTION
     for name in FOLDERS:
-        shutil.copytree(_folder(name), package / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(folder_of(name), package / name, ignore=shutil.ignore_patterns("__pycache__"))
     distribution = importlib.metadata.distribution(DISTRIBUTION)
     metadata = parent / "metadata" / f"{DISTRIBUTION}-{distribution.version}.dist-info"
     metadata.mkdir(parents=True)
@@ -47,7 +47,8 @@ def copy_package(parent: Path) -> list[Path]:
     return [package, metadata]
 
 
-def _folder(name: str) -> Path:
+def folder_of(name: str) -> Path:
+    """Where one of recrl's packages is."""
     spec = importlib.util.find_spec(f"{DISTRIBUTION}.{name}")
     assert spec is not None and spec.submodule_search_locations
     return Path(next(iter(spec.submodule_search_locations)))

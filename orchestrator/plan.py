@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.origins import has_other_code
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore
 from recrl.orchestrator.validation import nearest
@@ -30,27 +31,39 @@ class Work(StrEnum):
     NEW = "new"
     RESUME = "resume"
     RETRY = "retry"
+    REPAIR = "repair"  # damaged; goes on from what is whole
+    RERUN = "rerun"  # from the beginning, because its code has changed
     COMPLETE = "complete"
     FAILED = "failed"
+    DAMAGED = "damaged"
 
     @property
     def is_to_do(self) -> bool:
         """Whether a launch would work on the trial."""
-        return self in (Work.NEW, Work.RESUME, Work.RETRY)
+        return self in (Work.NEW, Work.RESUME, Work.RETRY, Work.REPAIR, Work.RERUN)
 
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """One trial of the grid and what is on disk of it."""
+    """One trial of the grid and what is on disk of it.
+
+    Attributes:
+        spec: the trial.
+        work: what a launch would do with it.
+        record: what its files say.
+        has_other_code: whether an attempt at it ran other code than is installed now.
+    """
 
     spec: TrialSpec
     work: Work
     record: TrialRecord
+    has_other_code: bool = False
 
     @property
     def steps_left(self) -> int:
-        """Environment steps that a launch would still take."""
-        return max(0, self.spec.total_steps - self.record.env_steps) if self.work.is_to_do else 0
+        """Environment steps that a launch would still take, at most."""
+        done = self.record.env_steps if self.work in (Work.RESUME, Work.RETRY) else 0
+        return max(0, self.spec.total_steps - done) if self.work.is_to_do else 0
 
 
 @dataclass(frozen=True)
@@ -69,6 +82,15 @@ class Plan:
     def to_do(self) -> tuple[TrialSpec, ...]:
         """The trials to run, in their order."""
         return tuple(trial.spec for trial in self.trials if trial.work.is_to_do)
+
+    def doing(self, work: Work) -> tuple[PlannedTrial, ...]:
+        """The trials with this kind of work."""
+        return tuple(trial for trial in self.trials if trial.work is work)
+
+    @property
+    def other_code(self) -> tuple[PlannedTrial, ...]:
+        """The trials that ran other code than is installed now, and are not run again from the beginning."""
+        return tuple(it for it in self.trials if it.has_other_code and it.work is not Work.RERUN)
 
     @property
     def counts(self) -> Mapping[Work, int]:
@@ -107,6 +129,8 @@ def make_plan(
     *,
     only: Mapping[str, Sequence[str]] | None = None,
     retry_failed: bool = False,
+    rerun_damaged: bool = False,
+    rerun_changed: bool = False,
 ) -> Plan:
     """Hold the grid's trials against the files.
 
@@ -115,6 +139,9 @@ def make_plan(
         store: where the sweep is, or will be.
         only: the trials to plan for, as ``select`` reads it; all by default.
         retry_failed: whether failed trials are to be tried again.
+        rerun_damaged: whether damaged trials that were complete or failed are to be run again; others are.
+            Then every file is read and held against its digest.
+        rerun_changed: whether trials that ran other code than is installed now are to be run again.
 
     Raises:
         RecrlError: ``only`` names what no trial of the grid has.
@@ -122,8 +149,13 @@ def make_plan(
     wanted = {spec.folder_name for spec in specs}
     trials = []
     for spec in select(specs, only or {}):
-        record = store.trial(spec).record()
-        trials.append(PlannedTrial(spec, _work(record, retry_failed=retry_failed), record))
+        trial = store.trial(spec)
+        record = trial.verified_record() if rerun_damaged else trial.record()
+        work = _work(record, retry_failed=retry_failed, rerun_damaged=rerun_damaged)
+        changed = has_other_code(trial, spec)
+        if changed and rerun_changed and (work.is_to_do or work is Work.COMPLETE):
+            work = Work.RERUN
+        trials.append(PlannedTrial(spec, work, record, changed))
     orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)
     return Plan(tuple(trials), orphans)
 
@@ -189,12 +221,15 @@ def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> t
     return tuple(spec for spec in specs if all(_label(spec, key) in values for key, values in wanted.items()))
 
 
-def _work(record: TrialRecord, *, retry_failed: bool) -> Work:
+def _work(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> Work:
     match record.status:
         case TrialState.COMPLETE:
             return Work.COMPLETE
         case TrialState.FAILED:
             return Work.RETRY if retry_failed else Work.FAILED
+        case TrialState.DAMAGED:
+            left_alone = record.claims in (TrialState.COMPLETE, TrialState.FAILED)
+            return Work.DAMAGED if left_alone and not rerun_damaged else Work.REPAIR
         case TrialState.WAITING | TrialState.RUNNING:
             return Work.RESUME if record.attempt else Work.NEW
 

@@ -36,12 +36,13 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.beside import beside
-from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
+from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError, SweepBusyError
 from recrl.orchestrator.locks import open_lock
 from recrl.orchestrator.object_store import ObjectStore
 from recrl.orchestrator.remote_trial import ALIVE, RemoteTrial, Upload, patiently, working_copy
+from recrl.orchestrator.small_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore, TrialStore, write_atomically, write_json
+from recrl.orchestrator.store import SweepStore, TrialStore
 
 PULL_SECONDS = 10.0  # between two looks at the trials that run
 LONGEST_PAUSE_SECONDS = 60.0  # between two looks while the store is down
@@ -53,6 +54,7 @@ STOP_QUESTION_SECONDS = 5.0  # between two questions of a worker whether to stop
 PULLS_AT_ONCE = 8
 
 LAUNCH = "launch.json"
+STORAGE_FORMAT = 2
 STOP_REQUEST = "stop.request"
 
 logger = logging.getLogger("recrl.sweep")
@@ -89,10 +91,17 @@ class RemoteSweep:
             RecrlError: as the constructor.
         """
         try:
-            uri = json.loads(store.storage_path.read_text())["uri"]
+            kept = read_sealed(store.storage_path, version=STORAGE_FORMAT)
+            if kept["name"] != store.name:
+                raise DamagedError(f"{store.storage_path.name} is that of another sweep, {kept['name']}")
         except FileNotFoundError:
             return None
-        return cls(uri, store.name)
+        except StorageError as error:
+            raise type(error)(
+                f"{store.name}: {error}, so that nobody knows where the sweep is kept; delete it and give "
+                "--storage URI again"
+            ) from error
+        return cls(kept["uri"], store.name)
 
     def mark(self, store: SweepStore) -> None:
         """Make a folder the mirror of this sweep.
@@ -113,7 +122,7 @@ class RemoteSweep:
             )
         store.folder.mkdir(parents=True, exist_ok=True)
         if present is None:
-            write_json(store.storage_path, {"uri": self.uri})
+            write_sealed(store.storage_path, {"name": store.name, "uri": self.uri}, version=STORAGE_FORMAT)
 
     def is_there(self) -> bool:
         """Whether it was launched.

@@ -34,13 +34,14 @@ from functools import partial
 from pathlib import PurePosixPath
 from typing import Any, Self
 
-from recrl.orchestrator import checkpoint
 from recrl.orchestrator.beside import beside
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError
 from recrl.orchestrator.object_store import ObjectStore
+from recrl.orchestrator.row_files import Extent
 from recrl.orchestrator.scratch import scratch_folder
+from recrl.orchestrator.small_files import write_atomically, write_json
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.store import TrialRecord, TrialStore, write_atomically, write_json
+from recrl.orchestrator.store import TrialRecord, TrialStore
 
 FORMAT = 1
 LOOK_SECONDS = 0.5  # between two looks at the trial's folder
@@ -53,6 +54,7 @@ KEPT_MANIFESTS = 2  # a reader may still be at the one before the last
 RETRIES = 3  # looks for a newer manifest, before one that is not intact is called damaged
 
 APPENDED = ("episodes.csv", "updates.csv", "events.jsonl", "log.txt")
+ROWS = ("episodes.csv", "updates.csv", "events.jsonl")
 WHOLE = ("spec.json", "provenance.json", "error.txt", "evaluation.csv", "policy.csv")
 ALIVE = "alive.json"
 PULLED = ".pulled.json"
@@ -111,7 +113,7 @@ class Manifest:
     def to_bytes(self) -> bytes:
         """Strict JSON; ``from_bytes`` is its inverse."""
         files = {name: [asdict(part) for part in parts] for name, parts in self.files.items()}
-        value = {"format": FORMAT, "record": asdict(self.record), "files": files}
+        value = {"format": FORMAT, "record": self.record.to_json(), "files": files}
         return json.dumps(value, indent=1, allow_nan=False).encode()
 
     @classmethod
@@ -168,7 +170,7 @@ class RemoteTrial:
         record = replace(record, attempt=max([record.attempt, *begun]))
         if record.attempt:
             trial.folder.mkdir(parents=True, exist_ok=True)
-            write_json(trial.state_path, asdict(record))
+            trial.write_record(record)
 
     def mirror(self, trial: TrialStore, keys: Sequence[str] | None = None, *, checkpoints: bool) -> None:
         """Make a folder show the newest manifest, and how far the trial has come since.
@@ -202,7 +204,7 @@ class RemoteTrial:
             silent = record.status is TrialState.RUNNING
             judged = here.token == "" and here.attempt >= record.attempt and silent
             if not judged and here != record:
-                write_json(trial.state_path, asdict(record))
+                trial.write_record(record)
 
     def _pull(self, trial: TrialStore, keys: Sequence[str], *, checkpoints: bool) -> Manifest | None:
         """Bring the files of the newest intact manifest; None if there is none.
@@ -305,7 +307,7 @@ class _Pulled:
         try:
             value = json.loads((trial.folder / PULLED).read_text())
             return cls(value["place"], Manifest.from_bytes(value["manifest"].encode()))
-        except (FileNotFoundError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError):
             return cls("", Manifest(TrialRecord(), {}))
 
     def write(self, trial: TrialStore) -> None:
@@ -327,7 +329,7 @@ class Upload:
         """
         self._remote = remote
         self._trial = trial
-        self._before = trial.record().token
+        self._before = trial.stated().token
         self._parts: Mapping[str, tuple[Part, ...]] = {}
         self._manifests: list[tuple[str, Manifest]] = []
         self._written: set[str] = set()
@@ -342,7 +344,7 @@ class Upload:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
             LostLeaseError: a newer attempt runs the trial.
         """
-        record = self._trial.record()
+        record = self._trial.stated()
         if not record.token or record.token == self._before:
             return
         if self._shown is None or time.monotonic() >= self._spoke_at + ALIVE_SECONDS:
@@ -357,7 +359,7 @@ class Upload:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
             LostLeaseError: a newer attempt runs the trial.
         """
-        record = self._trial.record()
+        record = self._trial.stated()
         if not record.token or record.token == self._before:
             return
         self._speak(replace(record, heartbeat=time.time()))  # to send much takes long
@@ -393,7 +395,7 @@ class Upload:
     def _speak(self, record: TrialRecord) -> None:
         """Claim the trial, and say that it lives. That it is over only a manifest may say."""
         said = replace(record, status=TrialState.RUNNING)
-        self._remote.objects.write(f"{_attempt_of(record)}/{ALIVE}", _json(asdict(said)))
+        self._remote.objects.write(f"{_attempt_of(record)}/{ALIVE}", _json(said.to_json()))
         self._spoke_at = time.monotonic()
 
     def _capture(self) -> tuple[TrialRecord, Manifest, dict[str, bytes]]:
@@ -405,9 +407,10 @@ class Upload:
         data: dict[str, bytes] = {}
         parts: dict[str, tuple[Part, ...]] = {}
         with self._trial.locked():
-            record = self._trial.record()
+            record = self._trial.stated()
             saved, rows = _newest_checkpoint(self._trial)
-            committed = {**dict.fromkeys(record.committed, 0), **rows}
+            extents = {**record.extents, **dict.fromkeys(ROWS, Extent()), **rows}
+            committed = {name: extent.length for name, extent in extents.items()}
             lengths = {**committed, "log.txt": _size(self._trial, "log.txt")}
             for name in APPENDED:
                 parts[name] = self._appended(name, lengths.get(name, 0), data)
@@ -418,7 +421,9 @@ class Upload:
                 parts[name] = (part,) if content else ()
                 data.update({part.key: content} if content else {})
         present = {name: found for name, found in parts.items() if (self._trial.folder / name).exists()}
-        return record, Manifest(replace(record, committed=committed), present), data
+        digests = {name: extent.sha256 for name, extent in extents.items()}
+        stands = replace(record, committed=committed, digests=digests)
+        return stands, Manifest(stands, present), data
 
     def _appended(self, name: str, length: int, data: dict[str, bytes]) -> tuple[Part, ...]:
         """The parts of a row file; its new bytes go into ``data``.
@@ -580,14 +585,16 @@ def _with_life(record: TrialRecord, sign: bytes | None) -> TrialRecord:
         return record  # it was cleared away, or cut short: there will be another
     if alive.token == record.token and alive.heartbeat < record.heartbeat:
         return record
-    return replace(alive, committed=record.committed)
+    return replace(alive, committed=record.committed, digests=record.digests, checkpoint=record.checkpoint)
 
 
-def _newest_checkpoint(trial: TrialStore) -> tuple[list[str], dict[str, int]]:
-    """The newest intact checkpoint, as a path in the trial's folder, if there is one; its rows' lengths."""
+def _newest_checkpoint(trial: TrialStore) -> tuple[list[str], dict[str, Extent]]:
+    """The newest intact checkpoint, as a path in the trial's folder, if there is one; what rows it has."""
     for path in trial.checkpoints():
         try:
-            return [f"checkpoints/{path.name}"], checkpoint.load(path)["files"]
+            tree = trial.load_checkpoint(path)
+            rows = {name: Extent(length, tree["digests"][name]) for name, length in tree["files"].items()}
+            return [f"checkpoints/{path.name}"], rows
         except CheckpointError:
             continue
     return [], {}

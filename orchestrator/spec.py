@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -29,6 +30,7 @@ class TrialState(StrEnum):
     RUNNING = "running"
     COMPLETE = "complete"
     FAILED = "failed"
+    DAMAGED = "damaged"  # as a reader finds it; no file says so of itself
 
     @property
     def is_finished(self) -> bool:
@@ -115,6 +117,18 @@ class TrialSpec:
             deploy_limits=self.deploy_limits,
             train_steps=self.train_steps,
         )
+
+    def is_no_curriculum(self, start_limits: Sequence[float | str] | None) -> bool:
+        """Whether the measured d_t is not above d_d anywhere: then the limits are d_d from the start.
+
+        Args:
+            start_limits: the d_t that the curriculum measured, [k]; None if it has not, or need not.
+        """
+        is_measured = not all(map(math.isfinite, self.train_limits)) and self.method.name != "none"
+        if start_limits is None or not is_measured:
+            return False
+        pairs = zip(start_limits, self.deploy_limits, strict=True)
+        return all(float(start) <= deploy for start, deploy in pairs)
 
     @property
     def trial_id(self) -> str:

@@ -27,6 +27,7 @@ class Standing(StrEnum):
     STOPPED = "stopped"
     INTERRUPTED = "interrupted"
     FAILED = "failed"
+    DAMAGED = "damaged"
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,11 @@ class TrialProgress:
 
     @property
     def fraction(self) -> float:
-        """The share of its environment steps that is done, in [0, 1]."""
+        """The share of its environment steps that is done, in [0, 1]; 0 of a damaged one."""
         if self.standing is Standing.COMPLETE:
             return 1.0
+        if self.standing is Standing.DAMAGED:
+            return 0.0
         return min(1.0, self.record.env_steps / self.spec.total_steps)
 
 
@@ -125,6 +128,8 @@ def standing_of(record: TrialRecord, *, now: float) -> Standing:
             return Standing.COMPLETE
         case TrialState.FAILED:
             return Standing.FAILED
+        case TrialState.DAMAGED:
+            return Standing.DAMAGED
         case TrialState.WAITING:
             return Standing.STOPPED if record.attempt else Standing.WAITING
         case TrialState.RUNNING:

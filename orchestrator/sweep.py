@@ -7,7 +7,6 @@ from the files.
 
 from __future__ import annotations
 
-import json
 import logging
 import signal
 import threading
@@ -19,14 +18,14 @@ from types import FrameType
 from typing import TYPE_CHECKING, Protocol
 
 from recrl.orchestrator.beside import beside
-from recrl.orchestrator.errors import StorageError
+from recrl.orchestrator.errors import DamagedError, RecrlError, StorageError
 from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.grid import GridSpec
-from recrl.orchestrator.plan import Plan, make_plan
+from recrl.orchestrator.plan import Plan, Work, make_plan
 from recrl.orchestrator.provenance import collect
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
-from recrl.orchestrator.store import SweepStore, write_atomically, write_json
+from recrl.orchestrator.store import SweepStore
 
 if TYPE_CHECKING:
     from recrl.orchestrator.remote_sweep import RemoteSweep
@@ -81,6 +80,8 @@ def launch(
     stop: threading.Event,
     only: Mapping[str, Sequence[str]] | None = None,
     retry_failed: bool = False,
+    rerun_damaged: bool = False,
+    rerun_changed: bool = False,
     storage: RemoteSweep | None = None,
     start_mirror: Callable[[SweepStore], Mirror] | None = None,
     watch: Callable[[Plan], None] | None = None,
@@ -95,6 +96,8 @@ def launch(
         stop: once set, running trials save where they are, and the call returns.
         only: the trials to work on, as ``plan.select`` reads it; all by default.
         retry_failed: whether failed trials are tried again.
+        rerun_damaged: whether damaged trials that were complete or failed are run again.
+        rerun_changed: whether trials that ran other code than is installed now are run again.
         storage: where the trials are kept, if ``store`` is only a mirror; the executor's as well.
         start_mirror: begins to show the sweep elsewhere, before the first trial.
         watch: told the plan before the first trial.
@@ -105,6 +108,11 @@ def launch(
         StorageError: the storage cannot be used.
         RecrlError: ``only`` names what is not in the grid, or the executor cannot run at all.
     """
+    if storage is not None and (rerun_damaged or rerun_changed):
+        raise RecrlError(
+            f"{storage.uri}: trials of a sweep that is kept there are not run again: give the sweep another "
+            "name; if only its folder here is damaged, delete that, and it is fetched again"
+        )
     specs = grid.trials()
     make_plan(specs, store, only=only)  # a mistake in ``only`` leaves no trace
     with store.lock(), _stopping_on_request(store, stop), _held(storage, stop):
@@ -114,10 +122,19 @@ def launch(
         if storage is not None:
             storage.publish(store)
         _leave_none_running(specs, store)  # of a launch that died
-        plan = make_plan(specs, store, only=only, retry_failed=retry_failed)
+        plan = make_plan(
+            specs,
+            store,
+            only=only,
+            retry_failed=retry_failed,
+            rerun_damaged=rerun_damaged,
+            rerun_changed=rerun_changed,
+        )
         chosen = [trial.spec for trial in plan.trials]
         if watch is not None:
             watch(plan)
+        for trial in plan.doing(Work.RERUN):
+            store.trial(trial.spec).set_all_aside()
         mirror = start_mirror(store) if start_mirror is not None else None
         patience = HASTY_MIRROR_SECONDS
         mirrored: bool | None = None
@@ -223,14 +240,12 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
 def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) -> None:
     """Say in the sweep's folder what it is."""
     try:
-        created = json.loads(store.info_path.read_text())["created"]
-    except FileNotFoundError:
+        created = store.info().get("created", time.time())
+    except DamagedError as error:
+        logger.warning("%s; to MLflow the sweep is a new one", error)
         created = time.time()
-    info = {"name": grid.name, "created": created, "launched": time.time(), **collect()}
-    write_json(store.info_path, info)
-    write_atomically(store.grid_path, grid.text)
-    lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs)
-    write_atomically(store.specs_path, lines.encode())
+    store.write_info({"name": grid.name, "created": created, "launched": time.time(), **collect()})
+    store.write_specs(specs, grid.text)
 
 
 def _leave_none_running(specs: Sequence[TrialSpec], store: SweepStore) -> None:

@@ -44,13 +44,15 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.errors import DamagedError, TrackingError
 from recrl.orchestrator.locks import open_lock
 from recrl.orchestrator.phase_totals import phase_totals
 from recrl.orchestrator.redaction import redacted
+from recrl.orchestrator.row_files import Extent
+from recrl.orchestrator.small_files import write_atomically, write_json
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.status import Standing, standing_of
-from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_atomically, write_json
+from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore
 from recrl.orchestrator.tracking_database import Database, OtherTables, ShownRun
 from recrl.orchestrator.tracking_points import (
     VIEW,
@@ -202,7 +204,7 @@ class Tracker:
             live: whether a launch is there that will resume what waits.
             rebuild: delete what MLflow has of the sweep first.
         """
-        trials = [trial for trial in self.store.trials() if trial.record().attempt]
+        trials = [trial for trial in self.store.trials() if _has_begun(trial.record())]
         sent, done, problems, remark = 0, 0, list[str](), ""
         with _alone(self.store, self.uri):
             view, self._view = self._view, None  # to be asked anew should anything go wrong
@@ -307,6 +309,8 @@ class _View:
         from mlflow.entities import Metric, Param, RunTag  # noqa: PLC0415  (mlflow takes seconds to import)
 
         record = trial.record()
+        if record.status is TrialState.DAMAGED:
+            raise DamagedError(record.error)
         status = run_status(record, live=live)
         committed = record.committed.get(trial.updates_path.name, 0)
         added = _added_afterwards(trial)
@@ -323,9 +327,13 @@ class _View:
         data = _head(trial.updates_path, committed)
         if len(data) < committed:
             return 0  # the file is being cut back at this moment; the next pass sees how it went
+        if Extent.of(data) != record.extents.get(trial.updates_path.name, Extent()):
+            raise DamagedError(f"{trial.updates_path.name} is not what was committed: its checksum differs")
         if not position.fits(data):
             self._delete_run(position.run_id)
             position = Position(self._create_run(trial, record))
+        if status == "FINISHED":
+            trial.require_whole()
         new_points, position = _new_points(trial, data, position)
         if status == "FINISHED" and position.last_row:
             last = final_points(trial.updates(), trial.evaluation(), _last_row(data, position))
@@ -627,7 +635,7 @@ def run_status(record: TrialRecord, *, live: bool) -> str:
     match standing_of(record, now=time.time()):
         case Standing.COMPLETE:
             return "FINISHED"
-        case Standing.FAILED:
+        case Standing.FAILED | Standing.DAMAGED:
             return "FAILED"
         case Standing.RUNNING:
             return "RUNNING"
@@ -654,6 +662,11 @@ def _new_points(trial: TrialStore, data: bytes, position: Position) -> tuple[lis
         found += points(row, trial.spec)
     start = data.rfind(b"\n", 0, max(0, end - 1)) + 1
     return found, replace(position, offset=end, last_row=data[start:end].decode())
+
+
+def _has_begun(record: TrialRecord) -> bool:
+    """Whether there is, or was, something to show."""
+    return record.attempt > 0 or record.status is TrialState.DAMAGED
 
 
 def _last_row(data: bytes, position: Position) -> Row:
@@ -721,10 +734,7 @@ def mirror_folder(store: SweepStore, uri: str) -> Path:
 
 def _sweep_id(store: SweepStore) -> str:
     """Ten hex digits: sweeps of one name, made at different times, are different sweeps."""
-    try:
-        created = str(json.loads(store.info_path.read_text()).get("created", ""))
-    except FileNotFoundError:
-        created = ""
+    created = str(store.info().get("created", ""))
     return hashlib.sha256(f"{store.name}\n{created}".encode()).hexdigest()[:10]
 
 

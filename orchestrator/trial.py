@@ -16,7 +16,7 @@ import logging
 import os
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import TextIOWrapper
@@ -36,16 +36,18 @@ from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
     LostLeaseError,
+    RowError,
     StorageError,
     TeacherUnavailableError,
     described,
 )
 from recrl.orchestrator.heartbeat import Heartbeat
+from recrl.orchestrator.origins import code_of
 from recrl.orchestrator.provenance import collect as collect_provenance
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.rollout_check import check_rollout
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.store import TrialStore, TrialWriter, write_json
+from recrl.orchestrator.store import TrialStore, TrialWriter
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, last_lesson
 
@@ -134,23 +136,21 @@ class Trial:
         self.update += 1
         for episode in episodes:
             self._writer.append_episode(episode)
-        self._writer.append_update(
-            {
-                "update": self.update,
-                "phase": phase,
-                "end_step": self.env_steps,
-                "episodes": len(episodes),
-                "episode_return": _mean([episode.episode_return for episode in episodes]),
-                "noise": lesson.policy_noise,
-                "time": round(time.time(), 3),
-                "collect_seconds": round(collect_seconds, 6),
-                "update_seconds": round(time.process_time() - clock, 6),
-                **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
-                **{f"limit_{i}": limit for i, limit in enumerate(lesson.limits)},
-                **self._shown_temperature(lesson),
-                **metrics,
-            }
-        )
+        row = {
+            "update": self.update,
+            "phase": phase,
+            "end_step": self.env_steps,
+            "episodes": len(episodes),
+            "episode_return": _mean([episode.episode_return for episode in episodes]),
+            "noise": lesson.policy_noise,
+            "time": round(time.time(), 3),
+            "collect_seconds": round(collect_seconds, 6),
+            "update_seconds": round(time.process_time() - clock, 6),
+            **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
+            **{f"limit_{i}": limit for i, limit in enumerate(lesson.limits)},
+            **self._shown_temperature(lesson),
+        }
+        self._writer.append_update({**row, **self._own_metrics(metrics, row)})
         self._next_lesson(episodes, rollout.observations)
 
     def save(self) -> None:
@@ -209,7 +209,10 @@ class Trial:
         report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
         self._lesson, self._teacher_state = self._teacher.step(self._teacher_state, report)
         if self._teacher_state.get("start_limits") != measured:
-            self._event("start limits measured", limits=self._teacher_state["start_limits"])
+            limits = self._teacher_state["start_limits"]
+            self._event("start limits measured", limits=limits)
+            if self.spec.is_no_curriculum(limits):
+                self._event("the curriculum is none", limits=limits)
         if self._lesson.policy_noise > 0.0:
             flat = observations.reshape(-1, observations.shape[-1])
             done = self._agent.add_noise(self._lesson.policy_noise, flat)
@@ -229,6 +232,15 @@ class Trial:
             late > (1.0 + HARD_LANDING) * max(final, 1.0) for late, final in zip(before, after, strict=True)
         ):
             self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
+
+    def _own_metrics(self, metrics: Mapping[str, float], row: Mapping[str, Any]) -> Mapping[str, float]:
+        """The agent's metrics, none of which may be called like a column of every trial."""
+        if taken := sorted(metrics.keys() & row.keys()):
+            raise RowError(
+                f"agent {self.spec.agent.label}: its metrics must have other names than the columns that "
+                f"every trial has, got {', '.join(taken)}"
+            )
+        return metrics
 
     def _shown_temperature(self, lesson: Lesson) -> dict[str, float]:
         """The temperature, for teachers that have one."""
@@ -427,7 +439,10 @@ def run_recorded(
         TeacherUnavailableError: the teacher's process is gone; the trial waits to be resumed.
     """
     torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
-    provenance = collect_provenance()  # waits for git, in silence: so before the trial begins
+    provenance = {
+        **collect_provenance(),
+        "code": code_of(spec),
+    }  # waits for git, in silence: so before the trial begins
     try:
         writer = store.begin(spec)
     except StorageError as error:
@@ -435,8 +450,7 @@ def run_recorded(
         return TrialState.WAITING
     with _log_to(store):
         try:
-            with store.writing():
-                write_json(store.provenance_path, provenance)
+            writer.add_provenance(provenance)
             return run_trial(
                 spec,
                 writer,

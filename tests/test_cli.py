@@ -1,6 +1,5 @@
 """The command line: quick to start, honest in its exit codes, and its errors are sentences."""
 
-import json
 import resource
 import signal
 import subprocess
@@ -227,7 +226,7 @@ def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureF
     for name in ("large", "small"):
         store = SweepStore(folder / "runs", name)
         store.folder.mkdir(parents=True)
-        store.info_path.write_text("{}")
+        store.write_info({"name": store.name})
     assert main(["status"]) == ExitCode.WRONG_INPUT
     assert main(["status", "smal"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.splitlines() == [
@@ -334,7 +333,7 @@ def test_logs_of_nobody_and_of_several(
     store = SweepStore(folder / "runs", "small")
     for spec in grid.trials():
         store.trial(spec).begin(spec).close(TrialState.WAITING)
-    store.info_path.write_text("{}")
+    store.write_info({"name": store.name})
     assert main(["logs", "small", *words]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
 
@@ -344,9 +343,9 @@ def test_status_says_why_a_trial_waits(folder: Path, capsys: pytest.CaptureFixtu
     store = SweepStore(folder / "runs", "small")
     spec = grid.trials()[0]
     store.trial(spec).begin(spec).close(TrialState.WAITING, error="the disk was full")
-    store.info_path.write_text("{}")
+    store.write_info({"name": store.name})
     assert main(["status", "--brief"]) == ExitCode.OK  # nothing was launched: no trials are known
-    store.specs_path.write_text(json.dumps(spec.to_json()) + "\n")
+    store.write_specs([spec])
     assert main(["status", "--brief"]) == ExitCode.OK
     assert "\nwaiting: two-state ppo-lag none seed 0: the disk was full\n" in capsys.readouterr().out
 

@@ -39,7 +39,7 @@ def river_grid(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     store = SweepStore(tmp_path_factory.mktemp("runs"), "river")
     trial = store.trial(RIVER)
     assert run_recorded(RIVER, trial, should_stop=lambda: False) is TrialState.COMPLETE
-    store.info_path.write_text("{}")
+    store.write_info({"name": store.name})
     return store
 
 

@@ -1,7 +1,7 @@
 """A sweep's files come back as tidy frames."""
 
-import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +91,7 @@ def test_an_empty_sweep_has_empty_frames_with_columns(tmp_path: Path) -> None:
 def test_trials_never_started_are_there_as_waiting(made_up_sweep: Callable[..., SweepStore]) -> None:
     store = made_up_sweep(seeds=2, tasks=["river-a"], agents=["cpo"], methods=["none"])
     specs = [trial.spec for trial in store.trials()]
-    lines = [json.dumps(spec.to_json(), separators=(",", ":")) for spec in specs]
-    store.specs_path.write_text("\n".join([*lines, lines[0].replace('"seed":0', '"seed":7')]) + "\n")
+    store.write_specs([*specs, replace(specs[0], seed=7)])
     sweep = frames.load(store)
     assert sweep.trials[["seed", "status"]].to_numpy().tolist() == [
         [0, "complete"],
@@ -103,7 +102,7 @@ def test_trials_never_started_are_there_as_waiting(made_up_sweep: Callable[..., 
 
 def test_trials_of_an_older_grid_are_left_out(made_up_sweep: Callable[..., SweepStore]) -> None:
     store = made_up_sweep(seeds=2, tasks=["river-a"], agents=["cpo"], methods=["none", "linear"])
-    store.specs_path.write_text(store.trials()[0].spec_path.read_text().replace("\n", "") + "\n")
+    store.write_specs([store.trials()[0].spec])
     assert len(frames.load(store).trials) == 1
 
 

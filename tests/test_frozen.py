@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,8 +44,8 @@ def run(folder: Path, spec: TrialSpec, *, updates: int | None = None) -> TrialSt
     store = SweepStore(folder, "small")
     answers = iter([False] * (updates if updates is not None else spec.num_updates) + [True])
     run_recorded(spec, store.trial(spec), should_stop=lambda: next(answers))
-    store.info_path.write_text("{}")
-    store.specs_path.write_text(json.dumps(spec.to_json()) + "\n")
+    store.write_info({"name": store.name})
+    store.write_specs([spec])
     return store.trial(spec)
 
 
@@ -114,12 +113,16 @@ def test_a_trial_without_a_checkpoint_is_a_sentence(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_that_does_not_fit_is_a_sentence(complete: TrialStore) -> None:
+    """Its tree has the networks of another agent, as if the agent's code had changed since."""
     other = replace(SPEC, agent=Choice("ppo-lag", {"hidden_sizes": [16]}))
-    complete.spec_path.write_text(json.dumps(other.to_json()))
+    tree = complete.latest_checkpoint()
+    assert tree is not None
+    changed = TrialStore(complete.folder.parent / other.folder_name)
+    changed.begin(other).commit(tree["trial"], update=5, env_steps=200)
     with pytest.raises(
         RecrlError, match=r"^two-state ppo-lag none seed 5: its checkpoint cannot be used with the task and "
     ):
-        FrozenTrial.thaw(TrialStore(complete.folder))
+        FrozenTrial.thaw(changed)
 
 
 def test_a_summary_is_hand_computed(complete: TrialStore) -> None:

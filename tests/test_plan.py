@@ -37,7 +37,7 @@ def _begin(store: SweepStore, spec: TrialSpec, *, env_steps: int, end: TrialStat
 def test_nothing_on_disk_is_all_new(store: SweepStore) -> None:
     plan = make_plan(SPECS, store)
     assert plan.to_do == SPECS
-    assert plan.counts == {Work.NEW: 8, Work.RESUME: 0, Work.RETRY: 0, Work.COMPLETE: 0, Work.FAILED: 0}
+    assert plan.counts == {**dict.fromkeys(Work, 0), Work.NEW: 8}
     assert plan.steps_left == 8000
     assert not store.folder.exists()
 

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,7 +37,7 @@ from recrl.orchestrator.ray_executor import (
 from recrl.orchestrator.ray_nodes import check_nodes, trials_that_fit
 from recrl.orchestrator.remote_sweep import RemoteSweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore, write_json
+from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.teacher_service import RayTeacher, start_teacher_service
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, TeacherSpec
@@ -393,12 +393,12 @@ def test_a_process_is_silent_only_after_it_has_spoken_of_its_trial(tmp_path: Pat
         files.begin(LONG)  # by a process that is dead, and left its record so
         silence = _Silence(store, 0.0, None)
         silence.begin(tune_trial)
-        write_json(files.state_path, asdict(replace(files.record(), pid=process.pid)))
+        files.write_record(replace(files.record(), pid=process.pid))
         for _ in range(3):
             silence.end([tune_trial])
         assert process.poll() is None
         files.begin(LONG)
-        write_json(files.state_path, asdict(replace(files.record(), pid=process.pid)))
+        files.write_record(replace(files.record(), pid=process.pid))
         silence.end([tune_trial])
         assert process.poll() is None
         silence.end([tune_trial])

@@ -11,7 +11,7 @@ def test_a_report_appears_while_the_sweep_runs_and_says_so(made_up_sweep: Callab
     store = made_up_sweep(
         seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 0"]
     )
-    store.info_path.write_text("{}")
+    store.write_info({"name": store.name})
     page, end = store.figures_folder / "report.md", time.monotonic() + 120.0
     with refreshing(store, first_seconds=0.0, interval_seconds=60.0):
         while not page.exists() and time.monotonic() < end:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -123,6 +124,40 @@ def test_a_sweep_in_an_object_store_is_the_sweep_of_a_folder(tmp_path: Path, loc
     again = other.launch()
     assert again.plan.to_do == ()
     assert not [key for key in one.storage.objects.keys_in() if "probe" in key or "launch" in key]
+
+
+def test_a_damaged_mirror_says_that_it_is_one(tmp_path: Path, local: SweepStore) -> None:
+    one = machine(tmp_path, "one")
+    one.launch()
+    other = machine(tmp_path, "other")
+    other.storage.mark(other.store)
+    other.storage.pull(other.store)
+    trial = other.store.trial(grid().trials()[0])
+    whole = trial.episodes_path.read_bytes()
+    trial.episodes_path.write_bytes(whole[:-1])
+    assert trial.record().error == (
+        f"episodes.csv has {len(whole) - 1:,} of its {len(whole):,} committed bytes; the sweep's folder is a "
+        "mirror here: delete it, and it is fetched again"
+    )
+    shutil.rmtree(other.store.folder)
+    again = machine(tmp_path, "other")
+    again.storage.mark(again.store)
+    again.storage.pull(again.store)
+    assert_equal(again.store, local)
+
+
+def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
+    here = machine(tmp_path, "here")
+    with pytest.raises(RecrlError, match="trials of a sweep that is kept there are not run again: "):
+        launch(
+            grid(),
+            here.store,
+            InlineExecutor(here.storage),
+            stop=threading.Event(),
+            storage=here.storage,
+            rerun_damaged=True,
+        )
+    assert not here.store.folder.exists()
 
 
 def test_a_trial_stopped_again_and_again_on_other_machines_equals_itself(

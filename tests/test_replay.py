@@ -35,7 +35,7 @@ def run(root: Path, spec: TrialSpec) -> TrialStore:
     store = SweepStore(root, "sweep")
     trial = store.trial(spec)
     run_recorded(spec, trial, should_stop=lambda: False)
-    store.info_path.write_text("{}")
+    store.write_info({"name": store.name})
     return trial
 
 
@@ -87,7 +87,7 @@ def test_a_run_without_updates_cannot_be_replayed(tmp_path: Path) -> None:
 
 def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest.CaptureFixture[str]) -> None:
     root = trial.folder.parent.parent.parent
-    (root / "sweep" / "trials.jsonl").write_text(trial.spec_path.read_text().replace("\n", "") + "\n")
+    SweepStore(root, "sweep").write_specs([trial.spec])
     command = ["replay", "--root", str(root), "--teacher"]
     assert main([*command, "dynamic", "--option", "window=4"]) == ExitCode.OK
     assert "two-state ppo-lag dynamic seed 1" in capsys.readouterr().out

@@ -1,6 +1,5 @@
 """One call draws a sweep, as far as it has come."""
 
-import json
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,6 +9,7 @@ import pytest
 from recrl.analysis import frames, report
 from recrl.analysis.report import NothingToDrawError
 from recrl.orchestrator.store import SweepStore
+from tests.committing import commit_file
 
 
 def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
@@ -138,9 +138,8 @@ def test_the_page_holds_everything_and_fetches_nothing(
         failed=["<b>bold & wide cpo linear seed 0"],
     )
     trial = store.trials()[0]
-    trial.provenance_path.write_text('{"torch": "9.9"}')
-    store.specs_path.write_text(json.dumps(trial.spec.to_json()) + "\n")
-    store.grid_path.write_text("name: made-up  # <script>alert(1)</script>\n")
+    commit_file(trial, "provenance.json", '{"torch": "9.9"}')
+    store.write_specs([trial.spec], b"name: made-up  # <script>alert(1)</script>\n")
     report.sketch(frames.load(store), tmp_path / "figures")  # the page is made as by draw
     reader = Strict()
     reader.feed((tmp_path / "figures" / "report.html").read_text())

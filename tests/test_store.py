@@ -12,8 +12,9 @@ import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import LostLeaseError, SweepBusyError
+from recrl.orchestrator.small_files import write_atomically
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore, TrialStore, TrialWriter, write_atomically
+from recrl.orchestrator.store import SweepStore, TrialStore, TrialWriter
 
 SPEC = TrialSpec(
     task=Choice("two-state"),

@@ -10,7 +10,6 @@ import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -24,7 +23,7 @@ from recrl.analysis.frames import KEY, Sweep
 from recrl.orchestrator.cli import main
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.store import SweepStore, write_json
+from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.tracking import sync, tracking_uri
 from recrl.orchestrator.tracking_database import (
     Database,
@@ -43,6 +42,7 @@ from recrl.orchestrator.tracking_snapshot import (
     Snapshot,
 )
 from recrl.orchestrator.tracking_ui import UI, open_ui
+from tests.committing import commit_file
 
 # MLflow 3.17 maps its tables in a way that SQLAlchemy 2.1 calls deprecated; not ours to mend.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")
@@ -64,10 +64,10 @@ def sweep(
         if labels == ("river-a", "cpo") and trial.spec.method.label != "linear":
             shutil.copytree(trial.folder, store.trial(trial.spec).folder)
     trial = store.trials()[0]
-    trial.policy_path.write_text("action_0,action_1\n0.25,0.75\n1.0,0.0\n")
-    trial.provenance_path.write_text('{"torch": "9.9"}')
+    commit_file(trial, "policy.csv", "action_0,action_1\n0.25,0.75\n1.0,0.0\n")
+    commit_file(trial, "provenance.json", '{"torch": "9.9"}')
     store.grid_path.write_text("name: made-up\n")
-    store.info_path.write_text("{}")
+    store.write_info({"name": store.name})
     shutil.copy(empty_database, store.mlflow_database)
     assert sync(store, tracking_uri(store, None)).problem == ""
     return store
@@ -115,10 +115,7 @@ def test_an_infinite_limit_and_a_cost_of_no_episodes_come_back(
     for name in ("cost_0", "episode_return"):
         cells[header.index(name)] = "nan"
     text[5] = ",".join(cells)
-    length = trial.updates_path.write_text("\n".join(text) + "\n")
-    record = trial.record()
-    record.committed[trial.updates_path.name] = length
-    write_json(trial.state_path, asdict(record))
+    commit_file(trial, "updates.csv", "\n".join(text) + "\n")
     shutil.copy(empty_database, store.mlflow_database)
     assert sync(store, tracking_uri(store, None)).problem == ""
     updates = tracked.load(tracking_uri(store, None), store.name).updates

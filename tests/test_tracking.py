@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ import pytest
 from recrl.orchestrator import tracking
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore, write_json
+from recrl.orchestrator.store import SweepStore, TrialRecord, TrialStore
 from recrl.orchestrator.tracking import run_status, sync, tracking_uri
 from recrl.orchestrator.tracking_mirror import start_mirror
 from recrl.orchestrator.tracking_points import (
@@ -34,6 +34,7 @@ from recrl.orchestrator.tracking_points import (
 )
 from recrl.orchestrator.tracking_snapshot import SNAPSHOT_TAG
 from recrl.orchestrator.tracking_ui import open_ui, ui_command, ui_url
+from tests.committing import commit_file
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -432,7 +433,7 @@ def test_rows_that_were_cut_back_are_gone_from_mlflow_too(
     grow(store, done, DYNAMIC)
     trial = trial_titled(store, DYNAMIC)
     text = trial.updates_path.read_text().replace("1700000020.0", "1700009999.0")  # update 20, written anew
-    trial.updates_path.write_text(text)
+    commit_file(trial, "updates.csv", text)
     sync(store, tracking_uri(store, None))
     points = history(store, runs(store)[DYNAMIC])["student/kl"]
     assert len(points) == 40
@@ -450,7 +451,7 @@ def test_a_resumed_trial_runs_again_and_loses_its_error(write: Callable[..., Swe
     assert run.info.status == "RUNNING"
     assert "recrl.error" not in run.data.tags
     assert run.data.tags["recrl.attempt"] == "2"
-    write_json(trial.state_path, asdict(replace(trial.record(), pid=2**22 + 1)))  # no process has this number
+    trial.write_record(replace(trial.record(), pid=2**22 + 1))  # no process has this number
     sync(store, uri)
     assert runs(store)[DYNAMIC].info.status == "KILLED"
 

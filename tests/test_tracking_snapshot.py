@@ -17,6 +17,7 @@ from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.store import SweepStore
 from recrl.orchestrator.tracking_points import points, rows_after, thinned
 from recrl.orchestrator.tracking_snapshot import MEMBERS, Announcement, HeldRun, ShownTrial, Snapshot
+from tests.committing import commit_file
 
 RUN = {"run_id": "a", "attempt": 1, "update": 2, "complete": False}
 RUNS = {"format": 1, "runs": [RUN], "metrics": ["train/return"]}
@@ -48,9 +49,9 @@ def test_a_snapshot_says_what_is_in_it() -> None:
 def test_a_snapshot_taken_is_what_mlflow_was_sent(made_up_sweep: Callable[..., SweepStore]) -> None:
     store = made_up_sweep(seeds=2, tasks=["a"], agents=["cpo"], methods=["dynamic", "unconstrained"])
     for trial in store.trials():
-        trial.policy_path.write_text("action_0\n1.0\n")
-        trial.events_path.write_text("")  # is not sent
-        trial.provenance_path.write_text("{}")
+        commit_file(trial, "policy.csv", "action_0\n1.0\n")
+        commit_file(trial, "events.jsonl", "")  # is not sent
+        commit_file(trial, "provenance.json", "{}")
     shown = [
         ShownTrial(trial, f"run-{index}", 1, trial.record().committed["updates.csv"], complete=index != 1)
         for index, trial in enumerate(store.trials())
