@@ -211,9 +211,9 @@ def test_numbers_that_break_down_are_located(tmp_path: Path, monkeypatch: pytest
     assert run_recorded(spec, store, should_stop=never, commit_seconds=0.0) is TrialState.FAILED
     record = store.record()
     assert record.error == (
-        "TaskOutputError: the task my_poisoned_task:TASK returned a reward of nan at step 1 of the rollout in "
-        "environment 0 (4 of 40 numbers); all must be finite (in update 5; the last good checkpoint is that of "
-        "update 4)"
+        "TaskOutputError: the task my_poisoned_task:TASK returned a reward of nan at step 1 of the rollout "
+        "in environment 0 (4 of 40 numbers); all must be finite (in update 5; the last good checkpoint is "
+        "that of update 4)"
     )
     assert "in update 5" in store.error_path.read_text()
     assert store.updates()["update"].tolist() == [1, 2, 3, 4]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import pytest
 from recrl.analysis import frames, report
 from recrl.orchestrator.cli import main
 from recrl.orchestrator.errors import CheckpointError, DamagedError, RowError
-from recrl.orchestrator.executors import InlineExecutor
+from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid import parse_grid
 from recrl.orchestrator.plan import Work, make_plan
@@ -39,7 +40,7 @@ GOES_ON = "the next launch goes on from what is whole and moves what is damaged 
 SPECS = parse_grid(GRID.encode(), source="grid.yaml").trials()
 
 
-def run(store: SweepStore, *, updates: int | None = None, **options: bool) -> SweepResult:
+def run(store: SweepStore, *, updates: int | None = None, **options: Any) -> SweepResult:
     """Launch the grid; its trials are stopped after so many updates."""
 
     class Stopping:
@@ -52,7 +53,7 @@ def run(store: SweepStore, *, updates: int | None = None, **options: bool) -> Sw
                     commit_seconds=0.0,
                 )
 
-    executor = InlineExecutor() if updates is None else Stopping()
+    executor: Executor = InlineExecutor() if updates is None else Stopping()
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     return launch(grid, store, executor, stop=threading.Event(), **options)
 
@@ -482,8 +483,8 @@ def test_an_agent_whose_metrics_change_is_named_and_one_that_reorders_them_is_no
         plain = SweepStore(tmp_path, "plain").trial(SPECS[0])
         run_recorded(SPECS[0], plain, should_stop=lambda: False)
         one, other = trial.updates(), plain.updates()
-        names = [name for name in one if name not in ("time", "collect_seconds", "update_seconds")]
-        assert sorted(one) == sorted(other)
+        names = [str(name) for name in one if name not in ("time", "collect_seconds", "update_seconds")]
+        assert sorted(map(str, one)) == sorted(map(str, other))
         assert one[names].equals(other[names])
     del sys.modules["my_fickle_agent"]
 

@@ -13,7 +13,7 @@ from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 DECAYS = (linear, cosine, exponential)
 
 
-def teacher(name: str, *, train: tuple[float, ...], deploy: tuple[float, ...], **options: int) -> Teacher:
+def teacher(name: str, *, train: tuple[float, ...], deploy: tuple[float, ...], **options: float) -> Teacher:
     """A teacher with a budget of B = 100 environment steps."""
     return make_teacher(TeacherSpec(name, options, CostLimits(train), CostLimits(deploy), train_steps=100))
 

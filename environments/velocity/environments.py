@@ -161,6 +161,13 @@ class VelocityVectorEnv(CMDPVectorEnv):
             observations = worlds.observations()
         return observations, outcome.rewards, outcome.terminated, outcome.truncated, info
 
+    def restart(self, index: npt.NDArray[np.intp]) -> Observations:
+        """Begin new episodes in some environments; see ``recrl.environments.vector``."""
+        if not self.worlds.generators:
+            raise ValueError(f"{self.cmdp.name}: call reset before restart")
+        self.worlds.restart(index)
+        return self.worlds.observations()
+
     def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
         """One RGB picture of each environment, [height, width, 3]."""
         return self._camera.frames(self.worlds)

@@ -86,6 +86,9 @@ class Stub(CMDPVectorEnv):
             truncated, info["final_obs"] = ~self._never, self._observations[now]
         return self._observations[self._step], self._rewards[now], self._never, truncated, info
 
+    def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[np.float32]:
+        return self._observations[self._step]
+
     def state_dict(self) -> dict[str, Any]:
         return {"step": self._step}
 
@@ -138,6 +141,9 @@ class TimedSteps(CMDPVectorEnv):
             self._rival()
             self.rival_seconds.append(time.thread_time() - end)
         return stepped
+
+    def restart(self, index: npt.NDArray[np.intp]) -> Any:
+        return self._environments.restart(index)
 
     def state_dict(self) -> dict[str, Any]:
         return self._environments.state_dict()

@@ -50,8 +50,8 @@ def explained(agent: ActorCritic, rollout: Rollout) -> Floats:
     observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
     actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
     batch = LearningBatch.gather(observations, actions, compact=False)
-    advantages, targets = agent._estimate(rollout, rollout.costs, batch)
-    share: Floats = 1.0 - advantages.var(axis=0) / targets.var(axis=0)
+    found = agent._estimate(rollout, rollout.costs, batch)
+    share: Floats = 1.0 - found.advantages.var(axis=0) / found.targets.var(axis=0)
     return share
 
 
