@@ -183,5 +183,5 @@ class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 
     def observation(self, observation: Any) -> Rows:
         """Add the proximity features, [n] -> [n + S L]."""
-        encoded: Rows = self._encoder(np.asarray(observation, np.float32)[None])
-        return encoded[0].copy()
+        encoded: Rows = self._encoder(np.asarray(observation, np.float32)[None]).reshape(-1)
+        return encoded

@@ -3,7 +3,7 @@
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,7 +44,7 @@ def run(store: SweepStore, *, updates: int | None = None, **options: Any) -> Swe
     """Launch the grid; its trials are stopped after so many updates."""
 
     class Stopping:
-        def run(self, specs: tuple[TrialSpec, ...], store: SweepStore, stop: threading.Event) -> None:
+        def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
             for spec in specs:
                 run_recorded(
                     spec,

@@ -160,6 +160,14 @@ def test_limits_start_where_the_teacher_measured_and_never_rise(undisturbed: Tri
     assert [event["event"] for event in undisturbed.events()] == ["start limits measured"]
 
 
+def test_a_limit_that_falls_at_once_when_training_ends_is_an_event(tmp_path: Path) -> None:
+    store = run(tmp_path, replace(SPEC, method=Choice("step"), train_limits=CostLimits((50.0,))))
+    (event,) = store.events()
+    assert event["event"] == "hard landing"
+    assert (event["limits"], event["deploy_limits"]) == ([50.0], SPEC.deploy_limits.to_json())
+    assert run(tmp_path / "soft", replace(SPEC, method=Choice("none"))).events() == []
+
+
 def test_every_episode_is_recorded_once_with_its_place(undisturbed: TrialStore) -> None:
     episodes = undisturbed.episodes()
     assert episodes["index"].tolist() == list(range(len(episodes)))

@@ -87,7 +87,8 @@ class Stub(CMDPVectorEnv):
         return self._observations[self._step], self._rewards[now], self._never, truncated, info
 
     def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[np.float32]:
-        return self._observations[self._step]
+        now: npt.NDArray[np.float32] = self._observations[self._step]
+        return now
 
     def state_dict(self) -> dict[str, Any]:
         return {"step": self._step}
