@@ -34,11 +34,11 @@ LESSONS = [
     Lesson("cpo", "two-state", (3.0,), 80, seeds=2),
     Lesson("ppo-lag", "two-state-2", (5.0, 2.0), 150, seeds=2, num_envs=64),
     Lesson("cpo", "two-state-2", (5.0, 2.0), 80, seeds=2),
-    Lesson("ppo-lag", "continuous-bandit", (2.5,), 250, seeds=2),
+    Lesson("ppo-lag", "continuous-bandit", (2.5,), 500, seeds=2),
     Lesson("cpo", "continuous-bandit", (2.5,), 80, seeds=2),
     Lesson("trpo-lag", "two-state", (3.0,), 150),
     Lesson("trpo-lag", "two-state-2", (5.0, 2.0), 200),
-    Lesson("trpo-lag", "continuous-bandit", (2.5,), 100),
+    Lesson("trpo-lag", "continuous-bandit", (2.5,), 150),
     Lesson("pcpo", "two-state", (3.0,), 100),
     Lesson("pcpo", "two-state-2", (5.0, 2.0), 100),
     Lesson("pcpo", "continuous-bandit", (2.5,), 100),
@@ -49,7 +49,7 @@ LESSONS = [
     Lesson("ipo", "two-state", (3.0,), 200),
     Lesson("ipo", "two-state-2", (5.0, 2.0), 200, seeds=0),
     Lesson("crpo", "two-state", (3.0,), 100),
-    Lesson("crpo", "two-state-2", (5.0, 2.0), 150),
+    Lesson("crpo", "two-state-2", (5.0, 2.0), 150, num_envs=128),
 ]
 
 

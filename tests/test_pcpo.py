@@ -154,7 +154,7 @@ def improved(
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("name", ["pcpo", "crpo", "trpo-lag"])
 def test_the_step_serves_the_constraints_within_the_trust_region(name: str, space: Space[object]) -> None:
-    violated, change = improved(name, space, [30.0, -9.0], [10.0, 10.0])
+    violated, change = improved(name, space, [30.0, -9.0], [1.0, 10.0])
     assert violated["surrogate_cost_0"] < 0.0
     assert violated["policy_steps"] == 1.0
     assert 0.0 < violated["kl"] <= DELTA

@@ -181,7 +181,7 @@ def test_what_the_command_prints_is_a_grids_task(
     main()
     printed = capsys.readouterr().out
     assert printed == "\n".join(grid_entry({"map_seed": seed, "horizon": 30}) for seed in (0, 1)) + "\n"
-    head = "name: generated\nagents: [ppo-lag]\nmethods: [none]\nseeds: 1\nrun: {total_steps: 1000}\ntasks:\n"
+    head = "name: generated\nagents: [ppo-lag]\nmethods: [none]\nseeds: 1\nrun: {total_steps: 4000}\ntasks:\n"
     grid = parse_grid((head + printed).encode(), source="printed.yaml")
     for seed, cell in enumerate(grid.tasks):
         assert cell.task.label == f"map-{seed}"

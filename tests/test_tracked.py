@@ -336,9 +336,7 @@ def test_what_goes_wrong_behind_the_first_rows_is_a_sentence(tmp_path: Path) -> 
 
 def test_a_databases_password_is_not_shown() -> None:
     uri = "postgresql://me:hunter2@host/mlflow"
-    assert (
-        str(unreadable(uri, OSError())) == "MLflow at postgresql://me:***@host/mlflow cannot be read: OSError"
-    )
+    assert str(unreadable(uri, OSError())) == "MLflow at postgresql://***@host/mlflow cannot be read: OSError"
 
 
 def test_a_file_that_is_no_database_of_mlflows_is_named(tmp_path: Path) -> None:
