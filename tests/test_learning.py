@@ -49,7 +49,7 @@ LESSONS = [
     Lesson("ipo", "two-state", (3.0,), 200),
     Lesson("ipo", "two-state-2", (5.0, 2.0), 200, seeds=0),
     Lesson("crpo", "two-state", (3.0,), 100),
-    Lesson("crpo", "two-state-2", (5.0, 2.0), 150, num_envs=128),
+    Lesson("crpo", "two-state-2", (5.0, 2.0), 300, num_envs=128),
 ]
 
 

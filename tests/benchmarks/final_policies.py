@@ -1,0 +1,43 @@
+"""What the final policies of a sweep earn and cost: a row a trial and policy, from its evaluation.
+
+python tests/benchmarks/final_policies.py runs/safety-gym-agents --to results/safety-gym/agents.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pandas as pd
+
+from recrl.analysis.frames import load
+from recrl.orchestrator.store import SweepStore
+
+KEYS = ["task", "agent", "method", "seed", "policy"]
+
+
+def final_policies(sweep: Path) -> pd.DataFrame:
+    """Means and standard errors over the episodes of each evaluation; complete trials only."""
+    evaluations = load(SweepStore(sweep.parent, sweep.name)).evaluations
+    grouped = evaluations.groupby(KEYS, observed=True)
+    columns = {"return": "episode_return", "cost": "cost_0"}
+    table = {"episodes": grouped.size()}
+    for name, column in columns.items():
+        table[name] = grouped[column].mean().round(3)
+        table[f"{name}_se"] = grouped[column].sem().round(3)
+    return pd.DataFrame(table).reset_index()
+
+
+def main() -> None:
+    """Read, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sweep", type=Path)
+    parser.add_argument("--to", type=Path, required=True)
+    arguments = parser.parse_args()
+    table = final_policies(arguments.sweep)
+    print(table.to_string(index=False))
+    table.to_csv(arguments.to, index=False, lineterminator="\n")
+
+
+if __name__ == "__main__":
+    main()
