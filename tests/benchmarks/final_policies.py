@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -21,7 +22,7 @@ def final_policies(sweep: Path) -> pd.DataFrame:
     evaluations = load(SweepStore(sweep.parent, sweep.name)).evaluations
     grouped = evaluations.groupby(KEYS, observed=True)
     columns = {"return": "episode_return", "cost": "cost_0"}
-    table = {"episodes": grouped.size()}
+    table: dict[str, pd.Series[Any]] = {"episodes": grouped.size()}
     for name, column in columns.items():
         table[name] = grouped[column].mean().round(3)
         table[f"{name}_se"] = grouped[column].sem().round(3)
