@@ -519,8 +519,13 @@ def _folder(text: str) -> Path:
         )
     path = _path(text)
     try:
-        if path.exists() and not path.is_dir():
+        files = [each for each in (path, *path.parents) if each.exists() and not each.is_dir()]
+        if files and files[0] == path:
             raise argparse.ArgumentTypeError(f"must be a folder, got the file {text!r}")
+        if files:
+            raise argparse.ArgumentTypeError(
+                f"must be a folder, but {str(files[0])!r} is a file, got {text!r}"
+            )
     except (OSError, ValueError) as error:
         raise argparse.ArgumentTypeError(_no_path(text, error)) from error
     return path

@@ -409,3 +409,10 @@ def test_a_wrong_option_is_a_sentence(
     with pytest.raises(SystemExit):
         main(["plan", "grid.yaml", option])
     assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep plan: error: {sentence}"
+
+
+def test_a_root_below_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "grid.yaml").write_text("name: x")
+    with pytest.raises(SystemExit):
+        main(["status", "x", "--root", str(tmp_path / "grid.yaml" / "below")])
+    assert f"must be a folder, but '{tmp_path / 'grid.yaml'}' is a file" in capsys.readouterr().err
