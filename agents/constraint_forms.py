@@ -108,7 +108,7 @@ def standard_errors(costs: Floats) -> Floats:
 
 
 class RecentEpisodes:
-    """The last finished episodes: those of the newest update, and of so many before it as a window needs.
+    """The last finished episodes: those of the newest update, and of earlier ones until the window is full.
 
     Args:
         window: the fewest episodes that will do, at least 1; there are fewer only before as many finished.
