@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from recrl.agents.actor_critic import PolicyRule, fresh_student
-from recrl.agents.advantages import reward_spread
-from recrl.agents.collect import Collector, episode_costs
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, LocalModel, solve_against
+from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.config import CPOConfig
-from recrl.agents.cpo import ConstrainedPolicyOptimisation, LocalModel, solve_against
-from recrl.agents.cross_fitting import halves
+from recrl.agents.constraints.cross_fitting import halves
 from recrl.agents.experience import Experience
-from recrl.agents.policies import StochasticPolicy
+from recrl.agents.learning.actor_critic import PolicyRule, fresh_student
+from recrl.agents.learning.advantages import reward_spread
+from recrl.agents.learning.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
 from recrl.environments.registry import make_vector
 

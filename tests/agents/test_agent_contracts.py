@@ -1,0 +1,402 @@
+"""What every student promises, whatever its algorithm (``recrl.agents.agent.Agent``)."""
+
+import gc
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from recrl.agents.agent import Agent, EntropySeeker, Rollout
+from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
+from recrl.agents.config import AscentConfig
+from recrl.agents.constraints.multiplier_rules import STARTS
+from recrl.agents.errors import DivergedError
+from recrl.agents.registry import AGENTS, agent_config, make_agent
+from recrl.environments.cmdp import Floats
+from recrl.environments.registry import make_vector
+from recrl.orchestrator.files.checkpoint import decode, encode
+
+TASKS = {"two-state": 3.0, "two-state-2": 3.0, "continuous-bandit": 2.5}
+OPTIONS = {"hidden_sizes": [16, 16], "critic_steps": 5}
+FINITE, SEVERAL_UPDATES = 3.0, 4
+
+
+class Lessons:
+    """A student with its task, advanced update by update."""
+
+    def __init__(self, agent: str, task: str, options: dict[str, Any] | None = None) -> None:
+        environments = make_vector(task, 4)
+        self.num_costs = environments.cmdp.num_costs
+        self.agent: Agent = make_agent(
+            agent, environments.cmdp, OPTIONS | (options or {}), np.random.SeedSequence(7)
+        )
+        self.collector = Collector(environments, num_steps=20)
+        self.collector.reset(seed=1)
+        self.generator = np.random.default_rng(2)
+
+    def collect(self) -> tuple[Rollout, tuple[FinishedEpisode, ...]]:
+        return self.collector.collect(self.agent, self.generator)
+
+    def limits(self, value: float = FINITE) -> Floats:
+        return np.full(self.num_costs, value)
+
+    def update(self, limit: float = FINITE) -> dict[str, float]:
+        rollout, episodes = self.collect()
+        return self.agent.update(rollout, episode_costs(episodes, self.num_costs), self.limits(limit))
+
+
+def flattened(tree: Any) -> list[Any]:
+    """The leaves of a state, arrays as bytes."""
+    if isinstance(tree, dict):
+        return [leaf for key in sorted(tree) for leaf in (key, *flattened(tree[key]))]
+    return [tree.tobytes() if isinstance(tree, np.ndarray) else tree]
+
+
+every_agent = pytest.mark.parametrize("agent", AGENTS)
+every_task = pytest.mark.parametrize("task", TASKS)
+
+
+@every_agent
+@every_task
+def test_every_update_returns_the_same_metrics_and_no_infinity(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    keys = set()
+    for limit in (FINITE, math.inf, 0.0, 100.0):
+        metrics = lessons.update(limit)
+        assert not any(math.isinf(value) for value in metrics.values())
+        keys.add(tuple(sorted(metrics)))
+    rollout, _ = lessons.collect()
+    none_finished = lessons.agent.update(rollout, np.empty((0, lessons.num_costs)), lessons.limits())
+    keys.add(tuple(sorted(none_finished)))
+    assert len(keys) == 1
+    for index in range(lessons.num_costs):
+        reported = ("multiplier", "cost_gap", "cost_advantage_max", "value_loss_cost")
+        assert {f"{name}_{index}" for name in reported} <= set(none_finished)
+    assert {"kl", "entropy", "policy_steps", "surrogate_reward", "value_loss_reward"} <= set(none_finished)
+
+
+@every_agent
+@every_task
+def test_resumed_is_uninterrupted_bit_for_bit(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    for _ in range(SEVERAL_UPDATES):
+        lessons.update()
+    resumed = Lessons(agent, task)
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    for _ in range(SEVERAL_UPDATES):
+        rollout, episodes = lessons.collect()
+        costs = episode_costs(episodes, lessons.num_costs)
+        expected = lessons.agent.update(rollout, costs, lessons.limits())
+        found = resumed.agent.update(rollout, costs, lessons.limits())
+        assert repr(found) == repr(expected)
+    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
+
+
+@every_agent
+def test_equal_seeds_give_equal_bytes(agent: str) -> None:
+    first, second = Lessons(agent, "two-state"), Lessons(agent, "two-state")
+    for lessons in (first, second):
+        for _ in range(SEVERAL_UPDATES):
+            lessons.update()
+    assert flattened(first.agent.state_dict()) == flattened(second.agent.state_dict())
+
+
+def test_every_student_begins_with_the_same_policy() -> None:
+    policies = [Lessons(agent, "two-state").agent.state_dict()["policy"] for agent in AGENTS]
+    for policy in policies[1:]:
+        np.testing.assert_array_equal(policy, policies[0])
+
+
+@every_agent
+@every_task
+def test_the_state_is_a_copy(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    state = lessons.agent.state_dict()
+    before = flattened(state)
+    lessons.update()
+    assert flattened(state) == before
+
+
+@every_agent
+@every_task
+def test_actions_have_the_shape_and_type_of_the_seam(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    rollout, _ = lessons.collect()
+    observations = rollout.observations[0]
+    for actions in (
+        lessons.agent.act(observations, np.random.default_rng(0)),
+        lessons.agent.act_greedily(observations),
+    ):
+        gaussian = task == "continuous-bandit"
+        assert actions.shape == ((4, 1) if gaussian else (4,))
+        assert actions.dtype == np.dtype(np.float32 if gaussian else np.int64)
+
+
+@every_agent
+@every_task
+def test_the_student_knows_no_limit_of_its_own(agent: str, task: str) -> None:
+    one, other = Lessons(agent, task), Lessons(agent, task)
+    rollout, episodes = one.collect()
+    costs = episode_costs(episodes, one.num_costs)
+    one.agent.update(rollout, costs, one.limits(1.0))
+    other.agent.update(rollout, costs, other.limits(2.0))
+    one.agent.load_state_dict(other.agent.state_dict())
+    assert repr(one.agent.update(rollout, costs, one.limits(2.0))) == repr(
+        other.agent.update(rollout, costs, other.limits(2.0))
+    )
+
+
+@every_agent
+@every_task
+def test_noise_returns_the_same_metrics_and_keeps_the_student_learning(agent: str, task: str) -> None:
+    lessons = Lessons(agent, task)
+    lessons.update()
+    rollout, _ = lessons.collect()
+    rows = rollout.observations.reshape(-1, rollout.observations.shape[-1])
+    keys = {tuple(lessons.agent.add_noise(noise, rows)) for noise in (0.1, 1.0)}
+    assert keys == {("noise_scale", "randomness_before", "randomness_after")}
+    assert math.isfinite(lessons.update()["kl"])
+
+
+@every_agent
+@every_task
+def test_entropy_that_is_rewarded_rises_in_one_update_and_survives_a_checkpoint(
+    agent: str, task: str
+) -> None:
+    plain, warm, resumed = (Lessons(agent, task, {"compaction": False}) for _ in range(3))
+    for student in (plain, warm, resumed):
+        assert isinstance(student.agent, EntropySeeker)
+        for _ in range(2):
+            student.update()
+    warm.agent.reward_entropy(1e4)  # type: ignore[attr-defined]  # asserted above
+    resumed.agent.load_state_dict(decode(encode(warm.agent.state_dict()), source="memory"))
+    kept = 1000.0  # a student that recovers from a violation looks at nothing else
+    entropies = [student.update(kept)["entropy"] for student in (plain, warm, resumed)]
+    assert entropies[1] > entropies[0]
+    assert entropies[2] == entropies[1]
+    cooled = Lessons(agent, task, {"compaction": False})
+    cooled.agent.load_state_dict(warm.agent.state_dict())
+    assert warm.agent.state_dict()["temperature"] == 0.0
+    rollout, episodes = warm.collect()
+    costs = episode_costs(episodes, warm.num_costs)
+    updates = [each.agent.update(rollout, costs, each.limits()) for each in (warm, cooled)]
+    assert repr(updates[0]) == repr(updates[1])
+
+
+@pytest.mark.parametrize("rule", STARTS)
+def test_a_student_that_waits_sums_up_no_violation_of_a_noisy_policy(rule: str) -> None:
+    options = {
+        **{"multiplier_rule": rule, "multiplier_initial": 0.5, "multiplier_proportional": 0.0},
+        **{"multiplier_waits": True, "multiplier_unit": "cost"},
+    }
+    lessons, resumed = (Lessons("ppo-lag", "two-state", options) for _ in range(2))
+    rollout, _ = lessons.collect()
+    lessons.agent.add_noise(0.1, rollout.observations.reshape(-1, rollout.observations.shape[-1]))
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    violated = 0.1
+    assert [student.update(violated)["multiplier_0"] for student in (lessons, resumed)] == pytest.approx(
+        [0.5] * 2
+    )
+    assert lessons.update(violated)["multiplier_0"] > 0.5
+
+
+@pytest.mark.parametrize("agent", ["ppo-lag", "trpo-lag"])
+def test_a_geometric_price_comes_down_faster_from_where_it_is_high(agent: str) -> None:
+    fall = {}
+    for geometric in (False, True):
+        options = {
+            **{"multiplier_initial": 9.0, "multiplier_step": 0.1, "multiplier_proportional": 0.0},
+            "multiplier_geometric": geometric,
+        }
+        lessons = Lessons(agent, "two-state", options)
+        metrics = lessons.update(1e9)
+        fall[geometric] = metrics["multiplier_0"]
+    # Both begin at 9 and differ only in the unit that the multipliers are reported in.
+    assert fall[True] / fall[False] == pytest.approx((10.0 * math.exp(-0.1) - 1.0) / 8.9)
+
+
+def test_a_geometric_price_of_another_rule_is_refused() -> None:
+    with pytest.raises(ValueError, match="with the rule projected it must be false"):
+        Lessons("ppo-lag", "two-state", {"multiplier_rule": "projected", "multiplier_geometric": True})
+
+
+@every_agent
+@pytest.mark.parametrize("task", ["two-state", "continuous-bandit"])
+def test_noise_changes_the_trust_region_of_its_update_alone(agent: str, task: str) -> None:
+    """Two updates, the first after noise, are those of students that had its radius and then their own."""
+    wide, narrow = {"target_kl": 0.02}, {"target_kl": 0.0005}
+    student = Lessons(agent, task, {**narrow, "noisy_target_kl": 0.02})
+    for options in (wide, narrow):
+        other = Lessons(agent, task, options)
+        state = student.agent.state_dict()
+        other.agent.load_state_dict(state)
+        rollout, episodes = student.collect()
+        if options is wide:
+            observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
+            for each in (student, other):
+                each.agent.add_noise(0.1, observations)
+        costs = episode_costs(episodes, 1)
+        metrics = [each.agent.update(rollout, costs, each.limits()) for each in (student, other)]
+        assert metrics[0] == pytest.approx(metrics[1], rel=0, abs=0, nan_ok=True)
+        assert flattened(student.agent.state_dict()) == flattened(other.agent.state_dict())
+    assert metrics[0]["kl"] < 0.002
+
+
+@every_agent
+def test_a_margin_is_a_lower_limit(agent: str) -> None:
+    """A student with a margin learns what one without it does from a limit that is lower by as much."""
+    rule = {"multiplier_rule": "projected", "multiplier_unit": "cost"}  # the others know the limit, too
+    options = rule if agent in {"ppo-lag", "trpo-lag", "focops"} else {}
+    careful, other = (Lessons(agent, "two-state", options | margin) for margin in ({"limit_margin": 2.0}, {}))
+    rollout, episodes = careful.collect()
+    costs = episode_costs(episodes, 1)
+    margin = 2.0 * costs.std(axis=0, ddof=1) / math.sqrt(len(costs))
+    assert margin > 0.0
+    metrics = careful.agent.update(rollout, costs, careful.limits())
+    assert metrics == pytest.approx(other.agent.update(rollout, costs, other.limits() - margin), nan_ok=True)
+
+
+@pytest.mark.parametrize("agent", ["cpo", "pcpo", "trpo"])
+def test_with_a_temperature_a_student_settles(agent: str) -> None:
+    """Where nothing is left to gain, steps to the edge of the trust region lead anywhere."""
+    late = {}
+    for temperature in (0.0, 0.3):
+        options = {"target_kl": 0.05, "temperature": temperature, "critic_steps": 40}
+        lessons = Lessons(agent, "two-state", options)
+        entropies = [lessons.update(math.inf)["entropy"] for _ in range(60)]
+        late[temperature] = max(entropies[30:])
+    assert late[0.3] < 0.01
+    assert late[0.0] > 0.1
+
+
+def test_a_margin_of_the_worst_episodes_is_refused() -> None:
+    with pytest.raises(ValueError, match="with the constraint cvar it must be 0, got 1"):
+        Lessons("cpo", "two-state", {"constraint": "cvar", "limit_margin": 1.0})
+
+
+@every_agent
+def test_the_paper_preset_learns_with_the_same_metrics(agent: str) -> None:
+    paper = Lessons(agent, "continuous-bandit", {"preset": "paper"})
+    assert set(paper.update()) == set(Lessons(agent, "continuous-bandit").update())
+
+
+@every_agent
+def test_a_reward_that_is_not_a_number_is_named(agent: str) -> None:
+    lessons = Lessons(agent, "two-state")
+    rollout, episodes = lessons.collect()
+    rewards = rollout.rewards.copy()
+    rewards[0, 0] = math.nan
+    with pytest.raises(DivergedError, match="rewards and costs must be finite, got 1 of 160 that are not"):
+        lessons.agent.update(replace(rollout, rewards=rewards), episode_costs(episodes, 1), lessons.limits())
+
+
+@every_agent
+def test_parameters_that_diverge_are_named(agent: str) -> None:
+    lessons = Lessons(agent, "two-state")
+    state = lessons.agent.state_dict()
+    state["critics"] = np.full_like(state["critics"], np.nan)
+    lessons.agent.load_state_dict(state)
+    with pytest.raises(DivergedError, match="must be finite, got"):
+        lessons.update()
+
+
+@every_agent
+@pytest.mark.parametrize("task", ["two-state", "two-state-2"])
+def test_evaluating_repeated_observations_once_changes_only_the_speed(agent: str, task: str) -> None:
+    compact, plain = Lessons(agent, task), Lessons(agent, task, {"compaction": False})
+    for _ in range(2):
+        found, expected = compact.update(), plain.update()
+        for key, value in expected.items():
+            assert found[key] == pytest.approx(value, rel=2e-3, abs=2e-4, nan_ok=True), key
+
+
+MINIBATCHES = {"compaction": False, "minibatch_size": 16, "critic_passes": 2}
+
+
+@every_agent
+@pytest.mark.parametrize("task", ["two-state-2", "continuous-bandit"])
+def test_a_student_of_minibatches_resumes_bit_for_bit(agent: str, task: str) -> None:
+    has_metric = "metric_samples" in agent_config(agent, {}).model_dump()
+    options = MINIBATCHES | ({"metric_samples": 20} if has_metric else {})
+    lessons = Lessons(agent, task, options)
+    for _ in range(2):
+        lessons.update()
+    resumed = Lessons(agent, task, options)
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    for _ in range(2):
+        rollout, episodes = lessons.collect()
+        costs = episode_costs(episodes, lessons.num_costs)
+        expected = lessons.agent.update(rollout, costs, lessons.limits())
+        assert repr(resumed.agent.update(rollout, costs, lessons.limits())) == repr(expected)
+        if isinstance(agent_config(agent, options), AscentConfig):
+            assert expected["policy_steps"] >= 1.0
+    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
+
+
+@every_agent
+def test_a_bound_on_the_worst_episodes_returns_the_same_metrics_and_resumes(agent: str) -> None:
+    options = {"constraint": "cvar", "cvar_level": 0.5}
+    lessons, resumed = (Lessons(agent, "two-state-2", options) for _ in range(2))
+    assert set(lessons.update()) == set(Lessons(agent, "two-state-2").update())
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    rollout, _ = lessons.collect()
+    none_finished = np.empty((0, 2))
+    expected = lessons.agent.update(rollout, none_finished, lessons.limits())
+    assert repr(resumed.agent.update(rollout, none_finished, lessons.limits())) == repr(expected)
+
+
+@pytest.mark.parametrize("agent", ["cpo", "pcpo"])
+@every_task
+def test_a_student_that_judges_its_steps_resumes_bit_for_bit(agent: str, task: str) -> None:
+    options = {"cross_fitting": True}
+    lessons, resumed = Lessons(agent, task, options), Lessons(agent, task, options)
+    keys = {tuple(sorted(lessons.update(limit))) for limit in (FINITE, math.inf, 0.0)}
+    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
+    rollout, episodes = lessons.collect()
+    for costs in (episode_costs(episodes, lessons.num_costs), np.empty((0, lessons.num_costs))):
+        expected = lessons.agent.update(rollout, costs, lessons.limits())
+        assert repr(resumed.agent.update(rollout, costs, lessons.limits())) == repr(expected)
+        keys.add(tuple(sorted(expected)))
+    assert len(keys) == 1
+    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
+
+
+def held_bytes() -> int:
+    """What all live tensors take."""
+    gc.collect()
+    return sum(thing.nbytes for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor))
+
+
+@pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
+@pytest.mark.parametrize("options", [{}, MINIBATCHES])
+def test_memory_is_flat_in_the_length_of_a_run(agent: str, options: dict[str, Any]) -> None:
+    lessons = Lessons(agent, "continuous-bandit", options)
+    lessons.update()
+    saved, held = len(encode(lessons.agent.state_dict())), held_bytes()
+    for _ in range(3):
+        lessons.update()
+    assert held_bytes() == held
+    assert len(encode(lessons.agent.state_dict())) == pytest.approx(saved, abs=200)  # digits of numbers
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@every_agent
+@every_task
+def test_a_student_on_a_gpu_learns_what_one_on_a_cpu_learns(agent: str, task: str) -> None:
+    on_cpu = Lessons(agent, task)
+    with torch.device("cuda"):
+        on_gpu = Lessons(agent, task)
+    np.testing.assert_array_equal(on_gpu.agent.state_dict()["policy"], on_cpu.agent.state_dict()["policy"])
+    rollout, episodes = on_cpu.collect()
+    costs = episode_costs(episodes, on_cpu.num_costs)
+    found, expected = (each.agent.update(rollout, costs, each.limits()) for each in (on_gpu, on_cpu))
+    for key, value in expected.items():
+        assert found[key] == pytest.approx(value, rel=0.02, abs=1e-3, nan_ok=True), key
+    on_cpu.agent.load_state_dict(on_gpu.agent.state_dict())
+    observations = rollout.observations[0]
+    np.testing.assert_array_equal(
+        on_gpu.agent.act_greedily(observations), on_cpu.agent.act_greedily(observations)
+    )
