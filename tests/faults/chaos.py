@@ -316,7 +316,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Kill everything of a sweep but its files.")
     parser.add_argument("--seconds", type=float, default=600.0, help="of harm")
     parser.add_argument("--seed", type=int, default=0, help="of the times and the victims")
-    parser.add_argument("--steps", type=int, default=0, help="of a trial; by default 6,000 a second")
+    parser.add_argument("--steps", type=int, default=0, help="of a trial; by default 9,000 a second")
     parser.add_argument("--log", type=Path, help="write what happened there too")
     given = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -324,7 +324,7 @@ def main() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    steps = given.steps or int(6_000 * given.seconds)
+    steps = given.steps or int(9_000 * given.seconds)
     log_path = given.log or Path(os.devnull)
     log_path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="chaos-") as name, log_path.open("w") as log:
