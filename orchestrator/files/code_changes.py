@@ -47,6 +47,8 @@ def code_of(spec: TrialSpec) -> dict[str, str]:
         names = [] if choice.name in ours else [_module_of(choice.name, group)]
         if isinstance(identity := choice.options.get("id"), str) and ":" in identity:
             names.append(identity)  # of Gymnasium: ``module:name``
+        if isinstance(network := choice.options.get("network"), str):
+            names.append(network)
         for name in filter(None, names):
             package = name.partition(":")[0].partition(".")[0]
             if digest := _package_digest(package):
