@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_networks.py [--updates 6]
 
-For each task, agent and size two trials run in turns, update by update, one with the standard perceptron,
+For each task, agent and size two trials run in turns, one with the standard perceptron and
 one with the same layers as a ``torch.nn.Module``. Printed are the CPU milliseconds of an update with the steps
 that it learns from, and their ratio, the median over the pairs.
 """
