@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from minigrid.minigrid_env import MiniGridEnv
 
 from recrl.environments.cmdp import CostLimits
+from recrl.environments.registration import register_all
 from recrl.environments.registry import make_vector, optimal_return
 from recrl.environments.rivergrid.grid_world import (
     FORWARD,
@@ -29,11 +30,8 @@ from recrl.environments.rivergrid.grid_world import (
 from recrl.environments.rivergrid.maps import MAPS, MapGenerator, generate_map, parse_map
 from recrl.environments.rivergrid.minigrid_env import RiverGridEnv, render_frame
 
-IDENTIFIERS = [
-    "recrl.environments.registration:recrl/RiverGrid-1a-v0",
-    "recrl.environments.registration:recrl/RiverGrid-1b-v0",
-    "recrl.environments.registration:recrl/RiverGrid-v0",
-]
+register_all()
+IDENTIFIERS = ["recrl/RiverGrid-1a-v0", "recrl/RiverGrid-1b-v0", "recrl/RiverGrid-v0"]
 
 
 def episode(name: str, actions: Sequence[int], **options: Any) -> tuple[list[float], list[list[float]], bool]:
