@@ -144,9 +144,7 @@ class ActorCritic:
         self._noisy = False
         self._temperature = 0.0
         self._form = (
-            TailCost(config.cvar_level, cmdp.num_costs)
-            if config.constraint == "cvar"
-            else MeanCost(config.limit_margin)
+            TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
         )
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,
@@ -198,9 +196,8 @@ class ActorCritic:
         costs, constrained = self._form.judge(rollout, recent_costs, limits)
         estimates = self._estimate(rollout, costs, batch)
         advantages = estimates.advantages
-        constraints = Constraints.measure(recent_costs, lengths, constrained, limits, noisy=self._noisy)
-        num_envs = rollout.rewards.shape[1]
-        experience = Experience.of(self._policy, batch, advantages, constraints, num_envs)
+        constraints = Constraints.measure(recent_costs, lengths, constrained, limits)
+        experience = Experience.of(self._policy, batch, advantages, constraints)
         if self._temperature > 0.0:
             experience = experience.with_entropy(self._temperature)
         metrics = {

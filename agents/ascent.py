@@ -82,7 +82,6 @@ def climb(
     Raises:
         DivergedError: the KL is not finite.
     """
-    config = config.in_update(noisy=experience.constraints.noisy)
     size = config.minibatch_size
     steps = max(config.policy_steps, config.policy_passes * experience.batch.num_parts(size))
     largest_kl = config.stop_kl_factor * config.target_kl

@@ -116,11 +116,6 @@ class StudentConfig(BaseModel):
         description="Episodes, at least, from which a mean cost is estimated: where fewer finish in an "
         "update, those of the updates before it count as well (ours).",
     )
-    limit_margin: NonNegative = Field(
-        default=0.0,
-        description="Standard errors of an update's mean episode cost that are added to it before it is "
-        "compared with its limit; only with the constraint mean (ours).",
-    )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",
         description="What critics learn: advantage plus value (ours), or the bootstrapped discounted "
@@ -134,11 +129,6 @@ class StudentConfig(BaseModel):
     target_kl: Positive = Field(
         default=0.01, description="Size of the trust region, mean KL in nats an update (paper)."
     )
-    noisy_target_kl: Positive | None = Field(
-        default=None,
-        description="target_kl of an update from samples of a policy to which the teacher added noise, which "
-        "has to be undone beside what is learnt, or in which it rewards entropy; null for target_kl (ours).",
-    )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",
         description="What policy noise does: make the policy as random as its mixture with a uniform one, or "
@@ -148,21 +138,6 @@ class StudentConfig(BaseModel):
         default=True,
         description="Evaluate networks once for each distinct observation of a rollout; exact, only faster.",
     )
-
-    def in_update(self, *, noisy: bool) -> Self:
-        """The settings of one update: target_kl is noisy_target_kl under noise or rewarded entropy."""
-        if not noisy or self.noisy_target_kl is None:
-            return self
-        return self.model_copy(update={"target_kl": self.noisy_target_kl})
-
-    @model_validator(mode="after")
-    def _margin_is_of_means(self) -> Self:
-        if self.limit_margin > 0.0 and self.constraint != "mean":
-            raise ValueError(
-                f"limit_margin counts standard errors of a mean: with the constraint {self.constraint} "
-                f"it must be 0, got {self.limit_margin}"
-            )
-        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -226,21 +201,6 @@ class MultiplierConfig(StudentConfig):
         default=1000.0,
         description="The largest multiplier that projected ascent and PID give (ours; anti-wind-up).",
     )
-    multiplier_geometric: bool = Field(
-        default=False,
-        description="Let the integral I of PID grow and fall by shares of 1 + I, so that a price that had to "
-        "be high is not high for long; only with the rule pid (ours).",
-    )
-    multiplier_waits: bool = Field(
-        default=False,
-        description="Sum up no violation that the teacher may have caused: in an update from samples of a "
-        "policy with added noise, or in which it rewards entropy, the integral of PID stays, and the other "
-        "rules' multipliers (ours).",
-    )
-    multiplier_reset: bool = Field(
-        default=False,
-        description="Begin a multiplier anew when its limit changes (ours); not for limits that always move.",
-    )
 
     @model_validator(mode="after")
     def _softplus_begins_above_zero(self) -> Self:
@@ -248,15 +208,6 @@ class MultiplierConfig(StudentConfig):
             raise ValueError(
                 f"multiplier_initial must be above 0 with the rule softplus-adam, "
                 f"got {self.multiplier_initial}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _shares_are_of_an_integral(self) -> Self:
-        if self.multiplier_geometric and self.multiplier_rule != "pid":
-            raise ValueError(
-                "multiplier_geometric is how the integral of PID moves: with the rule "
-                f"{self.multiplier_rule} it must be false"
             )
         return self
 
@@ -326,7 +277,7 @@ class FOCOPSConfig(AscentConfig, MultiplierConfig):
         "multiplier_unit": "cost",
         "multiplier_step": 0.01,
         "multiplier_maximum": 2.0,
-        "temperature": 1.5,
+        "focops_lambda": 1.5,
         "trust_region": "passed",
     }
 
@@ -335,7 +286,7 @@ class FOCOPSConfig(AscentConfig, MultiplierConfig):
         description="Adam's, for the policy (Zhang et al. 2020). Larger steps go far past the trust region "
         "before the KL is seen.",
     )
-    temperature: Positive = Field(
+    focops_lambda: Positive = Field(
         default=0.5,
         description="lambda, standard deviations of the reward advantages that are worth a nat (ours; Zhang "
         "et al. 2020: 1.5).",
@@ -390,37 +341,15 @@ class IPOConfig(AscentConfig):
     )
 
 
-class SettlingConfig(TrustRegionConfig):
-    """Settings of students that as published take steps to the trust region's edge, and need not."""
-
-    temperature: NonNegative = Field(
-        default=0.0,
-        description="T, what a nat of KL must be worth in the surrogate, in standard deviations of the "
-        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
-        "(ours).",
-    )
-
-
-class LinearisedConstraintConfig(SettlingConfig):
-    """Settings of students that hold a step to linearised constraints."""
-
-    cross_fitting: bool = Field(
-        default=False,
-        description="Judge what a step does to a cost on samples that did not choose it, and let a violation "
-        "count for more as far as less is confirmed; where observations are many and noisy, as on Safety Gym "
-        "(ours).",
-    )
-
-
-class CPOConfig(LinearisedConstraintConfig):
+class CPOConfig(TrustRegionConfig):
     """Settings of ``cpo``, constrained policy optimisation."""
 
 
-class PCPOConfig(LinearisedConstraintConfig):
+class PCPOConfig(TrustRegionConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""
 
 
-class TRPOConfig(SettlingConfig):
+class TRPOConfig(TrustRegionConfig):
     """Settings of ``trpo``, which knows no constraint."""
 
 
@@ -431,10 +360,10 @@ class TRPOLagConfig(TrustRegionConfig, MultiplierConfig):
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_TRUST_REGION,
         **STARTER_AGENTS_MULTIPLIERS,
-        "temperature": 0.0,
+        "kl_price": 0.0,
     }
 
-    temperature: NonNegative = Field(
+    kl_price: NonNegative = Field(
         default=1.0,
         description="lambda, what a nat of KL must be worth in the surrogate, that is 1 + the multipliers "
         "standard deviations of the reward advantages, so that steps end with the gain (ours; paper 0).",
@@ -447,10 +376,10 @@ class CRPOConfig(TrustRegionConfig):
     paper: ClassVar[Mapping[str, Any]] = {
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_TRUST_REGION,
-        "temperature": 0.0,
+        "kl_price": 0.0,
     }
 
-    temperature: NonNegative = Field(
+    kl_price: NonNegative = Field(
         default=1.0,
         description="lambda, what a nat of KL must be worth beyond a limit, in standard deviations of the "
         "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "

@@ -156,23 +156,13 @@ class RecentEpisodes:
 
 
 class MeanCost:
-    """The mean episode cost is constrained, or a bound above it; nothing is kept.
-
-    Args:
-        margin: so many standard errors of the mean are added to it.
-    """
-
-    def __init__(self, margin: float = 0.0) -> None:
-        self._margin = margin
+    """The mean episode cost is constrained; nothing is kept."""
 
     def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
         """See ``TailCost.judge``."""
         if not len(episode_costs):
             return rollout.costs, np.full(rollout.costs.shape[2], np.nan)
-        values = episode_costs.mean(axis=0)
-        if self._margin > 0.0:
-            values = values + self._margin * standard_errors(episode_costs)
-        return rollout.costs, values
+        return rollout.costs, episode_costs.mean(axis=0)
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing."""

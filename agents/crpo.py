@@ -19,7 +19,7 @@ complementarity problem. At the optimum it is 0: the reward pulls against costs 
 beyond a limit would only be taken back. Then a cost step mends the violation and no more, as Polyak (1967)
 steps down a violated constraint, and a reward step ends at the limit. Before, steps go as far beyond the
 limit on one side as on the other. A cost is at hand if the trust region reaches its limit. lambda is the
-``temperature``, in the same unit and for the same reason as that of ``trpo-lag``; 0 is the source's.
+``kl_price``, in the same unit and for the same reason as that of ``trpo-lag``; 0 is the source's.
 
 If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, k
 costs, of which j have a finite limit.
@@ -65,7 +65,7 @@ def step_down(problem: StepProblem, mended: int, config: CRPOConfig) -> DualSolu
     weights = np.zeros_like(problem.violations)
     if squared > NO_INFLUENCE:
         weights[mended] = np.sqrt(2.0 * problem.radius / squared)
-        if config.temperature > 0.0:
+        if config.kl_price > 0.0:
             beyond = overshoot(problem, config) * max(-float(problem.mixed[mended]), 0.0)
             weights[mended] = min(weights[mended], (float(problem.violations[mended]) + beyond) / squared)
     return DualSolution(StepCase.RECOVERY, 0.0, weights, np.full_like(weights, np.nan), (mended,))
@@ -76,7 +76,7 @@ def step_up(problem: StepProblem, config: CRPOConfig) -> DualSolution:
     nothing, size = np.zeros_like(problem.violations), 0.0
     if problem.squared_gradient > NO_INFLUENCE:
         size = float(np.sqrt(2.0 * problem.radius / problem.squared_gradient))
-        if config.temperature > 0.0:
+        if config.kl_price > 0.0:
             rises, slack = -problem.mixed, np.maximum(-problem.violations, 0.0)
             raised = rises > 0.0
             up_to_limit = float(np.min(slack[raised] / rises[raised], initial=np.inf))
@@ -85,14 +85,14 @@ def step_up(problem: StepProblem, config: CRPOConfig) -> DualSolution:
 
 
 def overshoot(problem: StepProblem, config: CRPOConfig) -> float:
-    """beta, how many times v a step goes beyond a limit, with a temperature above 0."""
+    """beta, how many times v a step goes beyond a limit, with a ``kl_price`` above 0."""
     squared = max(problem.squared_gradient, NO_INFLUENCE)
     reach = np.sqrt(2.0 * problem.radius * np.diag(problem.gram))
     at_hand = np.flatnonzero(-problem.violations <= reach)
     rises = -problem.mixed[at_hand]
     weights = projection_weights(problem.gram[np.ix_(at_hand, at_hand)], rises)
     taken = 0.0 if weights is None else float(rises @ weights)
-    return float(np.sqrt(max(1.0 - taken / squared, 0.0))) / (2.0 * config.temperature)
+    return float(np.sqrt(max(1.0 - taken / squared, 0.0))) / (2.0 * config.kl_price)
 
 
 class ConstraintRectifiedPolicyOptimisation:
@@ -107,7 +107,7 @@ class ConstraintRectifiedPolicyOptimisation:
     ) -> dict[str, float]:
         """Take one step up the reward or down a violated cost, unless nothing is known of the constraints."""
         constraints = experience.constraints
-        config = self._config.in_update(noisy=constraints.noisy)
+        config = self._config
         if not constraints.known:
             stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
             return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}

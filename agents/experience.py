@@ -1,6 +1,6 @@
 """What a student knows after a rollout: its samples, what they were worth, and how the constraints stand.
 
-Letters: N samples, B environments, k costs, D decisions, E finished episodes, j of the k limits are finite.
+Letters: N samples, k costs, D decisions, E finished episodes, j of the k limits are finite.
 """
 
 from __future__ import annotations
@@ -27,19 +27,16 @@ class Constraints:
 
     Attributes:
         limits: d, [k], possibly infinite.
-        gaps: constrained value of the episodes (their mean undiscounted cost, with a margin where one is
-            asked for, or its CVaR) minus limit, [k]; -inf where the limit is infinite, NaN where it is
-            finite and no episode finished.
+        gaps: constrained value of the episodes (their mean undiscounted cost, or its CVaR) minus limit, [k];
+            -inf where the limit is infinite, NaN where it is finite and no episode finished.
         standard_errors: of the episodes' mean costs, [k], at least 0; 0 of fewer than two episodes.
         episode_length: mean steps of these episodes, at least 1; NaN if none finished.
-        noisy: whether the teacher added noise to the policy that collected them, or rewards its entropy.
     """
 
     limits: Floats
     gaps: Floats
     standard_errors: Floats
     episode_length: float
-    noisy: bool = False
 
     @classmethod
     def measure(
@@ -48,8 +45,6 @@ class Constraints:
         lengths: npt.NDArray[np.int64],
         values: Floats,
         limits: Floats,
-        *,
-        noisy: bool = False,
     ) -> Constraints:
         """Compare the constrained values of E episodes with the limits.
 
@@ -58,11 +53,10 @@ class Constraints:
             lengths: their steps, [E].
             values: what is constrained, [k]; NaN if E is 0.
             limits: d, [k].
-            noisy: see the attribute.
         """
         gaps = np.where(np.isfinite(limits), values - limits, -np.inf)
         length = float(lengths.mean()) if len(lengths) else float("nan")
-        return cls(limits, gaps, standard_errors(costs), length, noisy)
+        return cls(limits, gaps, standard_errors(costs), length)
 
     @property
     def known(self) -> bool:
@@ -99,7 +93,6 @@ class Experience:
         old_log_probs: log pi_old(a | s) of the batch's decisions, [D].
         advantages: raw estimates for the reward, then each cost, of all samples of the rollout, [N, 1 + k].
         constraints: limits and gaps.
-        num_envs: B; sample i of the rollout is of environment i mod B.
     """
 
     batch: LearningBatch
@@ -107,7 +100,6 @@ class Experience:
     old_log_probs: Tensor
     advantages: Floats
     constraints: Constraints
-    num_envs: int
 
     @classmethod
     def of(
@@ -116,12 +108,11 @@ class Experience:
         batch: LearningBatch,
         advantages: Floats,
         constraints: Constraints,
-        num_envs: int,
     ) -> Experience:
         """The experience of a policy that has not moved since it collected the samples."""
         old = policy.distribution(batch.rows)
         log_probs = old.log_prob(batch.actions, batch.decision_rows)
-        return cls(batch, old, log_probs, advantages, constraints, num_envs)
+        return cls(batch, old, log_probs, advantages, constraints)
 
     def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
         """Minibatches without end, as ``LearningBatch.parts`` makes them; itself where there is one part."""

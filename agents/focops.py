@@ -6,10 +6,10 @@ network is drawn towards it. Up to constants, climbing
     mean over samples of 1[KL(s) <= delta] (ratio (A_r - sum_i nu_i A_i) / lam - KL(s)),
     KL(s) = KL(pi(. | s) || pi_old(. | s)),
 
-does that. lam, the temperature, is an option, in standard deviations of the reward advantages, and the
-multipliers nu move by a rule of ``recrl.agents.lagrange``; the paper's is projected ascent up to 2. Here, as
-in ``ppo-lag``, the penalised advantage is divided by 1 + sum_i nu_i, so that a large multiplier does not make
-the policy jump; lam keeps its meaning where no constraint binds.
+does that. lam, the paper's temperature, is the option ``focops_lambda``, in standard deviations of the reward
+advantages. The multipliers nu move by a rule of ``recrl.agents.lagrange``; the paper's is projected ascent up
+to 2. Here, as in ``ppo-lag``, the penalised advantage is divided by 1 + sum_i nu_i, so that a large
+multiplier does not make the policy jump; lam keeps its meaning where no constraint binds.
 
 The source stops when the mean KL is past delta; but the step that went past stands, and one Adam step may
 double the KL. So, ours, it is taken back as far as it went past: ``trust_region: kept``.
@@ -37,18 +37,18 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 
 
 def projection_objective(
-    experience: Experience, advantages: Floats, *, temperature: float, radius: float
+    experience: Experience, advantages: Floats, *, focops_lambda: float, radius: float
 ) -> Objective:
     """What draws the policy towards pi*: the module's formula.
 
     Args:
         experience: the samples, and pi_old at their rows.
         advantages: of the Lagrangian, of all samples of the rollout, [N].
-        temperature: lam, above 0.
+        focops_lambda: lam, above 0.
         radius: delta, nats; rows that have moved further pull no more.
     """
     batch, old = experience.batch, experience.old
-    pull = batch.per_decision(advantages / temperature)
+    pull = batch.per_decision(advantages / focops_lambda)
 
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
         assert type(now) is type(old)
@@ -90,13 +90,13 @@ class FirstOrderConstrainedOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
-        config = self._config.in_update(noisy=experience.constraints.noisy)
+        config = self._config
         start = policy.parameters.values.clone()
         penalty = self._multipliers.update(experience)
         objective = partial(
             projection_objective,
             advantages=penalty.advantages,
-            temperature=config.temperature,
+            focops_lambda=config.focops_lambda,
             radius=config.target_kl,
         )
         metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)

@@ -5,7 +5,7 @@ Multipliers first answer the gaps; then the policy takes one trust-region step u
 
 At a saddle of the Lagrangian that surrogate has no gradient, but a step that always reaches the edge of the
 trust region is as long there as anywhere, and the policy swings about the limit for ever. So, ours, a nat of
-KL must be worth ``temperature`` in that surrogate, and steps end with the gain.
+KL must be worth ``kl_price`` in that surrogate, and steps end with the gain.
 
 Letters: N samples, k costs.
 """
@@ -42,7 +42,7 @@ class TRPOLagrangian:
             penalty.advantages,
             self._config,
             generator,
-            temperature=self._config.temperature,
+            kl_price=self._config.kl_price,
         )
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 

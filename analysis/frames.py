@@ -67,7 +67,6 @@ METHOD_ORDER = (
     "cosine",
     "exponential",
     "dynamic",
-    "annealed",
     "cooling",
     "step",
     "unconstrained",

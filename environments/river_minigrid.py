@@ -31,7 +31,6 @@ from recrl.environments.river_grid import (
     HORIZON,
     STEP_REWARD,
     CostName,
-    ObservationName,
     RiverGridOptions,
     river_observations,
     state_index,
@@ -78,7 +77,6 @@ class RiverGridEnv(MiniGridEnv):
         drawing: the map, see ``recrl.environments.river_maps``.
         max_steps: H, steps after which an episode is truncated.
         costs: the cost functions, in order.
-        observation: what is seen, ``coordinates`` or ``pose``.
         **minigrid: MiniGrid's own, such as ``render_mode``.
     """
 
@@ -88,12 +86,11 @@ class RiverGridEnv(MiniGridEnv):
         *,
         max_steps: int = HORIZON,
         costs: Sequence[CostName] = ("river",),
-        observation: ObservationName = "coordinates",
         **minigrid: Any,
     ) -> None:
         self.river_map = parse_map(drawing)
         self.cost_names = tuple(costs)
-        self._observations = river_observations(self.river_map, observation)
+        self._observations = river_observations(self.river_map)
         super().__init__(
             mission_space=MissionSpace(mission_func=mission),
             width=self.river_map.width,
@@ -136,7 +133,6 @@ def draw_river_grid(name: str, options: RiverGridOptions) -> RiverGridEnv:
         str(task_map(name, options)),
         max_steps=options.horizon,
         costs=options.costs,
-        observation=options.observation,
         render_mode="rgb_array",
     )
 

@@ -12,9 +12,8 @@ temperature is high, and both arrive together.
     tau = temperature h             reward per nat, in the update after the lesson
 
 Where nothing is left to learn at a temperature, log pi(a | s) is the advantage over the temperature, up to a
-constant: ``Experience.with_entropy``. It needs a student to whom every observation can be worth something of
-its own (``observation: pose`` of RiverGrid), and whose price for a violation can rise until no way through it
-pays (``ppo-lag`` as it is, or with a ``multiplier_maximum`` above that price; ``cpo``).
+constant: ``Experience.with_entropy``. It needs an agent whose price for a violation can rise until no way
+through it pays (``ppo-lag`` as it is, or with a ``multiplier_maximum`` above that price; ``cpo``).
 
 Letters: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
 environment steps, p in [0, 1] the share of B that is used up, k the number of costs.

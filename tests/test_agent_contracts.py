@@ -13,7 +13,6 @@ from recrl.agents.agent import Agent, EntropySeeker, Rollout
 from recrl.agents.collect import Collector, FinishedEpisode, episode_costs
 from recrl.agents.config import AscentConfig
 from recrl.agents.errors import DivergedError
-from recrl.agents.lagrange import STARTS
 from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.environments.cmdp import Floats
 from recrl.environments.registry import make_vector
@@ -186,97 +185,6 @@ def test_entropy_that_is_rewarded_rises_in_one_update_and_survives_a_checkpoint(
     assert repr(updates[0]) == repr(updates[1])
 
 
-@pytest.mark.parametrize("rule", STARTS)
-def test_a_student_that_waits_sums_up_no_violation_of_a_noisy_policy(rule: str) -> None:
-    options = {
-        **{"multiplier_rule": rule, "multiplier_initial": 0.5, "multiplier_proportional": 0.0},
-        **{"multiplier_waits": True, "multiplier_unit": "cost"},
-    }
-    lessons, resumed = (Lessons("ppo-lag", "two-state", options) for _ in range(2))
-    rollout, _ = lessons.collect()
-    lessons.agent.add_noise(0.1, rollout.observations.reshape(-1, rollout.observations.shape[-1]))
-    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
-    violated = 0.1
-    assert [student.update(violated)["multiplier_0"] for student in (lessons, resumed)] == pytest.approx(
-        [0.5] * 2
-    )
-    assert lessons.update(violated)["multiplier_0"] > 0.5
-
-
-@pytest.mark.parametrize("agent", ["ppo-lag", "trpo-lag"])
-def test_a_geometric_price_comes_down_faster_from_where_it_is_high(agent: str) -> None:
-    fall = {}
-    for geometric in (False, True):
-        options = {
-            **{"multiplier_initial": 9.0, "multiplier_step": 0.1, "multiplier_proportional": 0.0},
-            "multiplier_geometric": geometric,
-        }
-        lessons = Lessons(agent, "two-state", options)
-        metrics = lessons.update(1e9)
-        fall[geometric] = metrics["multiplier_0"]
-    # Both begin at 9 and differ only in the unit that the multipliers are reported in.
-    assert fall[True] / fall[False] == pytest.approx((10.0 * math.exp(-0.1) - 1.0) / 8.9)
-
-
-def test_a_geometric_price_of_another_rule_is_refused() -> None:
-    with pytest.raises(ValueError, match="with the rule projected it must be false"):
-        Lessons("ppo-lag", "two-state", {"multiplier_rule": "projected", "multiplier_geometric": True})
-
-
-@every_agent
-@pytest.mark.parametrize("task", ["two-state", "continuous-bandit"])
-def test_noise_changes_the_trust_region_of_its_update_alone(agent: str, task: str) -> None:
-    """Two updates, the first after noise, are those of students that had its radius and then their own."""
-    wide, narrow = {"target_kl": 0.02}, {"target_kl": 0.0005}
-    student = Lessons(agent, task, {**narrow, "noisy_target_kl": 0.02})
-    for options in (wide, narrow):
-        other = Lessons(agent, task, options)
-        state = student.agent.state_dict()
-        other.agent.load_state_dict(state)
-        rollout, episodes = student.collect()
-        if options is wide:
-            observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
-            for each in (student, other):
-                each.agent.add_noise(0.1, observations)
-        costs = episode_costs(episodes, 1)
-        metrics = [each.agent.update(rollout, costs, each.limits()) for each in (student, other)]
-        assert metrics[0] == pytest.approx(metrics[1], rel=0, abs=0, nan_ok=True)
-        assert flattened(student.agent.state_dict()) == flattened(other.agent.state_dict())
-    assert metrics[0]["kl"] < 0.002
-
-
-@every_agent
-def test_a_margin_is_a_lower_limit(agent: str) -> None:
-    """A student with a margin learns what one without it does from a limit that is lower by as much."""
-    rule = {"multiplier_rule": "projected", "multiplier_unit": "cost"}  # the others know the limit, too
-    options = rule if agent in {"ppo-lag", "trpo-lag", "focops"} else {}
-    careful, other = (Lessons(agent, "two-state", options | margin) for margin in ({"limit_margin": 2.0}, {}))
-    rollout, episodes = careful.collect()
-    costs = episode_costs(episodes, 1)
-    margin = 2.0 * costs.std(axis=0, ddof=1) / math.sqrt(len(costs))
-    assert margin > 0.0
-    metrics = careful.agent.update(rollout, costs, careful.limits())
-    assert metrics == pytest.approx(other.agent.update(rollout, costs, other.limits() - margin), nan_ok=True)
-
-
-@pytest.mark.parametrize("agent", ["cpo", "pcpo", "trpo"])
-def test_with_a_temperature_a_student_settles(agent: str) -> None:
-    """Where nothing is left to gain, steps to the edge of the trust region lead anywhere."""
-    late = {}
-    for temperature in (0.0, 0.3):
-        options = {"target_kl": 0.05, "temperature": temperature, "critic_steps": 40}
-        lessons = Lessons(agent, "two-state", options)
-        entropies = [lessons.update(math.inf)["entropy"] for _ in range(60)]
-        late[temperature] = max(entropies[30:])
-    assert late[0.3] < 0.01
-    assert late[0.0] > 0.1
-
-
-def test_a_margin_of_the_worst_episodes_is_refused() -> None:
-    with pytest.raises(ValueError, match="with the constraint cvar it must be 0, got 1"):
-        Lessons("cpo", "two-state", {"constraint": "cvar", "limit_margin": 1.0})
-
-
 @every_agent
 def test_the_paper_preset_learns_with_the_same_metrics(agent: str) -> None:
     paper = Lessons(agent, "continuous-bandit", {"preset": "paper"})
@@ -346,22 +254,6 @@ def test_a_bound_on_the_worst_episodes_returns_the_same_metrics_and_resumes(agen
     none_finished = np.empty((0, 2))
     expected = lessons.agent.update(rollout, none_finished, lessons.limits())
     assert repr(resumed.agent.update(rollout, none_finished, lessons.limits())) == repr(expected)
-
-
-@pytest.mark.parametrize("agent", ["cpo", "pcpo"])
-@every_task
-def test_a_student_that_judges_its_steps_resumes_bit_for_bit(agent: str, task: str) -> None:
-    options = {"cross_fitting": True}
-    lessons, resumed = Lessons(agent, task, options), Lessons(agent, task, options)
-    keys = {tuple(sorted(lessons.update(limit))) for limit in (FINITE, math.inf, 0.0)}
-    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
-    rollout, episodes = lessons.collect()
-    for costs in (episode_costs(episodes, lessons.num_costs), np.empty((0, lessons.num_costs))):
-        expected = lessons.agent.update(rollout, costs, lessons.limits())
-        assert repr(resumed.agent.update(rollout, costs, lessons.limits())) == repr(expected)
-        keys.add(tuple(sorted(expected)))
-    assert len(keys) == 1
-    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
 
 
 def held_bytes() -> int:

@@ -136,16 +136,6 @@ def test_the_mean_form_leaves_costs_alone() -> None:
     assert math.isnan(MeanCost().judge(rollout, np.empty((0, 1)), limit)[1][0])
 
 
-def test_a_margin_is_of_standard_errors_of_the_mean() -> None:
-    """Costs 1, 2, 3, 6: mean 3, variance 14 / 3, so the mean's standard error is sqrt(14 / 12)."""
-    rollout, limit = rollout_of(np.array([1.0, 3.0])), np.array([9.0])
-    costs, values = MeanCost(1.5).judge(rollout, column(1.0, 2.0, 3.0, 6.0), limit)
-    assert costs is rollout.costs
-    assert values == pytest.approx([3.0 + 1.5 * math.sqrt(14.0 / 12.0)])
-    assert MeanCost(1.5).judge(rollout, column(4.0), limit)[1].tolist() == [4.0]
-    assert math.isnan(MeanCost(1.5).judge(rollout, np.empty((0, 1)), limit)[1][0])
-
-
 def test_where_the_limit_is_violated_all_cost_beyond_it_counts() -> None:
     """All episodes cost 9: the CVaR is flat; cost beyond the limit 5 is not, (9 - 5) / 0.25 beyond 5."""
     form = TailCost(0.75, 1)

@@ -19,7 +19,7 @@ def experience_of(batch: LearningBatch, old: Distribution, num_samples: int) -> 
     """Samples whose advantages are all 0, of the reward and of one cost."""
     constraints = Constraints(np.array([1.0]), np.array([0.0]), np.zeros(1), 1.0)
     log_probs = old.log_prob(batch.actions, batch.decision_rows)
-    return Experience(batch, old, log_probs, np.zeros((num_samples, 2)), constraints, num_envs=1)
+    return Experience(batch, old, log_probs, np.zeros((num_samples, 2)), constraints)
 
 
 def rewarded(experience: Experience) -> Floats:

@@ -107,8 +107,8 @@ def test_focops_weighs_what_is_gained_against_how_far_the_policy_moves() -> None
     ratios = torch.tensor([1.2, 1.8, 1.0, 1.0, 1.0, 1.0])
     advantages = np.array([3.0, 5.0, 0.0, 0.0, 0.0, 1.0])
     constraints = Constraints(np.ones(1), np.ones(1), np.zeros(1), 1.0)
-    experience = Experience(BATCH, old, torch.zeros(6), ADVANTAGES, constraints, num_envs=1)
-    objective = projection_objective(experience, advantages, temperature=2.0, radius=0.1)
+    experience = Experience(BATCH, old, torch.zeros(6), ADVANTAGES, constraints)
+    objective = projection_objective(experience, advantages, focops_lambda=2.0, radius=0.1)
     divergence = 0.6 * math.log(1.2) + 0.4 * math.log(0.8)
     expected = (1.2 * 3.0 / 2.0 + 1.0 / 2.0 - divergence) / 6.0
     assert float(objective(now, ratios)) == pytest.approx(expected, rel=1e-5)
@@ -121,7 +121,7 @@ def test_focops_keeps_its_trust_region_however_long_a_step_is() -> None:
             3, Discrete(2), NetworkForm((8,), orthogonal), 1.0, torch.Generator().manual_seed(0)
         )
         constraints = Constraints(np.array([math.inf]), np.array([-math.inf]), np.zeros(1), 10.0)
-        experience = Experience.of(policy, BATCH, ADVANTAGES, constraints, num_envs=1)
+        experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
         config = FOCOPSConfig(target_kl=0.01, policy_learning_rate=0.1, trust_region=name)
         rule = FirstOrderConstrainedOptimisation(config, policy, 1)
         found[name] = improve_and_measure(rule, policy, experience, np.random.default_rng(0))["kl"]
@@ -142,7 +142,7 @@ def improved(name: str, gap: float, limit: float = 5.0) -> tuple[dict[str, float
     constraints = Constraints(
         np.array([limit]), np.array([gap]), np.zeros(1), math.nan if math.isnan(gap) else 10.0
     )
-    experience = Experience.of(policy, BATCH, ADVANTAGES, constraints, num_envs=1)
+    experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
     metrics = improve_and_measure(rules[name], policy, experience, np.random.default_rng(0))
     return metrics, bool(np.any(policy.parameters.to_numpy() != before))
 

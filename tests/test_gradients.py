@@ -45,7 +45,7 @@ def moved_policy(space: Space[object], compact: bool) -> tuple[StochasticPolicy,
     batch = LearningBatch.gather(observations, actions, compact=compact)  # type: ignore[arg-type]
     constraints = Constraints(np.array([1.0, 1.0]), np.array([0.3, -0.5]), np.zeros(2), 2.0)
     advantages = generator.normal(size=(30, 3))
-    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
+    experience = Experience.of(policy, batch, advantages, constraints)
     policy.parameters.values.add_(0.1 * torch.randn(len(policy.parameters.values)))
     return policy, experience
 
@@ -84,7 +84,7 @@ def ipo(experience: Experience) -> Objective:
 
 
 def focops(experience: Experience) -> Objective:
-    return projection_objective(experience, experience.advantages[:, 0], temperature=0.5, radius=0.2)
+    return projection_objective(experience, experience.advantages[:, 0], focops_lambda=0.5, radius=0.2)
 
 
 OBJECTIVES: dict[str, Callable[[Experience], Objective]] = {

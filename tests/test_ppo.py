@@ -38,23 +38,23 @@ def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floa
     return policy, LearningBatch.gather(observations, actions, compact=True), advantages
 
 
-def rule_of(name: str, policy: StochasticPolicy, temperature: float = 0.0) -> PolicyRule:
+def rule_of(name: str, policy: StochasticPolicy) -> PolicyRule:
     if name == "ppo":
         return ProximalPolicyOptimisation(PPOConfig(target_kl=DELTA), policy)
     if name == "trpo":
-        return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA, temperature=temperature))
-    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, temperature=temperature), num_costs=2)
+        return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA))
+    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
 
 
 def improved(
-    name: str, space: Space[object], gaps: list[float], limits: list[float], temperature: float = 0.0
+    name: str, space: Space[object], gaps: list[float], limits: list[float]
 ) -> tuple[dict[str, float], Floats]:
     """The metrics, and the policy's parameters afterwards."""
     policy, batch, advantages = sampled(space)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)
-    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
-    rule = rule_of(name, policy, temperature)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    rule = rule_of(name, policy)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
     return metrics, policy.parameters.to_numpy().astype(np.float64)
 
@@ -71,45 +71,42 @@ def test_neither_limits_nor_costs_nor_finished_episodes_change_a_control(
         np.testing.assert_array_equal(improved(name, space, gaps, limits)[1], reference)
 
 
-@pytest.mark.parametrize("temperature", [0.0, 20.0])
 @pytest.mark.parametrize("space", SPACES)
-def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object], temperature: float) -> None:
+def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object]) -> None:
     gaps, unlimited = [-math.inf, -math.inf], [math.inf, math.inf]
-    found, after = improved("trpo", space, gaps, unlimited, temperature)
-    expected, after_cpo = improved("cpo", space, gaps, unlimited, temperature)
-    longest, _ = improved("trpo", space, gaps, unlimited)
-    assert (found["step_norm"] < 0.5 * longest["step_norm"]) == (temperature > 0.0)
+    found, after = improved("trpo", space, gaps, unlimited)
+    expected, after_cpo = improved("cpo", space, gaps, unlimited)
     np.testing.assert_allclose(after, after_cpo, atol=1e-5)
     assert found["surrogate_reward"] == pytest.approx(expected["surrogate_reward"], rel=1e-3)
     assert found["step_norm"] == pytest.approx(expected["step_norm"], rel=1e-3)
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_with_a_temperature_a_step_is_as_long_as_the_gain_is_large_up_to_the_trust_region(
+def test_with_a_price_of_the_kl_a_step_is_as_long_as_the_gain_is_large_up_to_the_trust_region(
     space: Space[object],
 ) -> None:
-    def stepped(size: float, temperature: float) -> float:
+    def stepped(size: float, kl_price: float) -> float:
         policy, batch, advantages = sampled(space)
-        experience = Experience.of(policy, batch, advantages, UNKNOWN, num_envs=1)
+        experience = Experience.of(policy, batch, advantages, UNKNOWN)
         objective = size * (advantages[:, 0] - advantages[:, 0].mean())
         generator = np.random.default_rng(0)
         config = TRPOConfig(target_kl=DELTA)
-        return step_up(policy, experience, objective, config, generator, temperature=temperature)["step_norm"]
+        return step_up(policy, experience, objective, config, generator, kl_price=kl_price)["step_norm"]
 
-    edge = stepped(1.0, temperature=0.0)
-    assert stepped(1e-3, temperature=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
-    assert stepped(1e3, temperature=1.0) == pytest.approx(edge, rel=1e-3)
-    small = stepped(1e-3, temperature=1.0)
+    edge = stepped(1.0, kl_price=0.0)
+    assert stepped(1e-3, kl_price=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
+    assert stepped(1e3, kl_price=1.0) == pytest.approx(edge, rel=1e-3)
+    small = stepped(1e-3, kl_price=1.0)
     assert small < 0.1 * edge
-    assert stepped(2e-3, temperature=1.0) == pytest.approx(2.0 * small, rel=1e-3)
-    assert stepped(1e-3, temperature=2.0) == pytest.approx(0.5 * small, rel=1e-3)
+    assert stepped(2e-3, kl_price=1.0) == pytest.approx(2.0 * small, rel=1e-3)
+    assert stepped(1e-3, kl_price=2.0) == pytest.approx(0.5 * small, rel=1e-3)
 
 
 def test_where_no_action_is_better_trpo_stays() -> None:
     policy, batch, advantages = sampled(SPACES[0])
     before = policy.parameters.to_numpy()
     constraints = Constraints(np.array([1.0]), np.array([0.0]), np.zeros(1), 10.0)
-    experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints, num_envs=1)
+    experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints)
     metrics = improve_and_measure(rule_of("trpo", policy), policy, experience, np.random.default_rng(0))
     np.testing.assert_array_equal(policy.parameters.to_numpy(), before)
     assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
@@ -133,7 +130,7 @@ def climbed(**options: object) -> tuple[float, bool, set[int]]:
     metrics = climb(
         policy,
         Adam(policy.parameters, 0.01),
-        Experience.of(policy, batch, advantages, UNKNOWN, num_envs=1),
+        Experience.of(policy, batch, advantages, UNKNOWN),
         objective,
         config=PPOConfig.model_validate(options),
         generator=np.random.default_rng(0),

@@ -23,7 +23,6 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
     ("dynamic", {"window": 1, "return_tolerance": 1.0, "cost_tolerance": 1.0}),
     ("dynamic", {"window": 2, "window_unit": "episodes", "start_fraction": 0.0}),
     ("dynamic", {"preset": "paper", "window": 2, "return_tolerance": 0.5}),
-    ("annealed", {"measured_at": 0.3, "arrival": 1.0, "noise_hold": 0.5, "noise_end": 0.5}),
 ]
 CONTRACT = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 TRAIN_STEPS = 100

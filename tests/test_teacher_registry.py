@@ -25,7 +25,6 @@ def spec(name: str, **options: Any) -> TeacherSpec:
 
 def test_the_names() -> None:
     assert sorted(TEACHERS) == [
-        "annealed",
         "cooling",
         "cosine",
         "dynamic",
