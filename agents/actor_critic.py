@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +38,7 @@ from recrl.agents.policies import StochasticPolicy
 from recrl.agents.scales import RunningScale, quotient
 from recrl.agents.spaces import observation_size
 from recrl.agents.surrogates import surrogate
-from recrl.environments.cmdp import CMDPSpec, Floats
+from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
 
 
 class Stateful(Protocol):
@@ -120,6 +120,8 @@ class ActorCritic:
         generator: of the minibatches.
     """
 
+    learns_rewarded_entropy: ClassVar[bool] = True
+
     def __init__(
         self,
         cmdp: CMDPSpec,
@@ -141,8 +143,6 @@ class ActorCritic:
         self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
-        self._noisy = False
-        self._temperature = 0.0
         self._form = (
             TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
         )
@@ -171,22 +171,21 @@ class ActorCritic:
         """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
         return self._policy.probabilities(self._encoder(observations))
 
-    def update(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
+    def update(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
         """Improve the policy by the rule, then fit the critics to the rollout.
 
         Raises:
             DivergedError: a reward, a loss or a parameter is not finite.
         """
         with self._on_its_device():
-            metrics = self._learn(rollout, episode_costs, limits)
-        self._noisy, self._temperature = False, 0.0
+            metrics = self._learn(rollout, episode_costs, step)
         self._policy.publish()
         require_finite("policy parameters", self._policy.parameters.to_numpy())
         require_finite("critic parameters", self._critics.parameters.to_numpy())
         return metrics
 
-    def _learn(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
-        config = self._config
+    def _learn(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
+        config, limits = self._config, step.limits.array
         observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
         actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
         batch = LearningBatch.gather(
@@ -198,8 +197,8 @@ class ActorCritic:
         advantages = estimates.advantages
         constraints = Constraints.measure(recent_costs, lengths, constrained, limits)
         experience = Experience.of(self._policy, batch, advantages, constraints)
-        if self._temperature > 0.0:
-            experience = experience.with_entropy(self._temperature)
+        if step.entropy_coefficient:
+            experience = experience.with_entropy(step.entropy_coefficient)
         metrics = {
             **improve_and_measure(self._rule, self._policy, experience, self._generator),
             **indexed("cost_gap", constraints.gaps),
@@ -303,14 +302,9 @@ class ActorCritic:
         """Make the policy more random once; see ``recrl.agents.noise``."""
         with self._on_its_device():
             metrics = self._policy.add_noise(noise, self._encoder(observations), self._config.noise_form)
-        self._noisy = True
         self._policy.publish()
         require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
         return metrics
-
-    def reward_entropy(self, temperature: float) -> None:
-        """In the next update, count the entropy of the policy as reward; see ``Experience.with_entropy``."""
-        self._noisy, self._temperature = True, temperature
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, generator, and the state of every part."""
@@ -318,8 +312,6 @@ class ActorCritic:
             "policy": self._policy.parameters.to_numpy(),
             "critics": self._critics.parameters.to_numpy(),
             "generator": self._generator.bit_generator.state,
-            "noisy": self._noisy,
-            "temperature": self._temperature,
             **{name: part.state_dict() for name, part in self._parts.items()},
         }
 
@@ -329,8 +321,6 @@ class ActorCritic:
         self._policy.publish()
         self._critics.parameters.load(state["critics"])
         self._generator.bit_generator.state = state["generator"]
-        self._noisy = bool(state.get("noisy", False))  # earlier checkpoints lack both
-        self._temperature = float(state.get("temperature", 0.0))
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
 

@@ -129,7 +129,7 @@ class Experience:
         log_probs = now.log_prob(self.batch.actions, self.batch.decision_rows)
         return torch.exp(log_probs - self.old_log_probs)
 
-    def with_entropy(self, temperature: float) -> Experience:
+    def with_entropy(self, coefficient: float) -> Experience:
         """The same, where the policy's entropy at every observation it saw is worth a reward.
 
         At the policy that collected the samples, the gradient of the entropy is that of a surrogate whose
@@ -137,14 +137,14 @@ class Experience:
         They are added to the reward's, so that every student climbs both, whatever it makes of advantages.
 
         Args:
-            temperature: reward per nat, at least 0.
+            coefficient: reward per nat, at least 0.
         """
         log_probs = self.old_log_probs.numpy(force=True).astype(np.float64)
         entropies = self.old.entropy().numpy(force=True).astype(np.float64)
         batch, advantages = self.batch, self.advantages.copy()
         if batch.decision_of_sample is not None:
             log_probs = log_probs[batch.decision_of_sample]
-        advantages[:, 0] -= temperature * (log_probs + batch.per_sample(entropies))
+        advantages[:, 0] -= coefficient * (log_probs + batch.per_sample(entropies))
         return replace(self, advantages=advantages)
 
     def in_reward_spreads(self) -> tuple[Floats, Floats, Floats]:

@@ -58,15 +58,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from recrl.environments.cmdp import CostLimits
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.start import START_FRACTION, StartMeasurement
 from recrl.teachers.teacher import (
-    Lesson,
     ProgressReport,
     TeacherSpec,
     TeacherState,
     already_seen,
-    last_lesson,
     progress,
 )
 from recrl.teachers.windows import Stretch, WindowUnit, extend, last_two_windows
@@ -238,8 +236,8 @@ def judge(
     deploy_limits: CostLimits,
     remaining: int,
     config: DynamicConfig,
-) -> Lesson:
-    """Lines 5 to 10 of Algorithm 2: the next lesson.
+) -> CurriculumStep:
+    """Lines 5 to 10 of Algorithm 2: the next step.
 
     Args:
         old: the window before the last.
@@ -250,7 +248,7 @@ def judge(
         config: the settings.
     """
     if old.episodes == 0 or new.episodes == 0:
-        return Lesson(limits)
+        return CurriculumStep(limits)
     converged = _converged(old, new, config)
     kept = _kept(new, limits, config)
     if config.dimensions == "joint":
@@ -262,7 +260,7 @@ def judge(
             limits, new.mean_costs, deploy_limits, converged, kept, strict=True
         )
     )
-    return Lesson(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
+    return CurriculumStep(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
 
 
 def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
@@ -364,51 +362,51 @@ class DynamicTeacher:
         self.config = DynamicConfig.model_validate(dict(spec.options))
         self.measurement = StartMeasurement(spec, self.config.start_fraction)
 
-    def start(self) -> tuple[Lesson, TeacherState]:
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``."""
         state = _state(
             update=0,
             env_steps=0,
-            lesson=Lesson(self.spec.train_limits),
+            step=CurriculumStep(self.spec.train_limits),
             last_change=0,
             history=(),
             start=self.measurement.begin(),
         )
-        return last_lesson(state), state
+        return CurriculumStep.from_json(state), state
 
-    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.step``."""
         if already_seen(state, report):
-            return last_lesson(state), state
+            return CurriculumStep.from_json(state), state
         start = self.measurement.advance(state, report)
         history = self._history(state, report)
         last_change = state["last_change"] + (
             len(report.episodes) if self.config.window_unit == "episodes" else 1
         )
-        before = last_lesson(state).limits
+        before = CostLimits.from_json(state["limits"])
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
         is_due = False  # line 4
         if progress(report.env_steps, self.spec.train_steps) >= 1.0:
-            lesson, history = Lesson(self.spec.deploy_limits), ()
+            step, history = CurriculumStep(self.spec.deploy_limits), ()
         elif start["start_limits"] is None or limits != before or last_change < self.config.window:
-            lesson = Lesson(limits)
+            step = CurriculumStep(limits)
         else:
             is_due = True
-            lesson = self._judge(limits, history, report.env_steps, last_change)
-        has_changed = lesson.limits != before or lesson.policy_noise > 0.0
+            step = self._judge(limits, history, report.env_steps, last_change)
+        has_changed = step.limits != before or step.policy_noise > 0.0
         if is_due and self.config.clock_reset == "convergence":
             has_changed = has_changed or self._has_converged(history, last_change)
-        if lesson.policy_noise > 0.0 and self.config.windows_after_noise == 2:
+        if step.policy_noise > 0.0 and self.config.windows_after_noise == 2:
             history = ()
         next_state = _state(
             update=report.update,
             env_steps=report.env_steps,
-            lesson=lesson,
+            step=step,
             last_change=0 if has_changed else last_change,
             history=history,
             start=start,
         )
-        return lesson, next_state
+        return CurriculumStep.from_json(next_state), next_state
 
     def _history(self, state: TeacherState, report: ProgressReport) -> tuple[Stretch, ...]:
         """The updates of the last two windows, or all of them as long as they are fewer."""
@@ -468,15 +466,15 @@ class DynamicTeacher:
 
     def _judge(
         self, limits: CostLimits, history: Sequence[Stretch], env_steps: int, last_change: int
-    ) -> Lesson:
-        """The next lesson once W has passed since the last change."""
+    ) -> CurriculumStep:
+        """The next step once W has passed since the last change."""
         values, noise = list(limits), 0.0
         for group in self._groups:
             windows = self._windows(history, group, last_change)
             if windows is None:
                 continue
             old, new = windows
-            lesson = judge(
+            step = judge(
                 old,
                 new,
                 limits=CostLimits(tuple(limits[index] for index in group)),
@@ -486,17 +484,17 @@ class DynamicTeacher:
                 ),
                 config=self.config,
             )
-            noise = max(noise, lesson.policy_noise)
-            for index, value in zip(group, lesson.limits, strict=True):
+            noise = max(noise, step.policy_noise)
+            for index, value in zip(group, step.limits, strict=True):
                 values[index] = value
-        return Lesson(CostLimits(tuple(values)), noise)
+        return CurriculumStep(CostLimits(tuple(values)), noise)
 
 
 def _state(
     *,
     update: int,
     env_steps: int,
-    lesson: Lesson,
+    step: CurriculumStep,
     last_change: int,
     history: Sequence[Stretch],
     start: dict[str, Any],
@@ -505,8 +503,8 @@ def _state(
     return {
         "update": update,
         "env_steps": env_steps,
-        "limits": lesson.limits.to_json(),
-        "policy_noise": lesson.policy_noise,
+        "limits": step.limits.to_json(),
+        "policy_noise": step.policy_noise,
         "last_change": last_change,
         "history": [stretch.to_json() for stretch in history],
         **start,

@@ -19,7 +19,7 @@ from recrl.agents.constraint_forms import (
     value_at_risk,
 )
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import Floats
+from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector
 
 NUM_ENVS = 64
@@ -201,7 +201,7 @@ def last_third(agent_name: str, options: dict[str, Any], limit: float, updates: 
     kept: list[list[tuple[float, float]]] = []
     for update in range(updates):
         rollout, episodes = collector.collect(agent, generator)
-        agent.update(rollout, episode_costs(episodes, 1), np.array([limit]))
+        agent.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits((limit,))))
         if update >= updates * 2 / 3:
             kept.append([(episode.costs[0], episode.episode_return) for episode in episodes])
     return np.array(kept)

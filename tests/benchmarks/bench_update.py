@@ -37,14 +37,14 @@ from recrl.agents.config import AscentConfig, StudentConfig, TrustRegionConfig
 from recrl.agents.networks import Adam, Critics, NetworkForm, xavier
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.registry import AGENTS, agent_config, make_agent
-from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
 NUM_ENVS, NUM_STEPS, UPDATES = 16, 200, 30
-LIMITS = np.array([5.0])
+STEP = CurriculumStep(CostLimits((5.0,)))
 OPTIONS: list[dict[str, Any]] = [{}, {"compaction": False}]
 NUM_OBSERVATIONS, NUM_ACTIONS = 72, 2
-LARGE_LIMITS, EPISODE_STEPS = np.array([25.0]), 1000
+LARGE_STEP, EPISODE_STEPS = CurriculumStep(CostLimits((25.0,))), 1000
 HIDDEN = (256, 256)
 # The policy is evaluated before and after its improvement, the critics before theirs.
 EVALUATIONS = 2
@@ -69,7 +69,7 @@ def measure(agent_name: str, options: dict[str, Any]) -> tuple[list[float], list
         before = time.thread_time()
         rollout, episodes = collector.collect(agent, generator)
         middle = time.thread_time()
-        metrics = agent.update(rollout, episode_costs(episodes, 1), LIMITS)
+        metrics = agent.update(rollout, episode_costs(episodes, 1), STEP)
         collecting.append((middle - before) * 1e3)
         updating.append((time.thread_time() - middle) * 1e3)
         steps.append(metrics["policy_steps"])
@@ -181,7 +181,7 @@ def measure_large(agent_name: str, preset: str, samples: int) -> tuple[float, fl
 
     square_rates = [flops_a_millisecond()]
     with patch.object(Adam, "step", step_and_pause):
-        spent = milliseconds(lambda: metrics.update(agent.update(rollout, costs, LARGE_LIMITS))) - sum(turns)
+        spent = milliseconds(lambda: metrics.update(agent.update(rollout, costs, LARGE_STEP))) - sum(turns)
     square_rates.append(flops_a_millisecond())
     bare_rate = pass_flops(rows, (NUM_OBSERVATIONS, *HIDDEN, 1)) / float(np.mean(turns))
     flops = update_flops(config, metrics, samples) / 1e3

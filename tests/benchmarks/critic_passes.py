@@ -26,11 +26,11 @@ from recrl.agents.agent import Rollout
 from recrl.agents.batch import LearningBatch
 from recrl.agents.collect import Collector, episode_costs
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import Floats
+from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector
 
 NUM_ENVS, NUM_STEPS = 20, 1000
-LIMITS = np.array([25.0])
+STEP = CurriculumStep(CostLimits((25.0,)))
 COLUMNS = [
     "student",
     "passes",
@@ -71,7 +71,7 @@ def learn(student: str, task: str, passes: int, *, samples: int, seed: int, upda
         told = explained(agent, rollout)
         costs = episode_costs(episodes, 1)
         before = time.process_time()
-        agent.update(rollout, costs, LIMITS)
+        agent.update(rollout, costs, STEP)
         seconds = time.process_time() - before
         earned = float(np.mean([episode.episode_return for episode in episodes]))
         steps = update * NUM_ENVS * NUM_STEPS
