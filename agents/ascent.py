@@ -13,11 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import islice
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from recrl.agents.actor_critic import Stateful
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import AscentConfig
 from recrl.agents.distributions import Distribution, mean_divergence
@@ -29,6 +31,23 @@ from recrl.agents.policies import StochasticPolicy
 # What is climbed: a differentiable scalar of the policy's distributions at the rows of some samples, and of
 # the probability ratios pi(a | s) / pi_old(a | s) of their decisions, [D].
 Objective = Callable[[Distribution, Tensor], Tensor]
+
+
+AnyAscentConfig = TypeVar("AnyAscentConfig", bound=AscentConfig)
+
+
+class FirstOrderRule(Generic[AnyAscentConfig]):
+    """What the rules share that improve a policy by gradient ascent: the settings and the optimiser.
+
+    Args:
+        config: the agent's settings.
+        policy: whose parameters the optimiser changes.
+    """
+
+    def __init__(self, config: AnyAscentConfig, policy: StochasticPolicy) -> None:
+        self._config = config
+        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
 
 def with_entropy(gain: Callable[[Tensor], Tensor], batch: LearningBatch, bonus: float) -> Objective:

@@ -25,13 +25,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.ascent import Objective, climb
+from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.ascent import FirstOrderRule, Objective, climb
 from recrl.agents.config import FOCOPSConfig
 from recrl.agents.distributions import Distribution, mean_divergence
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
-from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.environments.cmdp import CMDPSpec, Floats
 
@@ -77,14 +76,13 @@ def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, r
         policy.parameters.values.lerp_(start, 1.0 - (radius / divergence) ** 0.5)
 
 
-class FirstOrderConstrainedOptimisation:
+class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
     """The rule of ``focops``; a ``recrl.agents.actor_critic.PolicyRule``."""
 
     def __init__(self, config: FOCOPSConfig, policy: StochasticPolicy, num_costs: int) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        super().__init__(config, policy)
         self._multipliers = Multipliers(config, num_costs)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser, "multipliers": self._multipliers}
+        self.parts["multipliers"] = self._multipliers
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

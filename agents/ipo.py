@@ -31,12 +31,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.ascent import Objective, climb, with_prices
+from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.config import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief, surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
@@ -93,13 +92,8 @@ def barrier_gain(
     return gain
 
 
-class InteriorPointPolicyOptimisation:
+class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
     """The rule of ``ipo``; a ``recrl.agents.actor_critic.PolicyRule``."""
-
-    def __init__(self, config: IPOConfig, policy: StochasticPolicy) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

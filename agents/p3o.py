@@ -21,12 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.ascent import Objective, climb, with_prices
+from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.config import P3OConfig
 from recrl.agents.experience import Experience
-from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
 from recrl.environments.cmdp import CMDPSpec, Floats
@@ -66,13 +65,8 @@ def penalised_gain(
     return gain
 
 
-class PenalisedProximalPolicyOptimisation:
+class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
     """The rule of ``p3o``; a ``recrl.agents.actor_critic.PolicyRule``."""
-
-    def __init__(self, config: P3OConfig, policy: StochasticPolicy) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

@@ -10,24 +10,18 @@ from functools import partial
 
 import numpy as np
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.advantages import scaled_advantages
-from recrl.agents.ascent import Objective, climb, with_entropy
+from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_entropy
 from recrl.agents.config import PPOConfig
 from recrl.agents.experience import Experience
-from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate
 from recrl.environments.cmdp import CMDPSpec
 
 
-class ProximalPolicyOptimisation:
+class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
     """The rule of ``ppo``; a ``recrl.agents.actor_critic.PolicyRule``."""
-
-    def __init__(self, config: PPOConfig, policy: StochasticPolicy) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

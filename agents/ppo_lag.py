@@ -17,14 +17,13 @@ from collections.abc import Callable
 import numpy as np
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.advantages import penalised_advantages
-from recrl.agents.ascent import Objective, climb, with_entropy
+from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_entropy
 from recrl.agents.batch import LearningBatch
 from recrl.agents.config import PPOLagConfig
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
-from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
@@ -60,14 +59,13 @@ def separate_gain(
 GAINS = {"combined": combined_gain, "separate": separate_gain}
 
 
-class PPOLagrangian:
+class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
     """The rule of ``ppo-lag``; a ``recrl.agents.actor_critic.PolicyRule``."""
 
     def __init__(self, config: PPOLagConfig, policy: StochasticPolicy, num_costs: int) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        super().__init__(config, policy)
         self._multipliers = Multipliers(config, num_costs)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser, "multipliers": self._multipliers}
+        self.parts["multipliers"] = self._multipliers
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

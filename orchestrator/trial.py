@@ -5,10 +5,10 @@ optimisers, multipliers, teacher, environments, generators, counters, partial ep
 trial killed anywhere and resumed gives the bytes of one that never stopped.
 
 The walk of an update: collect T x B environment steps; append the episodes that finished;
-``agent.update(rollout, episode costs, step)`` under the curriculum's step, then
-``teacher.step(state, report)`` for the next one. When the budget B is spent the phase is deployment, the limits
-are d_d, the noise is 0 and the teacher is not asked any more; the agent goes on learning. At the end the policy
-is frozen and evaluated.
+``agent.update(rollout, episode costs, step)`` under the curriculum's step, then ``teacher.step(state,
+report)`` for the next one. When the budget B is spent the phase is deployment, the limits are d_d, the noise
+is 0 and the teacher is not asked any more; the agent goes on learning. At the end the policy is frozen and
+evaluated.
 """
 
 from __future__ import annotations
