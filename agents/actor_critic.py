@@ -27,7 +27,7 @@ from torch import Tensor
 from recrl.agents.advantages import generalised_advantages, next_values
 from recrl.agents.agent import Rollout
 from recrl.agents.batch import LearningBatch, to_tensor
-from recrl.agents.config import StudentConfig
+from recrl.agents.config import ActorCriticConfig
 from recrl.agents.constraint_forms import MeanCost, RecentEpisodes, TailCost
 from recrl.agents.distributions import mean_divergence
 from recrl.agents.encoding import Encoder
@@ -125,7 +125,7 @@ class ActorCritic:
     def __init__(
         self,
         cmdp: CMDPSpec,
-        config: StudentConfig,
+        config: ActorCriticConfig,
         *,
         encoder: Encoder,
         policy: StochasticPolicy,
@@ -382,7 +382,7 @@ def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
 
 def fresh_student(
     cmdp: CMDPSpec,
-    config: StudentConfig,
+    config: ActorCriticConfig,
     seed: np.random.SeedSequence,
     make_rule: Callable[[StochasticPolicy], PolicyRule],
 ) -> ActorCritic:

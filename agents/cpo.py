@@ -21,8 +21,9 @@ from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import reward_spread
+from recrl.agents.algorithm_configs import CPOConfig
 from recrl.agents.batch import to_tensor
-from recrl.agents.config import CPOConfig, TrustRegionConfig
+from recrl.agents.config import TrustRegionConfig
 from recrl.agents.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.agents.distributions import Distribution, mean_divergence
 from recrl.agents.errors import require_finite

@@ -33,7 +33,7 @@ import numpy as np
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import SMALLEST_STD, reward_spread
-from recrl.agents.config import CRPOConfig
+from recrl.agents.algorithm_configs import CRPOConfig
 from recrl.agents.cpo import LocalModel, along, linearise
 from recrl.agents.cpo_dual import NO_INFLUENCE, DualSolution, StepCase, StepProblem, projection_weights
 from recrl.agents.experience import ActiveConstraints, Experience

@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.algorithm_configs import FOCOPSConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, climb
-from recrl.agents.config import FOCOPSConfig
 from recrl.agents.distributions import Distribution, mean_divergence
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers

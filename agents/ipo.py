@@ -32,9 +32,9 @@ import torch
 from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.algorithm_configs import IPOConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
-from recrl.agents.config import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief, surrogate

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from recrl.agents.advantages import penalised_advantages, reward_spread
-from recrl.agents.config import MultiplierConfig
+from recrl.agents.config import LagrangianConfig
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.lagrange import (
     STARTS,
@@ -70,7 +70,7 @@ class Multipliers:
         num_costs: k.
     """
 
-    def __init__(self, config: MultiplierConfig, num_costs: int) -> None:
+    def __init__(self, config: LagrangianConfig, num_costs: int) -> None:
         self._state: MultiplierState = STARTS[config.multiplier_rule](num_costs, config.multiplier_initial)
         self._is_relative = config.multiplier_unit == "relative"
         self._step = multiplier_step(config)
@@ -110,7 +110,7 @@ class Multipliers:
         self._spreads.load_state_dict(state["spreads"])
 
 
-def multiplier_step(config: MultiplierConfig) -> MultiplierRule:
+def multiplier_step(config: LagrangianConfig) -> MultiplierRule:
     """The multiplier rule that the options name, as a function of state and gaps."""
     step, maximum = config.multiplier_step, config.multiplier_maximum
     if config.multiplier_rule == "softplus-adam":

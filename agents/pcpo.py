@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student
-from recrl.agents.config import PCPOConfig
+from recrl.agents.algorithm_configs import PCPOConfig
 from recrl.agents.cpo import constrained_step
 from recrl.agents.cpo_dual import (
     NO_INFLUENCE,

@@ -12,8 +12,8 @@ import numpy as np
 
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.advantages import scaled_advantages
+from recrl.agents.algorithm_configs import PPOConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_entropy
-from recrl.agents.config import PPOConfig
 from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.advantages import penalised_advantages
+from recrl.agents.algorithm_configs import PPOLagConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_entropy
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import PPOLagConfig
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
 from recrl.agents.policies import StochasticPolicy

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from recrl.agents.agent import Agent
-from recrl.agents.config import (
+from recrl.agents.algorithm_configs import (
     CPOConfig,
     CRPOConfig,
     FOCOPSConfig,

@@ -15,7 +15,8 @@ import torch
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import scaled_advantages
-from recrl.agents.config import TRPOConfig, TrustRegionConfig
+from recrl.agents.algorithm_configs import TRPOConfig
+from recrl.agents.config import TrustRegionConfig
 from recrl.agents.cpo import LocalModel
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience

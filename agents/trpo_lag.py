@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
-from recrl.agents.config import TRPOLagConfig
+from recrl.agents.algorithm_configs import TRPOLagConfig
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
 from recrl.agents.policies import StochasticPolicy

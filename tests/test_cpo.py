@@ -8,8 +8,8 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 
 from recrl.agents.actor_critic import improve_and_measure
+from recrl.agents.algorithm_configs import CPOConfig
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import CPOConfig
 from recrl.agents.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.cpo_dual import StepCase
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience

@@ -8,8 +8,8 @@ import torch
 from gymnasium.spaces import Discrete
 
 from recrl.agents.actor_critic import PolicyRule, improve_and_measure
+from recrl.agents.algorithm_configs import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.distributions import Categorical
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.focops import FirstOrderConstrainedOptimisation, projection_objective

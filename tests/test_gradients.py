@@ -9,9 +9,9 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 
 from recrl.agents import networks
+from recrl.agents.algorithm_configs import IPOConfig
 from recrl.agents.ascent import Objective, with_entropy
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import IPOConfig
 from recrl.agents.distributions import Distribution
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.focops import projection_objective

@@ -10,8 +10,8 @@ from gymnasium.spaces import Box, Discrete, Space
 from scipy.optimize import nnls
 
 from recrl.agents.actor_critic import PolicyRule, improve_and_measure
+from recrl.agents.algorithm_configs import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.cpo_dual import StepCase, StepProblem, projection_weights
 from recrl.agents.crpo import ConstraintRectifiedPolicyOptimisation, most_violated, step_down, step_up
 from recrl.agents.experience import Constraints, Experience

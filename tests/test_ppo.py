@@ -9,9 +9,9 @@ from gymnasium.spaces import Box, Discrete, Space
 
 from recrl.agents.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.advantages import penalised_advantages
+from recrl.agents.algorithm_configs import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.ascent import Objective, climb, with_entropy, with_prices
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.distributions import Categorical
 from recrl.agents.experience import Constraints, Experience

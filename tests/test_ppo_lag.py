@@ -9,8 +9,8 @@ from gymnasium.spaces import Discrete
 
 from recrl.agents.actor_critic import improve_and_measure
 from recrl.agents.advantages import scaled_advantages
+from recrl.agents.algorithm_configs import PPOLagConfig
 from recrl.agents.batch import LearningBatch
-from recrl.agents.config import PPOLagConfig
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.policies import StochasticPolicy

@@ -35,7 +35,7 @@ from gymnasium.vector.utils import batch_space
 
 from recrl.agents.agent import Policy
 from recrl.agents.collect import Collector, episode_costs
-from recrl.agents.config import StudentConfig
+from recrl.agents.config import ActorCriticConfig
 from recrl.agents.registry import agent_config, make_agent
 from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
@@ -192,7 +192,7 @@ def measure(task: str, agent_name: str, widths: list[int], updates: int) -> Meas
     environments = TimedSteps(made, rival.steps if rival else None)
     options = {"hidden_sizes": widths}
     config = agent_config(agent_name, options)
-    assert isinstance(config, StudentConfig)
+    assert isinstance(config, ActorCriticConfig)
     agent = make_agent(agent_name, environments.cmdp, options, np.random.SeedSequence(0))
     collector = Collector(environments, num_steps=NUM_STEPS)
     collector.reset(seed=0)

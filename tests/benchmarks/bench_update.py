@@ -33,7 +33,7 @@ from gymnasium.spaces import Box
 from recrl.agents.agent import Rollout
 from recrl.agents.batch import distinct_rows
 from recrl.agents.collect import Collector, episode_costs
-from recrl.agents.config import AscentConfig, StudentConfig, TrustRegionConfig
+from recrl.agents.config import ActorCriticConfig, AscentConfig, TrustRegionConfig
 from recrl.agents.networks import Adam, Critics, NetworkForm, xavier
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.registry import AGENTS, agent_config, make_agent
@@ -119,7 +119,7 @@ def pass_flops(rows: float, sizes: tuple[int, ...]) -> float:
     return forward_flops(rows, sizes) + backward_flops(rows, sizes)
 
 
-def update_flops(config: StudentConfig, metrics: dict[str, float], samples: int) -> float:
+def update_flops(config: ActorCriticConfig, metrics: dict[str, float], samples: int) -> float:
     """Of all products that one update with two critics asks for."""
     critic = (NUM_OBSERVATIONS, *config.hidden_sizes, 1)
     policy = (NUM_OBSERVATIONS, *config.hidden_sizes, NUM_ACTIONS)
@@ -163,7 +163,7 @@ def measure_large(agent_name: str, preset: str, samples: int) -> tuple[float, fl
     """Seconds of one update, those of its bounds, bare and square, and the policy steps it took."""
     options = {"preset": preset, "hidden_sizes": list(HIDDEN)}
     config = agent_config(agent_name, options)
-    assert isinstance(config, StudentConfig)
+    assert isinstance(config, ActorCriticConfig)
     box = Box(-np.inf, np.inf, (NUM_OBSERVATIONS,), np.float32)
     cmdp = CMDPSpec("noise", box, Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32), ("cost",), EPISODE_STEPS)
     agent = make_agent(agent_name, cmdp, options, np.random.SeedSequence(0))
