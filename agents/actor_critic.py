@@ -192,7 +192,7 @@ class ActorCritic:
             self._encoder(observations), actions, compact=config.compaction, most_rows=config.minibatch_size
         )
         recent_costs, lengths = self._recent.add(episode_costs, rollout.finished_lengths())
-        costs, constrained = self._form.judge(rollout, recent_costs, limits)
+        costs, constrained = self._form.constraint_costs(rollout, recent_costs, limits)
         estimates = self._estimate(rollout, costs, batch)
         advantages = estimates.advantages
         constraints = Constraints.measure(recent_costs, lengths, constrained, limits)

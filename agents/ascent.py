@@ -50,18 +50,20 @@ class FirstOrderRule(Generic[AnyAscentConfig]):
         self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
 
-def with_entropy(gain: Callable[[Tensor], Tensor], batch: LearningBatch, bonus: float) -> Objective:
+def with_entropy(
+    surrogate_objective: Callable[[Tensor], Tensor], batch: LearningBatch, bonus: float
+) -> Objective:
     """A function of the ratios alone, plus ``bonus`` times the mean entropy in nats."""
 
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
         if bonus == 0.0:
-            return gain(ratios)
-        return gain(ratios) + bonus * torch.dot(batch.row_weights, now.entropy())
+            return surrogate_objective(ratios)
+        return surrogate_objective(ratios) + bonus * torch.dot(batch.row_weights, now.entropy())
 
     return objective
 
 
-def with_prices(gain: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
+def with_prices(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
     """A function of the ratios that also says what it charges for costs, over 1 + that price.
 
     A penalty's gradients are as long as its price. Adam, whose steps remember the length of past gradients,
@@ -70,13 +72,13 @@ def with_prices(gain: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
     """
 
     def objective(_: Distribution, ratios: Tensor) -> Tensor:
-        value, price = gain(ratios)
+        value, price = surrogate_objective(ratios)
         return value / (1.0 + price)
 
     return objective
 
 
-def climb(
+def gradient_ascent(
     policy: StochasticPolicy,
     optimiser: Adam,
     experience: Experience,
@@ -112,8 +114,8 @@ def climb(
             divergence = float(mean_divergence(part.old, now.distribution, part.batch.row_weights))
         if taken == steps or divergence > largest_kl:
             break
-        gain = objective_on(part)(now.distribution, part.ratios(now.distribution))
-        now.gradient(-gain)
+        surrogate_objective = objective_on(part)(now.distribution, part.ratios(now.distribution))
+        now.gradient(-surrogate_objective)
         optimiser.step()
     require_finite("the KL of the policy's steps", divergence)
     return {"policy_steps": float(taken)}

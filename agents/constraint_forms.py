@@ -158,8 +158,10 @@ class RecentEpisodes:
 class MeanCost:
     """The mean episode cost is constrained; nothing is kept."""
 
-    def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
-        """See ``TailCost.judge``."""
+    def constraint_costs(
+        self, rollout: Rollout, episode_costs: Floats, limits: Floats
+    ) -> tuple[Floats, Floats]:
+        """See ``TailCost.constraint_costs``."""
         if not len(episode_costs):
             return rollout.costs, np.full(rollout.costs.shape[2], np.nan)
         return rollout.costs, episode_costs.mean(axis=0)
@@ -184,7 +186,9 @@ class TailCost:
         self._level = level
         self._value_at_risk = np.zeros(num_costs)
 
-    def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
+    def constraint_costs(
+        self, rollout: Rollout, episode_costs: Floats, limits: Floats
+    ) -> tuple[Floats, Floats]:
         """The costs to learn from, and what the limits are compared with.
 
         Args:

@@ -112,7 +112,7 @@ def constrained_step(
     problem, solved = linearise(model, active, metric, config)
     solution = solve(problem)
     is_acceptable = acceptance(model, active, solution, config.target_kl)
-    metrics = line_search(policy.parameters, along(solution, solved), is_acceptable, config)
+    metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
     multipliers[:] = 0.0
     multipliers[active.index] = solution.multipliers
     return {**metrics, "case": float(solution.case), **indexed("multiplier", multipliers)}
@@ -137,7 +137,7 @@ def linearise(
     return problem, solved
 
 
-def along(solution: DualSolution, solved: Tensor) -> Tensor:
+def to_parameter_step(solution: DualSolution, solved: Tensor) -> Tensor:
     """The step x, [P], that a solution stands for; ``solved`` is as ``linearise`` gives it."""
     weights = np.concatenate([[solution.gradient_weight], solution.constraint_weights])
     return -to_tensor(weights) @ solved

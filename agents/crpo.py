@@ -34,7 +34,7 @@ import numpy as np
 from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
 from recrl.agents.advantages import SMALLEST_STD, reward_spread
 from recrl.agents.algorithm_configs import CRPOConfig
-from recrl.agents.cpo import LocalModel, along, linearise
+from recrl.agents.cpo import LocalModel, linearise, to_parameter_step
 from recrl.agents.cpo_dual import NO_INFLUENCE, DualSolution, StepCase, StepProblem, projection_weights
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.policies import StochasticPolicy
@@ -125,7 +125,7 @@ class ConstraintRectifiedPolicyOptimisation:
             solution = step_down(problem, int(np.searchsorted(active.index, mended)), config)
             multipliers[mended] = np.inf  # as if this constraint were all that counts
         is_acceptable = improvement(model, mended, config.target_kl)
-        metrics = line_search(policy.parameters, along(solution, solved), is_acceptable, config)
+        metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
         return {**metrics, **indexed("multiplier", multipliers)}
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.algorithm_configs import FOCOPSConfig
-from recrl.agents.ascent import FirstOrderRule, Objective, climb
+from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent
 from recrl.agents.distributions import Distribution, mean_divergence
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
@@ -97,7 +97,9 @@ class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
             focops_lambda=config.focops_lambda,
             radius=config.target_kl,
         )
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         if config.trust_region == "kept":
             keep_near(policy, experience, start, config.target_kl)
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.algorithm_configs import IPOConfig
-from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_prices
+from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.policies import StochasticPolicy
@@ -64,7 +64,7 @@ def relief_of(batch: LearningBatch, costs: Floats, config: IPOConfig) -> Callabl
     return lambda ratios: surrogate(ratios - 1.0, per_decision)
 
 
-def barrier_gain(
+def barrier_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, violations: Floats, config: IPOConfig
 ) -> Callable[[Tensor], tuple[Tensor, float]]:
     """The module's formula, a function of the ratios, with the sum of the barriers' slopes.
@@ -84,12 +84,12 @@ def barrier_gain(
     shape = partial(barrier, sharpness=config.barrier_sharpness, slope=config.barrier_slope)
     relief = relief_of(batch, costs, config)
 
-    def gain(ratios: Tensor) -> tuple[Tensor, float]:
+    def surrogate_objective(ratios: Tensor) -> tuple[Tensor, float]:
         slack = relief(ratios) - offsets
         charged = slopes(slack.detach().numpy(force=True), config)
         return clipped_surrogate(ratios, signed, config.clip) + shape(slack).sum(), float(charged.sum())
 
-    return gain
+    return surrogate_objective
 
 
 class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
@@ -105,9 +105,11 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:
-            return with_prices(barrier_gain(part.batch, rewards, costs, violations, config))
+            return with_prices(barrier_surrogate_objective(part.batch, rewards, costs, violations, config))
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         multipliers = np.zeros_like(constraints.limits)
         multipliers[ActiveConstraints.of(constraints).index] = slopes(-violations, config)
         return {**metrics, **indexed("multiplier", multipliers)}

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.algorithm_configs import P3OConfig
-from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_prices
+from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
 from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
@@ -31,7 +31,7 @@ from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, pessimi
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
-def penalised_gain(
+def penalised_surrogate_objective(
     batch: LearningBatch,
     rewards: Floats,
     costs: Floats,
@@ -57,12 +57,12 @@ def penalised_gain(
     relief = [SignedAdvantages.split(batch, -column) for column in costs.T]
     offsets = to_tensor(violations)
 
-    def gain(ratios: Tensor) -> tuple[Tensor, float]:
+    def surrogate_objective(ratios: Tensor) -> tuple[Tensor, float]:
         excess = torch.relu(offsets - pessimistic_relief(ratios, relief, clip))
         value = clipped_surrogate(ratios, signed, clip) - factor * excess.sum()
         return value, factor * float((excess.detach() > 0.0).sum())
 
-    return gain
+    return surrogate_objective
 
 
 class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
@@ -78,12 +78,14 @@ class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:
-            gain = penalised_gain(
+            surrogate_objective = penalised_surrogate_objective(
                 part.batch, rewards, costs, violations, clip=config.clip, factor=config.penalty_factor
             )
-            return with_prices(gain)
+            return with_prices(surrogate_objective)
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         multipliers = np.where(constraints.gaps > 0.0, config.penalty_factor, 0.0)
         return {**metrics, **indexed("multiplier", multipliers)}
 

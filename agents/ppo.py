@@ -13,7 +13,7 @@ import numpy as np
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.advantages import scaled_advantages
 from recrl.agents.algorithm_configs import PPOConfig
-from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_entropy
+from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
 from recrl.agents.experience import Experience
 from recrl.agents.policies import StochasticPolicy
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate
@@ -32,10 +32,12 @@ class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
 
         def objective(part: Experience) -> Objective:
             signed = SignedAdvantages.split(part.batch, rewards)
-            gain = partial(clipped_surrogate, advantages=signed, clip=config.clip)
-            return with_entropy(gain, part.batch, config.entropy_bonus)
+            surrogate_objective = partial(clipped_surrogate, advantages=signed, clip=config.clip)
+            return with_entropy(surrogate_objective, part.batch, config.entropy_bonus)
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
 from recrl.agents.advantages import penalised_advantages
 from recrl.agents.algorithm_configs import PPOLagConfig
-from recrl.agents.ascent import FirstOrderRule, Objective, climb, with_entropy
+from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
 from recrl.agents.batch import LearningBatch
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
@@ -29,7 +29,7 @@ from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, surroga
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
-def combined_gain(
+def combined_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
 ) -> Callable[[Tensor], Tensor]:
     """The clipped surrogate of the penalised advantages, as a function of the ratios, [D].
@@ -45,10 +45,13 @@ def combined_gain(
     return lambda ratios: clipped_surrogate(ratios, penalised, clip)
 
 
-def separate_gain(
+def separate_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
 ) -> Callable[[Tensor], Tensor]:
-    """The reward's clipped surrogate minus the multiplied costs' surrogates; see ``combined_gain``."""
+    """The reward's clipped surrogate minus the multiplied costs' surrogates.
+
+    The arguments are those of ``combined_surrogate_objective``.
+    """
     weight = 1.0 / (1.0 + float(multipliers.sum()))
     signed = SignedAdvantages.split(batch, weight * rewards)
     penalty = batch.per_decision(weight * (costs @ multipliers))
@@ -56,7 +59,7 @@ def separate_gain(
 
 
 # By the name that the option ``penalty`` has.
-GAINS = {"combined": combined_gain, "separate": separate_gain}
+SURROGATE_OBJECTIVES = {"combined": combined_surrogate_objective, "separate": separate_surrogate_objective}
 
 
 class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
@@ -73,13 +76,17 @@ class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
         """Move the multipliers, then the policy."""
         config = self._config
         penalty = self._multipliers.update(experience)
-        gain_of = GAINS[config.penalty]
+        surrogate_objective_of = SURROGATE_OBJECTIVES[config.penalty]
 
         def objective(part: Experience) -> Objective:
-            gain = gain_of(part.batch, penalty.rewards, penalty.costs, penalty.multipliers, config.clip)
-            return with_entropy(gain, part.batch, config.entropy_bonus)
+            surrogate_objective = surrogate_objective_of(
+                part.batch, penalty.rewards, penalty.costs, penalty.multipliers, config.clip
+            )
+            return with_entropy(surrogate_objective, part.batch, config.entropy_bonus)
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 

@@ -67,7 +67,7 @@ from recrl.teachers.teacher import (
     already_seen,
     progress,
 )
-from recrl.teachers.windows import Stretch, WindowUnit, extend, last_two_windows
+from recrl.teachers.windows import WindowStatistics, WindowUnit, extend, last_two_windows
 
 # The pseudocode as it stands. W and eps_pi are not given in the paper: W is five updates of 16 episodes.
 PAPER = {
@@ -228,9 +228,9 @@ def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int
     return max(deploy_limit, deploy_limit + (start - deploy_limit) * (1.0 - 1.0 / max(1, remaining)))
 
 
-def judge(
-    old: Stretch,
-    new: Stretch,
+def decide(
+    old: WindowStatistics,
+    new: WindowStatistics,
     *,
     limits: CostLimits,
     deploy_limits: CostLimits,
@@ -263,7 +263,7 @@ def judge(
     return CurriculumStep(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
 
 
-def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
+def _converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConfig) -> list[bool]:
     """Whether the return and the cost of each dimension have converged (line 5), [k].
 
     Never where a window has no episode. Jointly, none has before all have.
@@ -281,7 +281,7 @@ def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
     return [all(converged)] * len(converged) if config.dimensions == "joint" else converged
 
 
-def _floors(window: Stretch, config: DynamicConfig) -> tuple[float, tuple[float, ...]]:
+def _floors(window: WindowStatistics, config: DynamicConfig) -> tuple[float, tuple[float, ...]]:
     """What a mean return and mean costs at least count as in a comparison: the floor, or the spread."""
     if not config.window_grows:
         return config.return_floor, (config.cost_floor,) * len(window.mean_costs)
@@ -289,7 +289,7 @@ def _floors(window: Stretch, config: DynamicConfig) -> tuple[float, tuple[float,
     return max(window.return_spread, config.return_floor), cost_floors
 
 
-def is_precise(window: Stretch, config: DynamicConfig) -> bool:
+def is_precise(window: WindowStatistics, config: DynamicConfig) -> bool:
     """Whether a window's means are known to within what equal means may differ by.
 
     s <= eps max(|mean|, floor, standard deviation), s the standard error of the return and of each cost. With
@@ -306,7 +306,7 @@ def is_precise(window: Stretch, config: DynamicConfig) -> bool:
     )
 
 
-def _kept(new: Stretch, limits: CostLimits, config: DynamicConfig) -> list[bool]:
+def _kept(new: WindowStatistics, limits: CostLimits, config: DynamicConfig) -> list[bool]:
     """Whether each limit is kept, [k]."""
     return [
         keeps_limit(cost, limit, tolerance=_tolerance(limit, error, config))
@@ -326,7 +326,7 @@ def _tolerance(limit: float, standard_error: float, config: DynamicConfig) -> fl
 
 
 def steps_left(
-    last: Stretch, *, env_steps: int, train_steps: int, unit: Literal["windows", "episodes"]
+    last: WindowStatistics, *, env_steps: int, train_steps: int, unit: Literal["windows", "episodes"]
 ) -> int:
     """How many steps of ``next_limit`` the training budget has room for, at the pace of the last window.
 
@@ -336,7 +336,7 @@ def steps_left(
     next one is not counted: Algorithm 2 judges before it plays episode b, when b - 1 are played and
     B - b + 1 are left.
 
-    >>> last = Stretch(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    >>> last = WindowStatistics(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
     [2, 35]
     """
@@ -350,8 +350,8 @@ class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
-    episodes since limits or policy were changed, in the unit of W), ``history`` (one ``Stretch`` for each
-    update of the last two windows, as far as they are comparable) and the keys of ``StartMeasurement``.
+    episodes since limits or policy were changed, in the unit of W), ``history`` (``WindowStatistics`` of each update
+    of the last two windows, as far as they are comparable) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
@@ -392,7 +392,7 @@ class DynamicTeacher:
             step = CurriculumStep(limits)
         else:
             is_due = True
-            step = self._judge(limits, history, report.env_steps, last_change)
+            step = self._decide(limits, history, report.env_steps, last_change)
         has_changed = step.limits != before or step.policy_noise > 0.0
         if is_due and self.config.clock_reset == "convergence":
             has_changed = has_changed or self._has_converged(history, last_change)
@@ -408,15 +408,17 @@ class DynamicTeacher:
         )
         return CurriculumStep.from_json(next_state), next_state
 
-    def _history(self, state: TeacherState, report: ProgressReport) -> tuple[Stretch, ...]:
+    def _history(self, state: TeacherState, report: ProgressReport) -> tuple[WindowStatistics, ...]:
         """The updates of the last two windows, or all of them as long as they are fewer."""
-        latest = Stretch.of_update(
+        latest = WindowStatistics.of_update(
             report.episodes,
             env_steps=report.env_steps - state["env_steps"],
             num_costs=len(self.spec.train_limits),
         )
         unit = self.config.window_unit
-        history = extend([Stretch.from_json(stretch) for stretch in state["history"]], latest, unit=unit)
+        history = extend(
+            [WindowStatistics.from_json(statistics) for statistics in state["history"]], latest, unit=unit
+        )
         needed = [self._last_two(history, group) for group in self._groups]
         if any(windows is None for windows in needed):
             return history
@@ -431,8 +433,8 @@ class DynamicTeacher:
         return (costs,)
 
     def _last_two(
-        self, history: Sequence[Stretch], group: tuple[int, ...]
-    ) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]] | None:
+        self, history: Sequence[WindowStatistics], group: tuple[int, ...]
+    ) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
         """The updates of the last two windows for a group of costs, or None as long as there are too few."""
         config = self.config
         return last_two_windows(
@@ -444,28 +446,29 @@ class DynamicTeacher:
             else None,
         )
 
-    def _is_due(self, newest: Sequence[Stretch], last_change: int) -> bool:
+    def _is_due(self, newest: Sequence[WindowStatistics], last_change: int) -> bool:
         """Whether a newest window lies wholly after the last change (line 4)."""
         in_episodes = self.config.window_unit == "episodes"
         length = sum(each.episodes for each in newest) if in_episodes else len(newest)
         return not self.config.window_grows or last_change >= length
 
     def _windows(
-        self, history: Sequence[Stretch], group: tuple[int, ...], last_change: int
-    ) -> tuple[Stretch, Stretch] | None:
+        self, history: Sequence[WindowStatistics], group: tuple[int, ...], last_change: int
+    ) -> tuple[WindowStatistics, WindowStatistics] | None:
         """The last two windows of a group of costs, each pooled; None if they are too few or too old."""
         windows = self._last_two(history, group)
         if windows is None or not self._is_due(windows[1], last_change):
             return None
-        return Stretch.pooled(windows[0]).of_costs(group), Stretch.pooled(windows[1]).of_costs(group)
+        old, new = (WindowStatistics.pooled(window).of_costs(group) for window in windows)
+        return old, new
 
-    def _has_converged(self, history: Sequence[Stretch], last_change: int) -> bool:
+    def _has_converged(self, history: Sequence[WindowStatistics], last_change: int) -> bool:
         """Whether line 11 is reached: the test of line 5 holds in some dimension, or jointly."""
         groups = (self._windows(history, group, last_change) for group in self._groups)
         return any(any(_converged(*windows, self.config)) for windows in groups if windows is not None)
 
-    def _judge(
-        self, limits: CostLimits, history: Sequence[Stretch], env_steps: int, last_change: int
+    def _decide(
+        self, limits: CostLimits, history: Sequence[WindowStatistics], env_steps: int, last_change: int
     ) -> CurriculumStep:
         """The next step once W has passed since the last change."""
         values, noise = list(limits), 0.0
@@ -474,7 +477,7 @@ class DynamicTeacher:
             if windows is None:
                 continue
             old, new = windows
-            step = judge(
+            step = decide(
                 old,
                 new,
                 limits=CostLimits(tuple(limits[index] for index in group)),
@@ -496,7 +499,7 @@ def _state(
     env_steps: int,
     step: CurriculumStep,
     last_change: int,
-    history: Sequence[Stretch],
+    history: Sequence[WindowStatistics],
     start: dict[str, Any],
 ) -> dict[str, Any]:
     """A state as JSON."""
@@ -506,6 +509,6 @@ def _state(
         "limits": step.limits.to_json(),
         "policy_noise": step.policy_noise,
         "last_change": last_change,
-        "history": [stretch.to_json() for stretch in history],
+        "history": [statistics.to_json() for statistics in history],
         **start,
     }

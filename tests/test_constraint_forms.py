@@ -117,32 +117,34 @@ def rollout_of(costs: Floats) -> Rollout:
 def test_without_a_finished_episode_the_value_at_risk_stays_and_nothing_is_known() -> None:
     form = TailCost(0.5, 1)
     limit = np.array([9.0])
-    form.judge(rollout_of(np.zeros(1)), column(1.0, 2.0, 3.0), limit)
-    costs, values = form.judge(rollout_of(np.array([1.0, 3.0])), np.empty((0, 1)), limit)
+    form.constraint_costs(rollout_of(np.zeros(1)), column(1.0, 2.0, 3.0), limit)
+    costs, values = form.constraint_costs(rollout_of(np.array([1.0, 3.0])), np.empty((0, 1)), limit)
     assert costs.ravel().tolist() == [0.0, 4.0]
     assert math.isnan(values[0])
     resumed = TailCost(0.5, 1)
     resumed.load_state_dict(form.state_dict())
-    found, _ = resumed.judge(rollout_of(np.array([1.0, 3.0])), np.empty((0, 1)), limit)
+    found, _ = resumed.constraint_costs(rollout_of(np.array([1.0, 3.0])), np.empty((0, 1)), limit)
     assert found.ravel().tolist() == [0.0, 4.0]
 
 
 def test_the_mean_form_leaves_costs_alone() -> None:
     rollout = rollout_of(np.array([1.0, 3.0]))
     limit = np.array([9.0])
-    costs, values = MeanCost().judge(rollout, column(1.0, 2.0), limit)
+    costs, values = MeanCost().constraint_costs(rollout, column(1.0, 2.0), limit)
     assert costs is rollout.costs
     assert values.tolist() == [1.5]
-    assert math.isnan(MeanCost().judge(rollout, np.empty((0, 1)), limit)[1][0])
+    assert math.isnan(MeanCost().constraint_costs(rollout, np.empty((0, 1)), limit)[1][0])
 
 
 def test_where_the_limit_is_violated_all_cost_beyond_it_counts() -> None:
     """All episodes cost 9: the CVaR is flat; cost beyond the limit 5 is not, (9 - 5) / 0.25 beyond 5."""
     form = TailCost(0.75, 1)
-    costs, values = form.judge(rollout_of(np.array([4.0, 3.0, 2.0])), column(9.0, 9.0), np.array([5.0]))
+    costs, values = form.constraint_costs(
+        rollout_of(np.array([4.0, 3.0, 2.0])), column(9.0, 9.0), np.array([5.0])
+    )
     assert costs.ravel().tolist() == [0.0, 8.0, 8.0]
     assert values.tolist() == [5.0 + 16.0]
-    _, unlimited = form.judge(rollout_of(np.zeros(1)), column(9.0, 9.0), np.array([math.inf]))
+    _, unlimited = form.constraint_costs(rollout_of(np.zeros(1)), column(9.0, 9.0), np.array([math.inf]))
     assert unlimited.tolist() == [9.0]
 
 
@@ -151,7 +153,7 @@ def test_the_bound_is_within_the_limit_exactly_where_the_cvar_is(limit: float) -
     generator = np.random.default_rng(0)
     for _ in range(50):
         costs = generator.gamma(1.0, 2.0, size=(20, 1))
-        _, values = TailCost(0.7, 1).judge(rollout_of(np.zeros(1)), costs, np.array([limit]))
+        _, values = TailCost(0.7, 1).constraint_costs(rollout_of(np.zeros(1)), costs, np.array([limit]))
         exact = conditional_value_at_risk(costs, 0.7)
         assert values[0] >= exact[0]
         if exact[0] <= limit:

@@ -11,16 +11,16 @@ import pytest
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.teachers.dynamic import (
     DynamicConfig,
+    decide,
     has_converged,
     is_precise,
-    judge,
     keeps_limit,
     next_limit,
     steps_left,
 )
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
-from recrl.teachers.windows import Stretch
+from recrl.teachers.windows import WindowStatistics
 
 SPLIT_AT_100 = (slice(0, 100), slice(100, None))
 
@@ -28,15 +28,20 @@ SPLIT_AT_100 = (slice(0, 100), slice(100, None))
 Student = Callable[[CurriculumStep, int], tuple[float, tuple[float, ...]]]
 
 
-def window(mean_return: float, *costs: float, episodes: int = 4, scatter: float = 0.0) -> Stretch:
-    return Stretch(100, episodes, mean_return, costs, (scatter,) * len(costs))
+def window(mean_return: float, *costs: float, episodes: int = 4, scatter: float = 0.0) -> WindowStatistics:
+    return WindowStatistics(100, episodes, mean_return, costs, (scatter,) * len(costs))
 
 
-def judged(
-    old: Stretch, new: Stretch, *, limits: tuple[float, ...], deploy: tuple[float, ...], **options: Any
+def decided(
+    old: WindowStatistics,
+    new: WindowStatistics,
+    *,
+    limits: tuple[float, ...],
+    deploy: tuple[float, ...],
+    **options: Any,
 ) -> tuple[tuple[float, ...], float]:
     """Limits and noise after a judgement with five steps left."""
-    step = judge(
+    step = decide(
         old,
         new,
         limits=CostLimits(limits),
@@ -142,7 +147,7 @@ def test_a_mean_cost_may_exceed_its_limit_by_the_tolerance() -> None:
 def test_the_tolerance_by_its_names(tolerance: str, cost: float, kept: bool) -> None:
     crossing = window(9.5, cost, scatter=0.12)  # standard error sqrt(0.12 / 3 / 4) = 0.1
     noise = 0.0 if kept else 0.3
-    assert judged(crossing, crossing, limits=(5.0,), deploy=(5.0,), adherence_tolerance=tolerance) == (
+    assert decided(crossing, crossing, limits=(5.0,), deploy=(5.0,), adherence_tolerance=tolerance) == (
         (5.0,),
         noise,
     )
@@ -150,13 +155,13 @@ def test_the_tolerance_by_its_names(tolerance: str, cost: float, kept: bool) -> 
 
 def test_the_relative_tolerance_is_a_standard_error_where_episodes_are_few() -> None:
     few = window(9.5, 6.0, scatter=12.0)  # standard error 1
-    assert judged(few, few, limits=(5.0,), deploy=(5.0,)) == ((5.0,), 0.0)
+    assert decided(few, few, limits=(5.0,), deploy=(5.0,)) == ((5.0,), 0.0)
 
 
 def test_the_relative_tolerance_of_a_small_limit_is_that_of_the_floor() -> None:
     careful, careless = window(9.5, 0.1), window(9.5, 0.11)
-    assert judged(careful, careful, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.0)
-    assert judged(careless, careless, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.3)
+    assert decided(careful, careful, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.0)
+    assert decided(careless, careless, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.3)
 
 
 # Line 7: the step.
@@ -186,7 +191,9 @@ def test_a_dimension_that_is_never_constrained_stays_so() -> None:
 
 
 def test_steps_left_are_estimated_from_the_last_window() -> None:
-    last = Stretch(env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    last = WindowStatistics(
+        env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,)
+    )
     assert steps_left(last, env_steps=4000, train_steps=5000, unit="windows") == 1  # 3 windows fit
     assert steps_left(last, env_steps=4000, train_steps=5000, unit="episodes") == 19
 
@@ -195,36 +202,36 @@ def test_steps_left_are_estimated_from_the_last_window() -> None:
 
 
 def test_a_converged_student_that_keeps_its_limit_gets_a_lower_one() -> None:
-    assert judged(window(9.0, 60.0), window(9.5, 55.0), limits=(60.0,), deploy=(5.0,)) == ((45.0,), 0.0)
+    assert decided(window(9.0, 60.0), window(9.5, 55.0), limits=(60.0,), deploy=(5.0,)) == ((45.0,), 0.0)
 
 
 @pytest.mark.parametrize("new", [window(5.0, 55.0), window(9.5, 40.0)], ids=["return", "cost"])
-def test_a_student_that_still_changes_is_left_alone(new: Stretch) -> None:
-    assert judged(window(9.0, 60.0), new, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
+def test_a_student_that_still_changes_is_left_alone(new: WindowStatistics) -> None:
+    assert decided(window(9.0, 60.0), new, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
 
 
 def test_a_converged_student_above_its_limit_gets_noise() -> None:
     stuck = window(9.5, 5.0)
-    assert judged(stuck, stuck, limits=(1.0,), deploy=(1.0,), policy_noise=0.2) == ((1.0,), 0.2)
+    assert decided(stuck, stuck, limits=(1.0,), deploy=(1.0,), policy_noise=0.2) == ((1.0,), 0.2)
 
 
 def test_a_window_without_episodes_is_no_evidence() -> None:
     nothing = window(0.0, 0.0, episodes=0)
-    assert judged(nothing, nothing, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
+    assert decided(nothing, nothing, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
 
 
 def test_a_dimension_never_blocks_another() -> None:
     kept, stuck, moving = window(9.5, 55.0, 9.0), window(9.5, 55.0, 9.0), window(9.5, 55.0, 20.0)
-    assert judged(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0)) == ((45.0, 5.0), 0.3)
-    assert judged(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0)) == ((45.0, 30.0), 0.0)
+    assert decided(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0)) == ((45.0, 5.0), 0.3)
+    assert decided(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0)) == ((45.0, 30.0), 0.0)
 
 
 def test_jointly_all_dimensions_wait_for_the_last() -> None:
     kept, stuck, moving = window(9.5, 55.0, 9.0), window(9.5, 55.0, 9.0), window(9.5, 55.0, 20.0)
     joint = {"dimensions": "joint"}
-    assert judged(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0), **joint) == ((60.0, 5.0), 0.3)
-    assert judged(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((60.0, 30.0), 0.0)
-    assert judged(kept, kept, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((45.0, 8.2), 0.0)
+    assert decided(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0), **joint) == ((60.0, 5.0), 0.3)
+    assert decided(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((60.0, 30.0), 0.0)
+    assert decided(kept, kept, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((45.0, 8.2), 0.0)
 
 
 # The clock.
@@ -499,7 +506,7 @@ def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
     """Eight episodes of a policy whose cost scatters as much as its mean look converged by chance."""
     generator = np.random.default_rng(0)
 
-    def noisy(number: int) -> Stretch:
+    def noisy(number: int) -> WindowStatistics:
         costs = generator.exponential(50.0, number)
         episodes = [
             EpisodeStats(
@@ -507,13 +514,13 @@ def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
             )
             for b, cost in enumerate(costs)
         ]
-        return Stretch.of_update(episodes, env_steps=8000, num_costs=1)
+        return WindowStatistics.of_update(episodes, env_steps=8000, num_costs=1)
 
     config = DynamicConfig()
     assert not any(is_precise(noisy(8), config) for _ in range(100))
     assert all(is_precise(noisy(100), config) for _ in range(20))
     assert is_precise(window(9.5, 5.0, episodes=1), config)  # deterministic: one episode says it all
-    assert not is_precise(Stretch(100, 0, 0.0, (0.0,), (0.0,)), config)
+    assert not is_precise(WindowStatistics(100, 0, 0.0, (0.0,), (0.0,)), config)
 
 
 def test_a_noisy_agent_is_held_where_it_is_until_a_hundred_episodes_say_that_it_has_converged() -> None:

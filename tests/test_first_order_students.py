@@ -13,9 +13,15 @@ from recrl.agents.batch import LearningBatch
 from recrl.agents.distributions import Categorical
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.focops import FirstOrderConstrainedOptimisation, projection_objective
-from recrl.agents.ipo import InteriorPointPolicyOptimisation, barrier, barrier_gain, relief_of, slopes
+from recrl.agents.ipo import (
+    InteriorPointPolicyOptimisation,
+    barrier,
+    barrier_surrogate_objective,
+    relief_of,
+    slopes,
+)
 from recrl.agents.networks import NetworkForm, orthogonal
-from recrl.agents.p3o import PenalisedProximalPolicyOptimisation, penalised_gain
+from recrl.agents.p3o import PenalisedProximalPolicyOptimisation, penalised_surrogate_objective
 from recrl.agents.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
 
@@ -39,14 +45,14 @@ def test_p3os_gain_is_the_one_computed_by_hand() -> None:
     ratios = torch.tensor([1.0, 1.0, 1.5, 1.0, 1.0, 1.0])
     # Reward: only sample 2 has moved, its ratio counts as 1.2: (0.2 * 2) / 6 spreads.
     # Cost: its centred advantage is 0, so the surrogate stays 0 and the violation 0.3 stands.
-    gain = penalised_gain(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
+    gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
     value, price = gain(ratios)
     assert float(value) == pytest.approx((0.4 / 6.0 - KAPPA * 0.3) / SPREAD, rel=1e-5)
     assert price == KAPPA
 
 
 def test_p3o_is_pessimistic_about_cost() -> None:
-    gain = penalised_gain(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
+    gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
     # Sample 1 has the reward advantage -1 and the cost advantage -1: the ratio 1.6 saves no more cost than
     # 1.2 would, and loses all the reward.
     value, _ = gain(torch.tensor([1.0, 1.6, 1.0, 1.0, 1.0, 1.0]))
@@ -54,7 +60,7 @@ def test_p3o_is_pessimistic_about_cost() -> None:
 
 
 def test_a_constraint_that_holds_costs_p3o_nothing() -> None:
-    gain = penalised_gain(BATCH, REWARDS, COSTS, violation(-1.0), clip=CLIP, factor=KAPPA)
+    gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(-1.0), clip=CLIP, factor=KAPPA)
     value, price = gain(torch.ones(6))
     assert float(value) == pytest.approx(0.0, abs=1e-6)
     assert price == 0.0
@@ -81,7 +87,7 @@ def test_the_barriers_slopes_are_its_finite_differences() -> None:
 
 def test_ipos_gain_is_the_one_computed_by_hand() -> None:
     config = IPOConfig(barrier_sharpness=10.0, barrier_slope=20.0, clip=CLIP)
-    value, price = barrier_gain(BATCH, REWARDS, COSTS, violation(-0.5), config)(torch.ones(6))
+    value, price = barrier_surrogate_objective(BATCH, REWARDS, COSTS, violation(-0.5), config)(torch.ones(6))
     slack = 0.5 / SPREAD
     assert float(value) == pytest.approx(math.log(slack) / 10.0, rel=1e-5)
     assert price == pytest.approx(1.0 / (10.0 * slack), rel=1e-5)

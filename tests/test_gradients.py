@@ -15,11 +15,11 @@ from recrl.agents.batch import LearningBatch
 from recrl.agents.distributions import Distribution
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.focops import projection_objective
-from recrl.agents.ipo import barrier_gain
+from recrl.agents.ipo import barrier_surrogate_objective
 from recrl.agents.networks import Critics, FlatParameters, NetworkForm, orthogonal
-from recrl.agents.p3o import penalised_gain
+from recrl.agents.p3o import penalised_surrogate_objective
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.ppo_lag import combined_gain, separate_gain
+from recrl.agents.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
 from recrl.agents.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import Floats
 
@@ -73,13 +73,15 @@ def lagrangian(
 
 
 def p3o(experience: Experience) -> Objective:
-    gain = penalised_gain(experience.batch, *experience.in_reward_spreads(), clip=CLIP, factor=5.0)
+    gain = penalised_surrogate_objective(
+        experience.batch, *experience.in_reward_spreads(), clip=CLIP, factor=5.0
+    )
     return of_ratios(lambda ratios: gain(ratios)[0])
 
 
 def ipo(experience: Experience) -> Objective:
     config = IPOConfig(barrier_sharpness=10.0, clip=CLIP)
-    gain = barrier_gain(experience.batch, *experience.in_reward_spreads(), config)
+    gain = barrier_surrogate_objective(experience.batch, *experience.in_reward_spreads(), config)
     return of_ratios(lambda ratios: gain(ratios)[0])
 
 
@@ -90,8 +92,8 @@ def focops(experience: Experience) -> Objective:
 OBJECTIVES: dict[str, Callable[[Experience], Objective]] = {
     "ppo": clipped,
     "trust region": plain,
-    "ppo-lag combined": partial(lagrangian, gain=combined_gain),
-    "ppo-lag separate": partial(lagrangian, gain=separate_gain),
+    "ppo-lag combined": partial(lagrangian, gain=combined_surrogate_objective),
+    "ppo-lag separate": partial(lagrangian, gain=separate_surrogate_objective),
     "p3o": p3o,
     "ipo": ipo,
     "focops": focops,

@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from recrl.agents.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.advantages import penalised_advantages
 from recrl.agents.algorithm_configs import CPOConfig, PPOConfig, TRPOConfig
-from recrl.agents.ascent import Objective, climb, with_entropy, with_prices
+from recrl.agents.ascent import Objective, gradient_ascent, with_entropy, with_prices
 from recrl.agents.batch import LearningBatch
 from recrl.agents.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.distributions import Categorical
@@ -127,7 +127,7 @@ def climbed(**options: object) -> tuple[float, bool, set[int]]:
         sizes.add(len(part.batch.rows))
         return lambda _, ratios: ratios @ weights
 
-    metrics = climb(
+    metrics = gradient_ascent(
         policy,
         Adam(policy.parameters, 0.01),
         Experience.of(policy, batch, advantages, UNKNOWN),

@@ -14,7 +14,7 @@ from recrl.agents.batch import LearningBatch
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks import NetworkForm, orthogonal
 from recrl.agents.policies import StochasticPolicy
-from recrl.agents.ppo_lag import GAINS, PPOLagrangian
+from recrl.agents.ppo_lag import SURROGATE_OBJECTIVES, PPOLagrangian
 
 STATES = np.array([0, 0, 1, 1, 1, 2])
 ACTIONS = np.array([0, 1, 0, 1, 1, 0])
@@ -107,7 +107,7 @@ def test_both_penalties_are_one_objective_before_anything_is_clipped() -> None:
     rewards, costs = scaled_advantages(ADVANTAGES)
     ratios = 1.0 + 0.1 * torch.arange(len(batch.actions)) / 10.0
     combined, separate = (
-        float(GAINS[penalty](batch, rewards, costs, np.array([2.0]), 0.2)(ratios))
+        float(SURROGATE_OBJECTIVES[penalty](batch, rewards, costs, np.array([2.0]), 0.2)(ratios))
         for penalty in ("combined", "separate")
     )
     assert combined == pytest.approx(separate, abs=1e-6)
@@ -120,7 +120,8 @@ def test_a_separate_penalty_is_not_clipped_by_hand() -> None:
     ratios = torch.ones(len(batch.actions))
     ratios[0] = 1.5
     found = {
-        name: float(gain(batch, rewards, costs, np.ones(1), 0.2)(ratios)) for name, gain in GAINS.items()
+        name: float(gain(batch, rewards, costs, np.ones(1), 0.2)(ratios))
+        for name, gain in SURROGATE_OBJECTIVES.items()
     }
     assert found["separate"] == pytest.approx((1.2 - 1.5) / 2.0)
     assert found["combined"] == pytest.approx(0.0)
