@@ -1,13 +1,13 @@
-"""What all students here have in common: a policy, 1 + k critics, and the walk of an update.
+"""What all agents here have in common: a policy, 1 + k critics, and the walk of an update.
 
-A student is an ``ActorCritic`` with a *rule* that improves the policy; PPO-Lagrangian and CPO are rules. An
+An agent is an ``ActorCritic`` with a *rule* that improves the policy; PPO-Lagrangian and CPO are rules. An
 update collapses the rollout, estimates advantages, lets the rule improve the policy, and fits the critics.
 
-A student lives on the device that was PyTorch's default one when it was made (``with torch.device("cuda")``):
+An agent lives on the device that was PyTorch's default one when it was made (``with torch.device("cuda")``):
 there it learns, with equal initial parameters on all. Rollouts come, and actions go, as NumPy arrays.
 
-Letters: T steps, B environments, N = T B samples, k costs, C = 1 + k signals, U distinct rows, M truncated
-steps, E finished episodes.
+Notation: T steps, B environments, N = T B samples, k costs, C = 1 + k signals, U unique observations, M
+truncated steps, E finished episodes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
 
 
 class Stateful(Protocol):
-    """Something that is saved and restored with a student."""
+    """Something that is saved and restored with an agent."""
 
     def state_dict(self) -> dict[str, Any]:
         """All it has learnt and adapted: a tree of dicts, lists, JSON scalars and NumPy arrays."""
@@ -54,7 +54,7 @@ class Stateful(Protocol):
 
 
 class PolicyRule(Protocol):
-    """How a student's policy gets better: what tells the algorithms apart."""
+    """How an agent's policy gets better: what tells the algorithms apart."""
 
     @property
     def parts(self) -> Mapping[str, Stateful]:
@@ -69,7 +69,7 @@ class PolicyRule(Protocol):
         Args:
             policy: the one that collected the samples; changed in place.
             experience: the samples, raw advantages, and how the constraints stand.
-            generator: the student's own randomness.
+            generator: the agent's own randomness.
 
         Returns:
             Metrics, the same keys every time: ``policy_steps``, ``multiplier_i``, and the rule's own.
@@ -95,24 +95,24 @@ def improve_and_measure(
     """
     metrics = rule.improve(policy, experience, generator)
     batch, advantages = experience.batch, experience.advantages
-    new = policy.distribution(batch.rows)
-    centred = batch.per_decision(advantages - advantages.mean(axis=0))
+    new = policy.distribution(batch.unique_observations)
+    centred = batch.per_pair(advantages - advantages.mean(axis=0))
     gains = surrogate(experience.ratios(new), centred).numpy(force=True)
     return {
         **metrics,
-        "kl": float(mean_divergence(experience.old, new, batch.row_weights)),
-        "entropy": float(torch.dot(batch.row_weights, new.entropy())),
+        "kl": float(mean_divergence(experience.old, new, batch.observation_weights)),
+        "entropy": float(torch.dot(batch.observation_weights, new.entropy())),
         "surrogate_reward": float(gains[0]),
         **indexed("surrogate_cost", gains[1:]),
     }
 
 
 class ActorCritic:
-    """A student; see ``recrl.agents.agent.Agent`` for what its methods promise.
+    """An agent; see ``recrl.agents.agent.Agent`` for what its methods promise.
 
     Args:
         cmdp: what the task fixes.
-        config: the settings that students share.
+        config: the settings that agents share.
         encoder: of the observations that policy and critics see.
         policy: of the encoded observations and the task's actions.
         critics: of the reward and the k costs.
@@ -188,8 +188,11 @@ class ActorCritic:
         config, limits = self._config, step.limits.array
         observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
         actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
-        batch = LearningBatch.gather(
-            self._encoder(observations), actions, compact=config.compaction, most_rows=config.minibatch_size
+        batch = LearningBatch.deduplicate(
+            self._encoder(observations),
+            actions,
+            compact=config.compaction,
+            most_observations=config.minibatch_size,
         )
         recent_costs, lengths = self._recent.add(episode_costs, rollout.finished_lengths())
         costs, constrained = self._form.constraint_costs(rollout, recent_costs, limits)
@@ -226,7 +229,7 @@ class ActorCritic:
                 trace_decays=np.ones(signals.shape[2]),
             )
             self._value_scale.add((first_returns**2).mean(axis=(0, 1)))
-        values = batch.per_sample(self._values(batch.rows)).reshape(signals.shape)
+        values = batch.per_sample(self._values(batch.unique_observations)).reshape(signals.shape)
         beyond = np.concatenate([rollout.final_observations, rollout.last_observations])
         beyond_values = self._values(torch.as_tensor(self._encoder(beyond)))
         num_final = len(rollout.final_observations)
@@ -292,7 +295,10 @@ class ActorCritic:
         losses = []
         for part in islice(batch.parts(config.minibatch_size, self._generator), steps):
             means, spread = regression_on(part)
-            losses.append(self._critics.differentiate(part.rows, part.row_weights, means) + spread)
+            losses.append(
+                self._critics.differentiate(part.unique_observations, part.observation_weights, means)
+                + spread
+            )
             self._critic_optimiser.step()
         mean = torch.stack(losses[-num_parts:]).mean(dim=0).numpy(force=True) * scale**2
         require_finite("value losses", mean)
@@ -374,25 +380,25 @@ def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
     Returns:
         The mean targets, [C, U], and the spread, [C].
     """
-    sums = batch.per_row(targets)
-    shares = batch.row_weights.numpy(force=True).astype(np.float64)[:, None]
+    sums = batch.per_observation(targets)
+    shares = batch.observation_weights.numpy(force=True).astype(np.float64)[:, None]
     spread = np.mean(batch.own(targets) ** 2, axis=0) - np.sum(sums**2 / shares, axis=0)
     return to_tensor((sums / shares).T.copy()), to_tensor(np.maximum(spread, 0.0))
 
 
-def fresh_student(
+def fresh_agent(
     cmdp: CMDPSpec,
     config: ActorCriticConfig,
     seed: np.random.SeedSequence,
     make_rule: Callable[[StochasticPolicy], PolicyRule],
 ) -> ActorCritic:
-    """A student before its first update; the same seed gives all with the same networks the same policy.
+    """An agent before its first update; the same seed gives all with the same networks the same policy.
 
     Args:
         cmdp: what the task fixes.
-        config: the student's settings.
+        config: the agent's settings.
         seed: of the initial parameters and of the order of minibatches.
-        make_rule: the student's rule for a policy.
+        make_rule: the agent's rule for a policy.
     """
     generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
     encoder = Encoder(

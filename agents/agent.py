@@ -1,10 +1,10 @@
-"""The seam between a trial and its student, and what crosses it.
+"""The seam between a trial and its agent, and what crosses it.
 
 An agent is any CRL algorithm. **What a curriculum asks for is an argument of ``update``, never agent state**:
 the cost limits are a vector [k], may be infinite, and change between updates. NumPy crosses the seam, tensors
 do not.
 
-Letters: T steps, B environments, k costs, E episodes finished in the rollout, M of its steps truncated.
+Notation: T steps, B environments, k costs, E episodes finished in the rollout, M of its steps truncated.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ steps, or as many as ``policy_passes`` passes over the samples need, whichever i
 mean KL from the old policy is measured on the rows of the next, which need to be evaluated anyway: of a
 thousand rows it is known to a few per cent.
 
-Letters: N samples, D decisions, k costs.
+Notation: N samples, D unique pairs, k costs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from recrl.agents.networks import Adam
 from recrl.agents.policies import StochasticPolicy
 
 # What is climbed: a differentiable scalar of the policy's distributions at the rows of some samples, and of
-# the probability ratios pi(a | s) / pi_old(a | s) of their decisions, [D].
+# the probability ratios pi(a | s) / pi_old(a | s) of their pairs, [D].
 Objective = Callable[[Distribution, Tensor], Tensor]
 
 
@@ -58,7 +58,7 @@ def with_entropy(
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
         if bonus == 0.0:
             return surrogate_objective(ratios)
-        return surrogate_objective(ratios) + bonus * torch.dot(batch.row_weights, now.entropy())
+        return surrogate_objective(ratios) + bonus * torch.dot(batch.observation_weights, now.entropy())
 
     return objective
 
@@ -109,9 +109,9 @@ def gradient_ascent(
     objective_on = lru_cache(maxsize=1)(objective_of)  # the whole batch comes again and again
     taken, divergence = 0, 0.0
     for taken, part in enumerate(islice(experience.parts(size, generator), steps + 1)):
-        now = policy.evaluate(part.batch.rows)
+        now = policy.evaluate(part.batch.unique_observations)
         with torch.no_grad():
-            divergence = float(mean_divergence(part.old, now.distribution, part.batch.row_weights))
+            divergence = float(mean_divergence(part.old, now.distribution, part.batch.observation_weights))
         if taken == steps or divergence > largest_kl:
             break
         surrogate_objective = objective_on(part)(now.distribution, part.ratios(now.distribution))

@@ -48,7 +48,7 @@ STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
 
 
 class ActorCriticConfig(BaseModel):
-    """Settings that all students with a policy and 1 + k critics share."""
+    """Settings that all agents with a policy and 1 + k critics share."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     paper: ClassVar[Mapping[str, Any]] = STARTER_AGENTS_SETTING
@@ -148,7 +148,7 @@ class ActorCriticConfig(BaseModel):
 
 
 class AscentConfig(ActorCriticConfig):
-    """Settings of students that climb an objective by Adam until the policy has moved far enough."""
+    """Settings of agents that climb an objective by Adam until the policy has moved far enough."""
 
     paper: ClassVar[Mapping[str, Any]] = {**STARTER_AGENTS_SETTING, **STARTER_AGENTS_ASCENT}
 
@@ -213,7 +213,7 @@ class LagrangianConfig(BaseModel):
 
 
 class TrustRegionConfig(ActorCriticConfig):
-    """Settings of students that take one trust-region step an update."""
+    """Settings of agents that take one trust-region step an update."""
 
     paper: ClassVar[Mapping[str, Any]] = {**STARTER_AGENTS_SETTING, **STARTER_AGENTS_TRUST_REGION}
 

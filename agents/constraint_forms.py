@@ -10,12 +10,12 @@ minimises, a small change of the policy changes the CVaR as if nu were fixed (Ta
 
     c'_t = (max(S_{t+1} - nu, 0) - max(S_t - nu, 0)) / (1 - alpha),  S_t the episode's cost before step t,
 
-which sum to max(C - nu, 0) / (1 - alpha) over an episode: only cost beyond the quantile counts. So a student
+which sum to max(C - nu, 0) / (1 - alpha) over an episode: only cost beyond the quantile counts. So an agent
 of mean costs that is given c'_t for the costs, and nu + the mean of their sums for the mean episode cost,
 keeps the CVaR within the limit, whatever its algorithm.
 
 Where all episodes are about equally bad, no episode has cost beyond its quantile: the CVaR is flat there, and
-a student that violates its limit d could not leave (Greenberg et al. 2022). But the CVaR is at most d if and
+an agent that violates its limit d could not leave (Greenberg et al. 2022). But the CVaR is at most d if and
 only if nu + E[max(C - nu, 0)] / (1 - alpha) is, for some nu <= d. Hence nu is the value at risk or d,
 whichever is less; where the limit is kept, that is the value at risk.
 
@@ -24,7 +24,7 @@ is the best of those, and the critics are baselines that know the average S_t. W
 costs is therefore seen by the trace, not by the bootstrap: with ``cvar``, a ``cost_trace_decay`` near 1 is
 right. And only a share 1 - alpha of the episodes of an update counts: it needs many.
 
-Letters: T steps, B environments, k costs, E finished episodes, alpha the level, nu the value at risk.
+Notation: T steps, B environments, k costs, E finished episodes, alpha the level, nu the value at risk.
 """
 
 from __future__ import annotations

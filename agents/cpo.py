@@ -7,7 +7,7 @@ scaled, and the constraints enter in cost per step, so that b and c have one uni
 If no episode finished, nothing is known about the constraints and the policy stays. A cost whose limit is
 infinite is no constraint.
 
-Letters: N samples, k costs, P parameters, delta the trust region's size, H its metric.
+Notation: N samples, k costs, P parameters, delta the trust region's size, H its metric.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.advantages import reward_spread
 from recrl.agents.algorithm_configs import CPOConfig
 from recrl.agents.batch import to_tensor
@@ -47,11 +47,11 @@ class LocalModel:
 
     def __init__(self, policy: StochasticPolicy, experience: Experience, advantages: Floats) -> None:
         self._policy, self._experience = policy, experience
-        self._advantages = experience.batch.per_decision(advantages)
+        self._advantages = experience.batch.per_pair(advantages)
 
     def gradients(self) -> Tensor:
         """The gradients of all surrogates at the policy as it is now, [1 + k, P]."""
-        now = self._policy.evaluate(self._experience.batch.rows)
+        now = self._policy.evaluate(self._experience.batch.unique_observations)
         surrogates = self._surrogates(now.distribution)
         return torch.stack([now.gradient(each, retain_graph=True).clone() for each in surrogates.unbind()])
 
@@ -75,8 +75,8 @@ class LocalModel:
     def measure(self) -> tuple[npt.NDArray[np.floating], float]:
         """Surrogates [1 + k] and mean KL of the policy as it is now, in nats."""
         batch = self._experience.batch
-        distribution = self._policy.distribution(batch.rows)
-        divergence = mean_divergence(self._experience.old, distribution, batch.row_weights)
+        distribution = self._policy.distribution(batch.unique_observations)
+        divergence = mean_divergence(self._experience.old, distribution, batch.observation_weights)
         return self._surrogates(distribution).numpy(force=True), float(divergence)
 
 
@@ -190,5 +190,5 @@ class ConstrainedPolicyOptimisation:
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh CPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: ConstrainedPolicyOptimisation(config))
+    """A fresh CPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: ConstrainedPolicyOptimisation(config))

@@ -32,7 +32,7 @@ most, in turns, a policy goes to and fro between two costs that must fall togeth
 limits. Only where the constraints contradict one another is the most violated one lowered alone; "most" is
 measured by the length c_i / sqrt(S_ii) of the step that would mend it, whatever the costs' units.
 
-Letters: k constraints.
+Notation: k constraints.
 """
 
 from __future__ import annotations

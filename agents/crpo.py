@@ -21,7 +21,7 @@ steps down a violated constraint, and a reward step ends at the limit. Before, s
 limit on one side as on the other. A cost is at hand if the trust region reaches its limit. lambda is the
 ``kl_price``, in the same unit and for the same reason as that of ``trpo-lag``; 0 is the source's.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, k
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, k
 costs, of which j have a finite limit.
 """
 
@@ -31,7 +31,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.advantages import SMALLEST_STD, reward_spread
 from recrl.agents.algorithm_configs import CRPOConfig
 from recrl.agents.cpo import LocalModel, linearise, to_parameter_step
@@ -142,5 +142,5 @@ def improvement(model: LocalModel, mended: int | None, target_kl: float) -> Call
 
 
 def make_crpo(cmdp: CMDPSpec, config: CRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh CRPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: ConstraintRectifiedPolicyOptimisation(config))
+    """A fresh CRPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: ConstraintRectifiedPolicyOptimisation(config))

@@ -1,6 +1,6 @@
-"""What a student knows after a rollout: its samples, what they were worth, and how the constraints stand.
+"""What an agent knows after a rollout: its samples, what they were worth, and how the constraints stand.
 
-Letters: N samples, k costs, D decisions, E finished episodes, j of the k limits are finite.
+Notation: N samples, k costs, D unique pairs, E finished episodes, j of the k limits are finite.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ class Experience:
 
     Attributes:
         batch: the samples, or a minibatch of them.
-        old: pi_old(. | s), of the policy that collected them, at the batch's rows.
-        old_log_probs: log pi_old(a | s) of the batch's decisions, [D].
+        old: pi_old(. | s), of the policy that collected them, at the batch's unique observations.
+        old_log_probs: log pi_old(a | s) of the batch's pairs, [D].
         advantages: raw estimates for the reward, then each cost, of all samples of the rollout, [N, 1 + k].
         constraints: limits and gaps.
     """
@@ -110,8 +110,8 @@ class Experience:
         constraints: Constraints,
     ) -> Experience:
         """The experience of a policy that has not moved since it collected the samples."""
-        old = policy.distribution(batch.rows)
-        log_probs = old.log_prob(batch.actions, batch.decision_rows)
+        old = policy.distribution(batch.unique_observations)
+        log_probs = old.log_prob(batch.actions, batch.pair_observations)
         return cls(batch, old, log_probs, advantages, constraints)
 
     def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
@@ -125,8 +125,8 @@ class Experience:
             yield replace(self, batch=part, old=self.old.at(index), old_log_probs=log_probs)
 
     def ratios(self, now: Distribution) -> Tensor:
-        """The probability ratios pi(a | s) / pi_old(a | s) of the decisions, [D]; exactly 1 for pi_old."""
-        log_probs = now.log_prob(self.batch.actions, self.batch.decision_rows)
+        """The probability ratios pi(a | s) / pi_old(a | s) of the pairs, [D]; exactly 1 for pi_old."""
+        log_probs = now.log_prob(self.batch.actions, self.batch.pair_observations)
         return torch.exp(log_probs - self.old_log_probs)
 
     def with_entropy(self, coefficient: float) -> Experience:
@@ -134,7 +134,7 @@ class Experience:
 
         At the policy that collected the samples, the gradient of the entropy is that of a surrogate whose
         advantages are -log pi(a | s) - H(pi(. | s)): what was less likely than it might be is worth more.
-        They are added to the reward's, so that every student climbs both, whatever it makes of advantages.
+        They are added to the reward's, so that every agent climbs both, whatever it makes of advantages.
 
         Args:
             coefficient: reward per nat, at least 0.
@@ -142,8 +142,8 @@ class Experience:
         log_probs = self.old_log_probs.numpy(force=True).astype(np.float64)
         entropies = self.old.entropy().numpy(force=True).astype(np.float64)
         batch, advantages = self.batch, self.advantages.copy()
-        if batch.decision_of_sample is not None:
-            log_probs = log_probs[batch.decision_of_sample]
+        if batch.pair_of_sample is not None:
+            log_probs = log_probs[batch.pair_of_sample]
         advantages[:, 0] -= coefficient * (log_probs + batch.per_sample(entropies))
         return replace(self, advantages=advantages)
 

@@ -14,7 +14,7 @@ multiplier does not make the policy jump; lam keeps its meaning where no constra
 The source stops when the mean KL is past delta; but the step that went past stands, and one Adam step may
 double the KL. So, ours, it is taken back as far as it went past: ``trust_region: kept``.
 
-Letters: N samples, U rows, D decisions, k costs, P parameters.
+Notation: N samples, U rows, D unique pairs, k costs, P parameters.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.algorithm_configs import FOCOPSConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent
 from recrl.agents.distributions import Distribution, mean_divergence
@@ -47,14 +47,16 @@ def projection_objective(
         radius: delta, nats; rows that have moved further pull no more.
     """
     batch, old = experience.batch, experience.old
-    pull = batch.per_decision(advantages / focops_lambda)
+    pull = batch.per_pair(advantages / focops_lambda)
 
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
         assert type(now) is type(old)
         divergence = now.divergence(old)  # type: ignore[arg-type]
         near = (divergence.detach() <= radius).to(divergence.dtype)
-        near_decisions = near if batch.decision_rows is None else near[batch.decision_rows]
-        return torch.dot(ratios * near_decisions, pull) - torch.dot(batch.row_weights * near, divergence)
+        near_decisions = near if batch.pair_observations is None else near[batch.pair_observations]
+        return torch.dot(ratios * near_decisions, pull) - torch.dot(
+            batch.observation_weights * near, divergence
+        )
 
     return objective
 
@@ -71,7 +73,11 @@ def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, r
         radius: delta, nats.
     """
     batch = experience.batch
-    divergence = float(mean_divergence(experience.old, policy.distribution(batch.rows), batch.row_weights))
+    divergence = float(
+        mean_divergence(
+            experience.old, policy.distribution(batch.unique_observations), batch.observation_weights
+        )
+    )
     if divergence > radius:
         policy.parameters.values.lerp_(start, 1.0 - (radius / divergence) ** 0.5)
 
@@ -106,7 +112,7 @@ class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
 
 
 def make_focops(cmdp: CMDPSpec, config: FOCOPSConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh FOCOPS student."""
-    return fresh_student(
+    """A fresh FOCOPS agent."""
+    return fresh_agent(
         cmdp, config, seed, lambda policy: FirstOrderConstrainedOptimisation(config, policy, cmdp.num_costs)
     )

@@ -17,8 +17,8 @@ where there is no slack: there phi goes on along its tangent (Kervadec et al. 20
 so that a violated constraint is an exact penalty with the factor kappa. All advantages and c are in standard
 deviations of the reward's advantages, so that kappa is in reward per unit of cost, as multipliers are.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, D
-decisions, k costs.
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
+pairs, k costs.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.algorithm_configs import IPOConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
@@ -60,8 +60,8 @@ def relief_of(batch: LearningBatch, costs: Floats, config: IPOConfig) -> Callabl
     if config.cost_surrogate == "pessimistic":
         split = [SignedAdvantages.split(batch, -column) for column in costs.T]
         return partial(pessimistic_relief, relief=split, clip=config.clip)
-    per_decision = batch.per_decision(-costs)
-    return lambda ratios: surrogate(ratios - 1.0, per_decision)
+    per_pair = batch.per_pair(-costs)
+    return lambda ratios: surrogate(ratios - 1.0, per_pair)
 
 
 def barrier_surrogate_objective(
@@ -116,5 +116,5 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
 
 
 def make_ipo(cmdp: CMDPSpec, config: IPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh IPO student."""
-    return fresh_student(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))
+    """A fresh IPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))

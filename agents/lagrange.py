@@ -6,11 +6,11 @@ the constraint is violated) and returns the next state. A dimension whose limit 
 constraint: its multiplier is 0 and the rest of its state stands still.
 
 A state is a dict of float64 arrays [k], so that a checkpoint can hold it as it is; ``multipliers`` is in
-each. Letters: k costs.
+each. Notation: k costs.
 
 Which to use: ``projected_ascent`` alone is an integrator, and so it swings about the limit; the proportional
 term of ``pid`` damps it. Neither winds down below 0 nor remembers old violations, so both answer at once when
-the limit moves. ``softplus_adam`` winds down and remembers; it is kept because the paper's students use it.
+the limit moves. ``softplus_adam`` winds down and remembers; it is kept because the paper's agents use it.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def relative_gaps(gaps: Floats, limits: Floats, standard_errors: Floats) -> Floa
     return np.where(active, quotient(np.where(active, gaps, 0.0), floors), -np.inf)
 
 
-# How each rule begins, by the name that a student's options use.
+# How each rule begins, by the name that an agent's options use.
 STARTS: dict[str, Callable[[int, float], dict[str, Floats]]] = {
     "projected": start_projected_ascent,
     "softplus-adam": start_softplus_adam,

@@ -9,8 +9,8 @@ mean of max(ratio A_i, clip(ratio) A_i). The penalty is exact: if kappa exceeds 
 constrained problem, both have the same optimum, and nothing has to adapt. All advantages and c are divided by
 the standard deviation of the reward's, so that kappa is in reward per unit of cost, as multipliers are.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, D
-decisions, k costs.
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
+pairs, k costs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.algorithm_configs import P3OConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.batch import LearningBatch, to_tensor
@@ -91,7 +91,5 @@ class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
 
 
 def make_p3o(cmdp: CMDPSpec, config: P3OConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh P3O student."""
-    return fresh_student(
-        cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy)
-    )
+    """A fresh P3O agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy))

@@ -13,7 +13,7 @@ for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far f
 too: the paper bounds the damage, here the step is scaled back into the trust region. Then it is shortened by
 ``cpo``'s line search, which the paper leaves out.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, k
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, k
 costs, P parameters.
 """
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_agent
 from recrl.agents.algorithm_configs import PCPOConfig
 from recrl.agents.cpo import constrained_step
 from recrl.agents.cpo_dual import (
@@ -76,5 +76,5 @@ class ProjectionBasedConstrainedPolicyOptimisation:
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PCPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))
+    """A fresh PCPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))

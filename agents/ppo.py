@@ -1,7 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017): the control that knows no constraint.
 
 Its objective is the clipped surrogate of the standardised reward advantages. Costs are learnt and reported,
-as with every student, and change nothing; so do limits, and whether an episode finished.
+as with every agent, and change nothing; so do limits, and whether an episode finished.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.advantages import scaled_advantages
 from recrl.agents.algorithm_configs import PPOConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
@@ -42,5 +42,5 @@ class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
 
 
 def make_ppo(cmdp: CMDPSpec, config: PPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PPO student."""
-    return fresh_student(cmdp, config, seed, lambda policy: ProximalPolicyOptimisation(config, policy))
+    """A fresh PPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: ProximalPolicyOptimisation(config, policy))

@@ -4,10 +4,10 @@ Multipliers first answer the gaps; then the policy climbs the penalised surrogat
 it has moved too far. If no episode finished, nothing is known about the constraints: the multipliers stay.
 
 The objective is (L_r - sum_i p_i L_i) / (1 + sum_i p_i), p the multipliers. ``separate`` clips the reward's
-surrogate only (the paper's students); ``combined`` clips the surrogate of the penalised advantage
+surrogate only (the paper's agents); ``combined`` clips the surrogate of the penalised advantage
 A_r - sum_i p_i A_i, so that the policy gains nothing from leaving the clip range for a cost's sake either.
 
-Letters: N samples, D decisions, k costs.
+Notation: N samples, D unique pairs, k costs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 from torch import Tensor
 
-from recrl.agents.actor_critic import ActorCritic, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.advantages import penalised_advantages
 from recrl.agents.algorithm_configs import PPOLagConfig
 from recrl.agents.ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
@@ -54,7 +54,7 @@ def separate_surrogate_objective(
     """
     weight = 1.0 / (1.0 + float(multipliers.sum()))
     signed = SignedAdvantages.split(batch, weight * rewards)
-    penalty = batch.per_decision(weight * (costs @ multipliers))
+    penalty = batch.per_pair(weight * (costs @ multipliers))
     return lambda ratios: clipped_surrogate(ratios, signed, clip) - surrogate(ratios, penalty)
 
 
@@ -91,5 +91,5 @@ class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
 
 
 def make_ppo_lag(cmdp: CMDPSpec, config: PPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PPO-Lagrangian student."""
-    return fresh_student(cmdp, config, seed, lambda policy: PPOLagrangian(config, policy, cmdp.num_costs))
+    """A fresh PPO-Lagrangian agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: PPOLagrangian(config, policy, cmdp.num_costs))

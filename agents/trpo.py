@@ -5,7 +5,7 @@ q = g.H^-1 g (appendix C), shortened until the surrogate does not fall and the t
 is the gradient of a surrogate and H the Hessian of the mean KL plus damping. With no finite limit, ``cpo``
 takes the same step.
 
-Letters: N samples, k costs, P parameters, delta the trust region's size.
+Notation: N samples, k costs, P parameters, delta the trust region's size.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.advantages import scaled_advantages
 from recrl.agents.algorithm_configs import TRPOConfig
 from recrl.agents.config import TrustRegionConfig
@@ -100,5 +100,5 @@ class TrustRegionPolicyOptimisation:
 
 
 def make_trpo(cmdp: CMDPSpec, config: TRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh TRPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: TrustRegionPolicyOptimisation(config))
+    """A fresh TRPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: TrustRegionPolicyOptimisation(config))

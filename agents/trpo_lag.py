@@ -7,14 +7,14 @@ At a saddle of the Lagrangian that surrogate has no gradient, but a step that al
 trust region is as long there as anywhere, and the policy swings about the limit for ever. So, ours, a nat of
 KL must be worth ``kl_price`` in that surrogate, and steps end with the gain.
 
-Letters: N samples, k costs.
+Notation: N samples, k costs.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.algorithm_configs import TRPOLagConfig
 from recrl.agents.experience import Experience
 from recrl.agents.multipliers import Multipliers
@@ -48,5 +48,5 @@ class TRPOLagrangian:
 
 
 def make_trpo_lag(cmdp: CMDPSpec, config: TRPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh TRPO-Lagrangian student."""
-    return fresh_student(cmdp, config, seed, lambda _: TRPOLagrangian(config, cmdp.num_costs))
+    """A fresh TRPO-Lagrangian agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: TRPOLagrangian(config, cmdp.num_costs))

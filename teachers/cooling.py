@@ -15,7 +15,7 @@ Where nothing is left to learn at a temperature, log pi(a | s) is the advantage 
 constant: ``Experience.with_entropy``. It needs an agent whose price for a violation can rise until no way
 through it pays (``ppo-lag`` as it is, or with a ``multiplier_maximum`` above that price; ``cpo``).
 
-Letters: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
+Notation: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
 environment steps, p in [0, 1] the share of B that is used up, k the number of costs.
 """
 

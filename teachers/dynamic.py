@@ -45,7 +45,7 @@ the letter wherever it is defined.
 One consequence of line 7 is kept, and worth knowing: a student whose converged cost is below d_d is given
 d_d at once, whatever remains of the budget.
 
-Letters: d limits in force, d_t training limits, d_d deployment limits, B the training budget in environment
+Notation: d limits in force, d_t training limits, d_d deployment limits, B the training budget in environment
 steps, b an episode, C-bar and r-bar the mean episode cost and return of a window, W a window's size, k the
 number of costs, eps_r, eps_c, eps_pi the paper's settings.
 """
@@ -350,8 +350,8 @@ class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
-    episodes since limits or policy were changed, in the unit of W), ``history`` (``WindowStatistics`` of each update
-    of the last two windows, as far as they are comparable) and the keys of ``StartMeasurement``.
+    episodes since limits or policy were changed, in the unit of W), ``history`` (``WindowStatistics`` of each
+    update of the last two windows, as far as they are comparable) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.

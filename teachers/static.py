@@ -3,7 +3,7 @@
 The three decays of the paper, and the controls that hold one limit for the whole training phase. The clock
 counts environment steps (``teacher.progress``) and is read once per policy update.
 
-Letters: d_t training limits, d_d deployment limits, B the training budget in environment steps,
+Notation: d_t training limits, d_d deployment limits, B the training budget in environment steps,
 p = env steps / B in [0, 1] the progress, k the number of costs.
 """
 

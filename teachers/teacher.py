@@ -5,7 +5,7 @@ which is opaque to it, and checkpoints it with the agent. A teacher keeps nothin
 inline, in an actor of its own or in one actor that a whole sweep shares, and always gives the same limits. It
 is asked once per policy update, with every episode that finished since the last one.
 
-Letters: d_t training limits, d_d deployment limits, B the training budget in environment steps,
+Notation: d_t training limits, d_d deployment limits, B the training budget in environment steps,
 p = env steps / B in [0, 1] the progress, k the number of costs.
 """
 

@@ -4,7 +4,7 @@ A policy is constant between two updates, so a window is made of whole updates a
 up once, when they are reported: judging costs nothing per episode, and a state keeps one short record for
 each update of the last two windows.
 
-Letters: k the number of costs, W a window's size.
+Notation: k the number of costs, W a window's size.
 """
 
 from __future__ import annotations

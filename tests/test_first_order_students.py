@@ -28,7 +28,7 @@ from recrl.environments.cmdp import Floats
 STATES = np.array([0, 0, 1, 1, 1, 2])
 ACTIONS = np.array([0, 1, 0, 1, 1, 0])
 ADVANTAGES = np.array([[1.0, 2.0], [-1.0, 0.0], [2.0, 1.0], [0.0, 0.0], [-3.0, 1.0], [1.0, 2.0]])
-BATCH = LearningBatch.gather(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=False)
+BATCH = LearningBatch.deduplicate(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=False)
 CLIP, KAPPA = 0.2, 5.0
 
 

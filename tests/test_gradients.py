@@ -42,7 +42,7 @@ def moved_policy(space: Space[object], compact: bool) -> tuple[StochasticPolicy,
     policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0))
     observations = generator.normal(size=(8, 3))[generator.integers(8, size=30)]
     actions = policy.sample(observations, generator)  # type: ignore[arg-type]
-    batch = LearningBatch.gather(observations, actions, compact=compact)  # type: ignore[arg-type]
+    batch = LearningBatch.deduplicate(observations, actions, compact=compact)  # type: ignore[arg-type]
     constraints = Constraints(np.array([1.0, 1.0]), np.array([0.3, -0.5]), np.zeros(2), 2.0)
     advantages = generator.normal(size=(30, 3))
     experience = Experience.of(policy, batch, advantages, constraints)
@@ -60,9 +60,7 @@ def clipped(experience: Experience) -> Objective:
 
 
 def plain(experience: Experience) -> Objective:
-    return of_ratios(
-        partial(surrogate, advantages=experience.batch.per_decision(experience.advantages[:, 1]))
-    )
+    return of_ratios(partial(surrogate, advantages=experience.batch.per_pair(experience.advantages[:, 1])))
 
 
 def lagrangian(
@@ -128,12 +126,12 @@ def test_an_objectives_gradient_is_its_finite_differences(
     def of_policy(distribution: Distribution) -> torch.Tensor:
         return objective(distribution, experience.ratios(distribution))
 
-    now = policy.evaluate(experience.batch.rows)
+    now = policy.evaluate(experience.batch.unique_observations)
     ratios = experience.ratios(now.distribution)
     assert float(ratios.detach().max()) > 1.0 + CLIP and float(ratios.detach().min()) < 1.0 - CLIP
     exact = now.gradient(of_policy(now.distribution)).clone().numpy()
     expected = differences(
-        policy.parameters, lambda: float(of_policy(policy.distribution(experience.batch.rows)))
+        policy.parameters, lambda: float(of_policy(policy.distribution(experience.batch.unique_observations)))
     )
     assert np.abs(expected).max() > 1e-3
     np.testing.assert_allclose(exact, expected, atol=1e-7)

@@ -124,14 +124,14 @@ def improved(
     actions = policy.sample(observations, generator)
     liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
     advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    batch = LearningBatch.gather(observations, actions, compact=True)
-    before, old = policy.parameters.to_numpy(), policy.distribution(batch.rows)
+    batch = LearningBatch.deduplicate(observations, actions, compact=True)
+    before, old = policy.parameters.to_numpy(), policy.distribution(batch.unique_observations)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)
     experience = Experience.of(policy, batch, advantages, constraints)
     metrics = improve_and_measure(rule_of(name, 2), policy, experience, np.random.default_rng(0))
-    moved = old.divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]
-    metrics["kl"] = float(torch.dot(batch.row_weights, moved))
+    moved = old.divergence(policy.distribution(batch.unique_observations))  # type: ignore[arg-type]
+    metrics["kl"] = float(torch.dot(batch.observation_weights, moved))
     return metrics, (policy.parameters.to_numpy() - before).astype(np.float64)
 
 

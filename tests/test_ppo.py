@@ -35,7 +35,7 @@ def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floa
     actions = policy.sample(observations, generator)
     liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
     advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    return policy, LearningBatch.gather(observations, actions, compact=True), advantages
+    return policy, LearningBatch.deduplicate(observations, actions, compact=True), advantages
 
 
 def rule_of(name: str, policy: StochasticPolicy) -> PolicyRule:
@@ -123,8 +123,8 @@ def climbed(**options: object) -> tuple[float, bool, set[int]]:
     sizes = set()
 
     def objective(part: Experience) -> Objective:
-        weights = part.batch.per_decision(advantages[:, 0])
-        sizes.add(len(part.batch.rows))
+        weights = part.batch.per_pair(advantages[:, 0])
+        sizes.add(len(part.batch.unique_observations))
         return lambda _, ratios: ratios @ weights
 
     metrics = gradient_ascent(
@@ -155,14 +155,14 @@ def test_with_minibatches_the_steps_are_those_of_the_passes_if_they_are_more() -
 
 def test_an_entropy_bonus_adds_the_mean_entropy_in_nats() -> None:
     _, batch, _ = sampled(SPACES[0])
-    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.rows), 4), dim=1))
+    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.unique_observations), 4), dim=1))
     objective = with_entropy(lambda ratios: ratios.sum(), batch, 0.5)
     assert float(objective(uniform, torch.ones(2))) == pytest.approx(2.0 + 0.5 * math.log(4.0), rel=1e-5)
 
 
 def test_a_priced_gain_is_divided_by_one_and_its_price() -> None:
     _, batch, _ = sampled(SPACES[0])
-    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.rows), 4), dim=1))
+    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.unique_observations), 4), dim=1))
     objective = with_prices(lambda ratios: (ratios.sum(), 3.0))
     assert float(objective(uniform, torch.ones(2))) == 0.5
 

@@ -30,7 +30,7 @@ def fresh(**options: object) -> tuple[StochasticPolicy, PPOLagrangian, LearningB
     generator = torch.Generator().manual_seed(0)
     policy = StochasticPolicy(3, Discrete(2), NetworkForm((8,), orthogonal), 1.0, generator)
     rule = PPOLagrangian(PPOLagConfig.model_validate(options), policy, 1)
-    return policy, rule, LearningBatch.gather(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=True)
+    return policy, rule, LearningBatch.deduplicate(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=True)
 
 
 def improvement(

@@ -31,7 +31,7 @@ import torch
 from gymnasium.spaces import Box
 
 from recrl.agents.agent import Rollout
-from recrl.agents.batch import distinct_rows
+from recrl.agents.batch import find_repeated
 from recrl.agents.collect import Collector, episode_costs
 from recrl.agents.config import ActorCriticConfig, AscentConfig, TrustRegionConfig
 from recrl.agents.networks import Adam, Critics, NetworkForm, xavier
@@ -73,7 +73,7 @@ def measure(agent_name: str, options: dict[str, Any]) -> tuple[list[float], list
         collecting.append((middle - before) * 1e3)
         updating.append((time.thread_time() - middle) * 1e3)
         steps.append(metrics["policy_steps"])
-        found = distinct_rows(rollout.observations.reshape(NUM_ENVS * NUM_STEPS, -1))
+        found = find_repeated(rollout.observations.reshape(NUM_ENVS * NUM_STEPS, -1))
         rows = max(rows, NUM_ENVS * NUM_STEPS if found is None else len(found[0]))
     return collecting, updating, float(np.mean(steps)), rows
 

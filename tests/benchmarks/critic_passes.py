@@ -49,7 +49,7 @@ def explained(agent: ActorCritic, rollout: Rollout) -> Floats:
     """The share of the variance of the targets that the critics explain, of the reward and each cost."""
     observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
     actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
-    batch = LearningBatch.gather(observations, actions, compact=False)
+    batch = LearningBatch.deduplicate(observations, actions, compact=False)
     found = agent._estimate(rollout, rollout.costs, batch)
     share: Floats = 1.0 - found.advantages.var(axis=0) / found.targets.var(axis=0)
     return share
