@@ -32,18 +32,18 @@ lint: install
 	$(BIN)/mypy
 
 chaos: install
-	$(BIN)/python tests/chaos.py --seconds $(or $(SECONDS),600) --seed $(or $(SEED),0) --log results/chaos/seed-$(or $(SEED),0).txt
+	$(BIN)/python tests/faults/chaos.py --seconds $(or $(SECONDS),600) --seed $(or $(SEED),0) --log results/chaos/seed-$(or $(SEED),0).txt
 
 cluster-test: install
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt 'psycopg[binary]'
-	$(BIN)/python -m tests.cluster --log results/cluster/log.txt
+	$(BIN)/python -m tests.faults.cluster --log results/cluster/log.txt
 
 # moto wants a newer graphql-core than MLflow: it stays beside the environment
 storage-test: install
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt s3fs
 	$(BIN)/pip install --quiet --disable-pip-version-check --target .venv/moto 'moto[server]'
-	PYTHONPATH=.venv/moto $(BIN)/python -m pytest -q tests/test_s3.py
-	PYTHONPATH=.venv/moto $(BIN)/python -m tests.cluster_storage --log results/cluster/storage.txt
+	PYTHONPATH=.venv/moto $(BIN)/python -m pytest -q tests/orchestrator/test_s3.py
+	PYTHONPATH=.venv/moto $(BIN)/python -m tests.faults.cluster_storage --log results/cluster/storage.txt
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -150,7 +150,7 @@ class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 
     Args:
         environment: its observations are vectors, and its ``observation_components`` say which of their
-            numbers are a lidar, as those of ``recrl.environments.safety_gym`` do.
+            numbers are a lidar, as those of ``recrl.environments.safety_gym.environments`` do.
         components: the parts of an observation, for an environment that does not declare them.
         scales: length scales in metres.
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.agents.agent import Agent
-from recrl.agents.collect import Collector, FinishedEpisode
+from recrl.agents.collection import Collector, FinishedEpisode
 from recrl.agents.spaces import environment_actions
 from recrl.environments.cmdp import Floats
 from recrl.environments.vector import CMDPVectorEnv

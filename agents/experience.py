@@ -13,11 +13,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.advantages import reward_spread, scaled_advantages
-from recrl.agents.batch import LearningBatch
-from recrl.agents.constraint_forms import standard_errors
-from recrl.agents.distributions import Distribution
-from recrl.agents.policies import StochasticPolicy
+from recrl.agents.constraints.cost_measures import standard_errors
+from recrl.agents.learning.advantages import reward_spread, scaled_advantages
+from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.distributions import Distribution
+from recrl.agents.learning.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
 
 

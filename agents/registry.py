@@ -50,52 +50,52 @@ AGENTS: dict[str, AgentEntry] = {
     "ppo-lag": AgentEntry(
         "PPO on the Lagrangian, with a choice of multiplier rules.",
         PPOLagConfig,
-        "recrl.agents.ppo_lag:make_ppo_lag",
+        "recrl.agents.algorithms.ppo_lag:make_ppo_lag",
     ),
     "cpo": AgentEntry(
         "Constrained policy optimisation: a trust-region step that keeps the constraints.",
         CPOConfig,
-        "recrl.agents.cpo:make_cpo",
+        "recrl.agents.algorithms.cpo:make_cpo",
     ),
     "pcpo": AgentEntry(
         "Projection-based constrained policy optimisation: a reward step, projected onto the constraints.",
         PCPOConfig,
-        "recrl.agents.pcpo:make_pcpo",
+        "recrl.agents.algorithms.pcpo:make_pcpo",
     ),
     "focops": AgentEntry(
         "First-order constrained optimisation in policy space: multipliers, no second derivatives.",
         FOCOPSConfig,
-        "recrl.agents.focops:make_focops",
+        "recrl.agents.algorithms.focops:make_focops",
     ),
     "p3o": AgentEntry(
         "Penalised proximal policy optimisation: an exact penalty, nothing to adapt.",
         P3OConfig,
-        "recrl.agents.p3o:make_p3o",
+        "recrl.agents.algorithms.p3o:make_p3o",
     ),
     "ipo": AgentEntry(
         "Interior-point policy optimisation: a logarithmic barrier before each limit.",
         IPOConfig,
-        "recrl.agents.ipo:make_ipo",
+        "recrl.agents.algorithms.ipo:make_ipo",
     ),
     "crpo": AgentEntry(
         "Constraint-rectified policy optimisation: reward steps while the constraints hold, else cost steps.",
         CRPOConfig,
-        "recrl.agents.crpo:make_crpo",
+        "recrl.agents.algorithms.crpo:make_crpo",
     ),
     "trpo-lag": AgentEntry(
         "TRPO on the Lagrangian, with a choice of multiplier rules.",
         TRPOLagConfig,
-        "recrl.agents.trpo_lag:make_trpo_lag",
+        "recrl.agents.algorithms.trpo_lag:make_trpo_lag",
     ),
     "ppo": AgentEntry(
         "PPO, which knows no constraint: a control.",
         PPOConfig,
-        "recrl.agents.ppo:make_ppo",
+        "recrl.agents.algorithms.ppo:make_ppo",
     ),
     "trpo": AgentEntry(
         "TRPO, which knows no constraint: a control.",
         TRPOConfig,
-        "recrl.agents.trpo:make_trpo",
+        "recrl.agents.algorithms.trpo:make_trpo",
     ),
 }
 

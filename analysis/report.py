@@ -39,18 +39,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from recrl.analysis import claims, figures, metrics, page, styles, tables
-from recrl.analysis.bound_figure import cumulative_bounds
-from recrl.analysis.cumulative import bound_table, cumulative_costs
-from recrl.analysis.diagnostics import curriculum_diagnostics
-from recrl.analysis.doubts import doubts
-from recrl.analysis.frames import GROUP, Sweep, ordered
-from recrl.analysis.frontier import return_against_cost
-from recrl.analysis.intervals import ENOUGH_RUNS
-from recrl.analysis.metrics import MEAN, Averaging, Measure, interquartile
-from recrl.analysis.page import Section
-from recrl.analysis.policy_map import policy_maps
-from recrl.analysis.profiles import performance_profiles
+from recrl.analysis import report_page, report_tables
+from recrl.analysis.data.sweep_data import GROUP, Sweep, ordered
+from recrl.analysis.data.validity import doubts
+from recrl.analysis.figures import learning_curves, styles
+from recrl.analysis.figures.cumulative_cost import cumulative_bounds
+from recrl.analysis.figures.diagnostics import curriculum_diagnostics
+from recrl.analysis.figures.frontier import return_against_cost
+from recrl.analysis.figures.policy_map import policy_maps
+from recrl.analysis.figures.profiles import performance_profiles
+from recrl.analysis.report_page import Section
+from recrl.analysis.statistics import claims, metrics
+from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.intervals import ENOUGH_RUNS
+from recrl.analysis.statistics.metrics import MEAN, Averaging, Measure, interquartile
 from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.spec import TrialState
 
@@ -154,14 +156,18 @@ def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
     pictures = [path for path in drawn if path.suffix == ".png"]
     text = [f"![{path.stem}]({path.name})" for path in pictures]
     for heading, table in shown:
-        text += ["", f"## {heading}", "", tables.markdown(table)]
+        text += ["", f"## {heading}", "", report_tables.markdown(table)]
     if not shown:
         text += ["", NO_TABLE]
-    state = [_count(sweep), "", *(f"- {tables.markdown_text(sentence)}" for sentence in missing(sweep))]
-    title = f"# {tables.markdown_text(sweep.name)}"
+    state = [
+        _count(sweep),
+        "",
+        *(f"- {report_tables.markdown_text(sentence)}" for sentence in missing(sweep)),
+    ]
+    title = f"# {report_tables.markdown_text(sweep.name)}"
     reports = [
-        tables.write_text(_html(sweep, pictures, shown), folder / "report.html"),
-        tables.write_text("\n".join([title, "", *state, "", *text]), folder / "report.md"),
+        report_tables.write_text(_html(sweep, pictures, shown), folder / "report.html"),
+        report_tables.write_text("\n".join([title, "", *state, "", *text]), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
 
@@ -186,9 +192,9 @@ def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable
     made: dict[str, Callable[[], Figure | None]] = {}
     for agent in agents:
         made[f"learning-curves_{_safe(agent)}"] = partial(
-            figures.learning_curves, sweep, agent, averaging=averaging
+            learning_curves.learning_curves, sweep, agent, averaging=averaging
         )
-    made["curricula"] = partial(figures.curricula, sweep)
+    made["curricula"] = partial(learning_curves.curricula, sweep)
     for task, agent in cells:
         made[f"diagnostics_{_safe(task)}_{_safe(agent)}"] = partial(
             curriculum_diagnostics, sweep, task, agent
@@ -237,7 +243,8 @@ def missing(sweep: Sweep) -> list[str]:
     if few:
         sentences.append(
             f"{' or '.join(map(str, few))} seed{'s' if few[-1] > 1 else ''}: bootstrap intervals "
-            f"are too short below {ENOUGH_RUNS} seeds (marked {tables.TOO_FEW}); Student's and Wilson's hold"
+            f"are too short below {ENOUGH_RUNS} seeds (marked {report_tables.TOO_FEW}); Student's "
+            "and Wilson's hold"
         )
     return sentences
 
@@ -262,8 +269,8 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str
     rows = metrics.outcomes(sweep)
     bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
     written = [
-        tables.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
-        tables.write_csv(pd.concat(bounds), folder / "bounds.csv"),
+        report_tables.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
+        report_tables.write_csv(pd.concat(bounds), folder / "bounds.csv"),
     ]
     if not len(rows):
         return written, []
@@ -271,9 +278,9 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str
     averaged = metrics.summary(rows)
     robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
     compared = metrics.comparisons(rows, generator)
-    outcomes = {measure: tables.outcome_table(averaged, measure) for measure in Measure}
+    outcomes = {measure: report_tables.outcome_table(averaged, measure) for measure in Measure}
     latex = [
-        f"% Outcome of {measure.description}.\n{tables.latex(table)}\n"
+        f"% Outcome of {measure.description}.\n{report_tables.latex(table)}\n"
         for measure, table in outcomes.items()
         if len(table)
     ]
@@ -281,11 +288,11 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str
         (f"Outcome of {measure.description}", table) for measure, table in outcomes.items() if len(table)
     ]
     if len(compared):
-        against = tables.comparison_table(compared, Measure.DEPLOYMENT)
+        against = report_tables.comparison_table(compared, Measure.DEPLOYMENT)
         shown.append(("Deployment phase against `none`, seed by seed [95% interval]", against))
     weighed = claims.weigh(rows)
     if len(weighed):
-        written.append(tables.write_csv(weighed, folder / "claims.csv"))
+        written.append(report_tables.write_csv(weighed, folder / "claims.csv"))
         shown.append(("What the paper says of these maps, in deployment", claims.claims_table(weighed)))
     for i, costs in enumerate(bounds):
         which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
@@ -293,11 +300,11 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str
             shown.append((f"Cumulative cost of training beside its bounds{which}", bound_table(costs)))
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
     written += [
-        tables.write_csv(rows, folder / "outcomes.csv"),
-        tables.write_parquet(rows, folder / "outcomes.parquet"),
-        tables.write_csv(whole, folder / "summary.csv"),
-        tables.write_csv(compared, folder / "comparisons.csv"),
-        tables.write_text("\n".join(latex), folder / "outcomes.tex"),
+        report_tables.write_csv(rows, folder / "outcomes.csv"),
+        report_tables.write_parquet(rows, folder / "outcomes.parquet"),
+        report_tables.write_csv(whole, folder / "summary.csv"),
+        report_tables.write_csv(compared, folder / "comparisons.csv"),
+        report_tables.write_text("\n".join(latex), folder / "outcomes.tex"),
     ]
     return written, shown
 
@@ -307,11 +314,13 @@ def _html(sweep: Sweep, pictures: list[Path], shown: list[tuple[str, pd.DataFram
     failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
     sections = []
     if sentences := missing(sweep):
-        sections.append(Section("To be known", page.items(sentences, failed=failed)))
-    sections.append(Section("Figures", "\n".join(page.figure(path, _caption(path)) for path in pictures)))
-    sections += [Section(heading.replace("`", ""), page.table(table)) for heading, table in shown]
+        sections.append(Section("To be known", report_page.items(sentences, failed=failed)))
+    sections.append(
+        Section("Figures", "\n".join(report_page.figure(path, _caption(path)) for path in pictures))
+    )
+    sections += [Section(heading.replace("`", ""), report_page.table(table)) for heading, table in shown]
     if not shown:
-        sections.append(Section("Tables", page.items([NO_TABLE])))
+        sections.append(Section("Tables", report_page.items([NO_TABLE])))
     settings = {
         f"{kind} {choice['label']}": choice
         for trial in sweep.facts
@@ -321,13 +330,15 @@ def _html(sweep: Sweep, pictures: list[Path], shown: list[tuple[str, pd.DataFram
     sections.append(
         Section(
             "Settings",
-            page.verbatim(sweep.grid)
-            + page.verbatim("\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)),
+            report_page.verbatim(sweep.grid)
+            + report_page.verbatim("\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)),
         )
     )
-    sections.append(Section("Provenance", page.verbatim("\n".join(_provenance(sweep)))))
+    sections.append(Section("Provenance", report_page.verbatim("\n".join(_provenance(sweep)))))
     goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
-    return page.page(sweep.name, _count(sweep), sections, reload_seconds=RELOAD_SECONDS if goes_on else None)
+    return report_page.page(
+        sweep.name, _count(sweep), sections, reload_seconds=RELOAD_SECONDS if goes_on else None
+    )
 
 
 def _caption(path: Path) -> str:

@@ -70,16 +70,16 @@ OBSTACLES = ("", ", past a few obstacles", ", past many obstacles")
 TASKS: dict[str, Task] = {
     "two-state": Task(
         summary="A camp and a mine, one cost, closed-form optimum: for testing learners.",
-        options="recrl.environments.two_state:TwoStateOptions",
-        make="recrl.environments.two_state:make_two_state",
-        optimum="recrl.environments.two_state:two_state_optimum",
+        options="recrl.environments.finite.two_state:TwoStateOptions",
+        make="recrl.environments.finite.two_state:make_two_state",
+        optimum="recrl.environments.finite.two_state:two_state_optimum",
         sample_options={"arrival": 0.5},
     ),
     "two-state-2": Task(
         summary="A camp and a mine, two costs, closed-form optimum: for testing learners.",
-        options="recrl.environments.two_state:TwoStateOptions",
-        make="recrl.environments.two_state:make_two_state",
-        optimum="recrl.environments.two_state:two_state_optimum",
+        options="recrl.environments.finite.two_state:TwoStateOptions",
+        make="recrl.environments.finite.two_state:make_two_state",
+        optimum="recrl.environments.finite.two_state:two_state_optimum",
         sample_options={"arrival": 0.5},
     ),
     "continuous-bandit": Task(
@@ -90,49 +90,49 @@ TASKS: dict[str, Task] = {
     ),
     "rivergrid-1a": Task(
         summary="The paper's RiverGrid 1a: the goal is only reached through the river, at a cost of 5.",
-        options="recrl.environments.river_grid:RiverGridOptions",
-        make="recrl.environments.river_grid:make_river_grid",
-        optimum="recrl.environments.river_grid:river_grid_optimum",
-        drawn="recrl.environments.river_minigrid:draw_river_grid",
+        options="recrl.environments.rivergrid.grid_world:RiverGridOptions",
+        make="recrl.environments.rivergrid.grid_world:make_river_grid",
+        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
+        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
         sample_options={"horizon": 20, "costs": ("river", "turns")},
     ),
     "rivergrid-1b": Task(
         summary="The paper's RiverGrid 1b: through the river at a cost of 5, or round it at a cost of 0.",
-        options="recrl.environments.river_grid:RiverGridOptions",
-        make="recrl.environments.river_grid:make_river_grid",
-        optimum="recrl.environments.river_grid:river_grid_optimum",
-        drawn="recrl.environments.river_minigrid:draw_river_grid",
+        options="recrl.environments.rivergrid.grid_world:RiverGridOptions",
+        make="recrl.environments.rivergrid.grid_world:make_river_grid",
+        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
+        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
         sample_options={"horizon": 20},
     ),
     "rivergrid": Task(
         summary="RiverGrid on a map of one's own or on a random solvable one.",
-        options="recrl.environments.river_grid:RiverGridMapOptions",
-        make="recrl.environments.river_grid:make_river_grid",
-        optimum="recrl.environments.river_grid:river_grid_optimum",
-        drawn="recrl.environments.river_minigrid:draw_river_grid",
+        options="recrl.environments.rivergrid.grid_world:RiverGridMapOptions",
+        make="recrl.environments.rivergrid.grid_world:make_river_grid",
+        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
+        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
         sample_options={"horizon": 20, "generate": {"seed": 3}},
     ),
     "rivergrid-generated": Task(
         summary="RiverGrid on an instance like the paper's two that a seed draws.",
-        options="recrl.environments.river_grid:RiverGridGeneratedOptions",
-        make="recrl.environments.river_grid:make_river_grid",
-        optimum="recrl.environments.river_grid:river_grid_optimum",
-        drawn="recrl.environments.river_minigrid:draw_river_grid",
+        options="recrl.environments.rivergrid.grid_world:RiverGridGeneratedOptions",
+        make="recrl.environments.rivergrid.grid_world:make_river_grid",
+        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
+        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
         sample_options={"horizon": 20, "map_seed": 0},
     ),
     "gymnasium": Task(
         summary="Any environment that is registered with Gymnasium, by its id.",
-        options="recrl.environments.vectorize:GymnasiumOptions",
-        make="recrl.environments.vectorize:make_gymnasium",
-        drawn="recrl.environments.vectorize:draw_gymnasium",
+        options="recrl.environments.gymnasium_adapter:GymnasiumOptions",
+        make="recrl.environments.gymnasium_adapter:make_gymnasium",
+        drawn="recrl.environments.gymnasium_adapter:draw_gymnasium",
         sample_options={"id": "CartPole-v1", "costless": True},
     ),
     **{
         f"{robot}{goal}{level}": Task(
             summary=f"Safety Gym: the {robot} {what}{OBSTACLES[level]}.",
-            options="recrl.environments.safety_gym:SafetyGymOptions",
-            make="recrl.environments.safety_gym:make_safety_gym",
-            drawn="recrl.environments.safety_gym:draw_safety_gym",
+            options="recrl.environments.safety_gym.environments:SafetyGymOptions",
+            make="recrl.environments.safety_gym.environments:make_safety_gym",
+            drawn="recrl.environments.safety_gym.environments:draw_safety_gym",
             sample_options={"horizon": 12},
         )
         for robot in ("Car", "Point")
@@ -173,8 +173,12 @@ def find_task(name: str) -> Task:
     return Task(
         summary=f"The environment that {name} returns.",
         options=KeywordOptions,
-        make=functools.partial(load_attribute("recrl.environments.vectorize:make_from_callable"), found),
-        drawn=functools.partial(load_attribute("recrl.environments.vectorize:draw_from_callable"), found),
+        make=functools.partial(
+            load_attribute("recrl.environments.gymnasium_adapter:make_from_callable"), found
+        ),
+        drawn=functools.partial(
+            load_attribute("recrl.environments.gymnasium_adapter:draw_from_callable"), found
+        ),
     )
 
 

@@ -14,11 +14,11 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.store import SweepStore
 
 if TYPE_CHECKING:
-    from recrl.orchestrator.remote_sweep import RemoteSweep
+    from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 
 
 class Executor(Protocol):
@@ -45,7 +45,7 @@ class InlineExecutor:
 
     def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
         """See ``Executor.run``."""
-        from recrl.orchestrator.trial import run_recorded  # noqa: PLC0415  (imports torch)
+        from recrl.orchestrator.trial.trial import run_recorded  # noqa: PLC0415  (imports torch)
 
         for spec in specs:
             if stop.is_set():

@@ -19,7 +19,7 @@ from enum import StrEnum
 from typing import Any
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.foreign import checked_spec
+from recrl.orchestrator.untrusted import checked_spec
 from recrl.teachers.teacher import TeacherSpec
 
 

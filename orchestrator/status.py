@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from recrl.orchestrator.files.store import SweepStore, TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore, TrialRecord
 
 # A trial says after its updates that it lives, and an update of big networks takes a minute or two; one that
 # has been silent for so long has died.

@@ -17,18 +17,18 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import TYPE_CHECKING, Protocol
 
-from recrl.orchestrator.beside import beside
+from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, RecrlError, StorageError
 from recrl.orchestrator.executors import Executor
-from recrl.orchestrator.grid import GridSpec
-from recrl.orchestrator.plan import Plan, Work, make_plan
-from recrl.orchestrator.provenance import collect
+from recrl.orchestrator.files.provenance import collect
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.grid.grid import GridSpec
+from recrl.orchestrator.grid.plan import Plan, Work, make_plan
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
-from recrl.orchestrator.store import SweepStore
 
 if TYPE_CHECKING:
-    from recrl.orchestrator.remote_sweep import RemoteSweep
+    from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
 MIRROR_SECONDS = 120.0

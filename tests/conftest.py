@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recrl.analysis.frames import Sweep, load
+from recrl.analysis.data.sweep_data import Sweep, load
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.orchestrator.files.store import SweepStore, TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore, TrialWriter
-from recrl.orchestrator.tracking import sync, tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import sync, tracking_uri
 
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0

@@ -1,10 +1,10 @@
 """The velocity tasks as environments: one for Gymnasium, and a batch for agents.
 
     import gymnasium
-    environment = gymnasium.make("recrl.environments.velocity:recrl/SafetyAntVelocity-v1")
-    environments = gymnasium.make_vec("recrl.environments.velocity:recrl/SafetyAntVelocity-v1", num_envs=16)
+    environment = gymnasium.make("recrl.environments.registration:recrl/SafetyAntVelocity-v1")
+    batch = gymnasium.make_vec("recrl.environments.registration:recrl/SafetyAntVelocity-v1", num_envs=16)
 
-What is observed, done, earned and paid: ``recrl.environments.velocity.worlds``.
+What is observed, done, earned and paid: ``recrl.environments.velocity.batch``.
 
 ``info`` of a step holds ``cost`` (the cost, [k] with k = 1), ``velocity`` (what is compared with the
 threshold, m/s), and ``cost_exception`` if the physics broke down.
@@ -22,14 +22,14 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field
 
-from recrl.environments.camera import Camera, Renderer
 from recrl.environments.cmdp import CMDPSpec, Floats
-from recrl.environments.ordering import give_actions
+from recrl.environments.simulation.actions import give_actions
+from recrl.environments.simulation.camera import Camera, Renderer
 from recrl.environments.vector import CMDPVectorEnv
 from recrl.environments.velocity.tasks import HORIZON, VELOCITY_TASKS, Booleans, VelocityTask
 
 if TYPE_CHECKING:
-    from recrl.environments.velocity.worlds import Observations, Outcome, VelocityWorlds
+    from recrl.environments.velocity.batch import Observations, Outcome, VelocityWorlds
 
 COST_NAMES = ("cost",)
 
@@ -52,7 +52,7 @@ class VelocityOptions(BaseModel):
 
 def _make_worlds(task: VelocityTask, number: int, options: VelocityOptions) -> VelocityWorlds:
     """Worlds to be stepped; who only asks what there is to be set does not wait for MuJoCo and Numba."""
-    from recrl.environments.velocity.worlds import VelocityWorlds  # noqa: PLC0415
+    from recrl.environments.velocity.batch import VelocityWorlds  # noqa: PLC0415
 
     return VelocityWorlds(task, number, horizon=options.horizon, num_threads=options.num_threads)
 

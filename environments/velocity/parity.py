@@ -26,9 +26,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.velocity.batch import VelocityWorlds
 from recrl.environments.velocity.physics import derive, derive_with_forces
 from recrl.environments.velocity.tasks import VELOCITY_TASKS, VelocityTask
-from recrl.environments.velocity.worlds import VelocityWorlds
 
 TOLERANCE = 1e-5
 STAGES = (0.5, 0.5, 1.0)

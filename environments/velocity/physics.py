@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.machine_code import (
+from recrl.environments.simulation.machine_code import (
     array_at,
     compiled,
     compiled_for_batch,
@@ -20,7 +20,7 @@ from recrl.environments.machine_code import (
     mj_rnePostConstraint,
     mj_step,
 )
-from recrl.environments.mujoco_layout import structure
+from recrl.environments.simulation.mujoco_layout import structure
 
 MAX_FIELDS = 5
 """Room for fields of ``mjData`` that are copied."""

@@ -7,8 +7,8 @@ import copy
 import mujoco
 import numpy as np
 
-from recrl.environments.camera import Frame, make_context
-from recrl.environments.velocity.worlds import TORSO, VelocityWorlds
+from recrl.environments.simulation.camera import Frame, make_context
+from recrl.environments.velocity.batch import TORSO, VelocityWorlds
 
 MAX_GEOMS = 1000
 CAMERA_ELEVATION, CAMERA_AZIMUTH = -20.0, 90.0

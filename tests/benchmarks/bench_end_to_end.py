@@ -34,12 +34,12 @@ from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
 from recrl.agents.agent import Policy
-from recrl.agents.collect import Collector, episode_costs
+from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.config import ActorCriticConfig
 from recrl.agents.registry import agent_config, make_agent
 from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
-from recrl.environments.safety_gym import SafetyGymVectorEnv
+from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
 from recrl.environments.vector import CMDPVectorEnv
 
 UPDATE, SAFETY_GYM = (

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from recrl.environments.cmdp import CostLimits
-from recrl.environments.exact import solve_by_lagrangian
+from recrl.environments.finite.exact_solver import solve_by_lagrangian
 from recrl.environments.registry import make_vector
-from recrl.environments.river_grid import RiverGridVectorEnv
-from recrl.environments.river_maps import MAPS
-from recrl.environments.river_minigrid import RiverGridEnv
+from recrl.environments.rivergrid.grid_world import RiverGridVectorEnv
+from recrl.environments.rivergrid.maps import MAPS
+from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
 
 STEPS = 20_000
 REPEATS = 5

@@ -21,11 +21,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.ray_executor import RayExecutor, local_cluster
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.ray.executor import RayExecutor, local_cluster
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.tracking import tracking_uri
-from recrl.orchestrator.tracking_mirror import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.mlflow_sync import tracking_uri
 from tests.benchmarks.bench_overhead import car_trial, family
 
 LOOK_SECONDS = 1.0

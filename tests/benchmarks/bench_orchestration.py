@@ -22,10 +22,10 @@ import numpy as np
 import ray
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.orchestrator.ray_executor import RayExecutor, local_cluster
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.ray.executor import RayExecutor, local_cluster
+from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 

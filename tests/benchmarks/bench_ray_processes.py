@@ -24,12 +24,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from recrl.orchestrator import ray_executor
-from recrl.orchestrator.beside import beside
-from recrl.orchestrator.ray_executor import RayExecutor, local_cluster
+from recrl.orchestrator.background import beside
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.ray import executor
+from recrl.orchestrator.ray.executor import RayExecutor, local_cluster
+from recrl.orchestrator.ray.teacher_service import start_teacher_service
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.teacher_service import start_teacher_service
 from tests.benchmarks.bench_memory import name_of
 from tests.benchmarks.bench_overhead import car_trial, family
 
@@ -42,15 +42,15 @@ NICENESS = {"worker_niceness": 0}  # of trials: on a busy machine they would get
 @contextmanager
 def settings(*, ours: bool) -> Iterator[None]:
     """Start clusters with our settings meanwhile, or without."""
-    before: Mapping[str, Any] = {name: getattr(ray_executor, name) for name in ("SELDOM", "LEFT_OUT")}
+    before: Mapping[str, Any] = {name: getattr(executor, name) for name in ("SELDOM", "LEFT_OUT")}
     now = {**before, "SELDOM": {**before["SELDOM"], **NICENESS}}
     for name, value in (now if ours else {"SELDOM": NICENESS, "LEFT_OUT": {}}).items():
-        setattr(ray_executor, name, value)
+        setattr(executor, name, value)
     try:
         yield
     finally:
         for name, value in before.items():
-            setattr(ray_executor, name, value)
+            setattr(executor, name, value)
 
 
 def used() -> dict[tuple[int, int], tuple[str, float]]:

@@ -36,11 +36,11 @@ import mujoco.batch
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.gremlins import leads
-from recrl.environments.safety_gym import SafetyGymVectorEnv
-from recrl.environments.safety_tasks import HORIZON, SAFETY_TASKS, SUBSTEPS
-from recrl.environments.safety_worlds import SafetyWorlds
-from recrl.environments.scene import PARKED
+from recrl.environments.safety_gym.batch import SafetyWorlds
+from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.gremlins import leads
+from recrl.environments.safety_gym.scene import PARKED
+from recrl.environments.safety_gym.tasks import HORIZON, SAFETY_TASKS, SUBSTEPS
 
 NUM_ENVS, MANY_ENVS = 16, 64
 STEPS = 5
@@ -120,7 +120,7 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
         of the bare speed, and of 16 of the led one.
     """
     batch = SafetyGymVectorEnv(name, NUM_ENVS)
-    single = gymnasium.make(f"recrl/{name}-v0")
+    single = gymnasium.make(f"recrl.environments.registration:recrl/{name}-v0")
     generator = np.random.default_rng(0)
     batch.reset(seed=0)
     single.reset(seed=0)

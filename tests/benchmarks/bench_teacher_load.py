@@ -30,11 +30,11 @@ import numpy as np
 import ray
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
-from recrl.orchestrator.ray_executor import local_cluster, look_seconds
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.ray.executor import local_cluster, look_seconds
+from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.status import SILENCE_SECONDS
-from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 

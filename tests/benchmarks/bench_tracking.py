@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from recrl.environments.cmdp import CostLimits, Phase
+from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.tracking import last_report, tracking_uri
-from recrl.orchestrator.tracking_mirror import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.mlflow_sync import last_report, tracking_uri
 
 STEPS_PER_UPDATE = 3200
 STUDENT_METRICS = (

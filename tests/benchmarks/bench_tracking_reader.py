@@ -5,8 +5,8 @@
 
 A store is made with as many runs and points as are asked for, with the columns, artifacts and sums of real
 trials and random numbers; rows are written to MLflow's tables directly, as MLflow itself would take half an
-hour. Then ``recrl.analysis.tracked.load`` reads it in a fresh process. The aim: 1,000 runs x 300 points, each
-with all metrics of a trial, within 10 seconds on two cores, imports counted.
+hour. Then ``recrl.analysis.data.from_mlflow.load`` reads it in a fresh process. The aim: 1,000 runs x 300
+points, each with all metrics of a trial, within 10 seconds on two cores, imports counted.
 
 With ``--server`` an MLflow server of one process stands before that store and hands out the artifacts as
 well. At first it has the sweep's snapshot as the mirror would have left it, of all runs but one; then none,
@@ -32,10 +32,10 @@ import numpy as np
 import pandas as pd
 
 from recrl.environments.cmdp import Floats, Phase
+from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.store import SweepStore
-from recrl.orchestrator.tracking import PHASES_TAG, PROGRESS_TAG, SPEC_TAG, sync, tracking_uri
-from recrl.orchestrator.tracking_snapshot import (
+from recrl.orchestrator.tracking.mlflow_sync import PHASES_TAG, PROGRESS_TAG, SPEC_TAG, sync, tracking_uri
+from recrl.orchestrator.tracking.snapshot import (
     AT_THE_END,
     BEFORE_METRICS,
     FROM_THE_BEGINNING,
@@ -45,7 +45,7 @@ from recrl.orchestrator.tracking_snapshot import (
     HeldRun,
     Snapshot,
 )
-from recrl.orchestrator.tracking_ui import open_ui
+from recrl.orchestrator.tracking.ui import open_ui
 from tests.benchmarks.bench_tracking import STEPS_PER_UPDATE, STUDENT_METRICS, children_cpu, write_sweep
 
 PORT = 5714

@@ -21,10 +21,10 @@ import numpy as np
 import pandas as pd
 import torch
 
-from recrl.agents.actor_critic import ActorCritic
 from recrl.agents.agent import Rollout
-from recrl.agents.batch import LearningBatch
-from recrl.agents.collect import Collector, episode_costs
+from recrl.agents.collection import Collector, episode_costs
+from recrl.agents.learning.actor_critic import ActorCritic
+from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector

@@ -11,8 +11,8 @@ from typing import Any
 
 import pandas as pd
 
-from recrl.analysis.frames import load
-from recrl.orchestrator.store import SweepStore
+from recrl.analysis.data.sweep_data import load
+from recrl.orchestrator.files.store import SweepStore
 
 KEYS = ["task", "agent", "method", "seed", "policy"]
 

@@ -25,9 +25,9 @@ import numpy as np
 from scipy.optimize import linprog
 
 from recrl.environments.cmdp import CostLimits, Floats
-from recrl.environments.exact import evaluate_policy, solve_by_lagrangian
-from recrl.environments.finite_cmdp import FiniteCMDP
-from recrl.environments.river_grid import (
+from recrl.environments.finite.exact_solver import evaluate_policy, solve_by_lagrangian
+from recrl.environments.finite.finite_cmdp import FiniteCMDP
+from recrl.environments.rivergrid.grid_world import (
     HORIZON,
     RiverGridGeneratedOptions,
     river_cmdp,

@@ -1,4 +1,4 @@
-"""How often the intervals of ``recrl.analysis.intervals`` cover the truth; its estimators beside rliable's.
+"""How often the intervals of ``statistics.intervals`` cover the truth; its estimators beside rliable's.
 
     OMP_NUM_THREADS=1 python -m tests.benchmarks.interval_statistics [--samples 4000]
 
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from recrl.analysis.intervals import (
+from recrl.analysis.statistics.intervals import (
     Interval,
     improvement_interval,
     interquartile_mean,

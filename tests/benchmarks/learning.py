@@ -25,12 +25,12 @@ import pandas as pd
 import torch
 
 from recrl.agents.agent import Agent, DiscretePolicy
-from recrl.agents.collect import Collector, episode_costs
+from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import make_agent
 from recrl.agents.spaces import environment_actions
 from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
-from recrl.environments.exact import evaluate_policy
-from recrl.environments.finite_cmdp import FiniteVectorEnv
+from recrl.environments.finite.exact_solver import evaluate_policy
+from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector, optimal_return
 from recrl.environments.vector import CMDPVectorEnv
 

@@ -11,7 +11,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from recrl.environments.parity import TOLERANCE, compare_recording
+from recrl.environments.safety_gym.parity import TOLERANCE, compare_recording
 
 
 def main() -> int:

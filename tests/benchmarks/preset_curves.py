@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from recrl.agents.collect import Collector, episode_costs
+from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector

@@ -13,7 +13,7 @@ import sys
 
 import numpy as np
 
-from recrl.environments.safety_gym import SafetyGymVectorEnv
+from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
 
 NUM_ENVS = 64
 HELD_STEPS = 25

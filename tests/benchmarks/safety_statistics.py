@@ -15,9 +15,9 @@ import math
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym import SafetyGymVectorEnv
-from recrl.environments.safety_worlds import SafetyWorlds
-from recrl.environments.scene import rotation_matrices
+from recrl.environments.safety_gym.batch import SafetyWorlds
+from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.scene import rotation_matrices
 
 HELD_STEPS = 25
 # Task, policy: mean and standard error of return, cost and goals an episode of 1,000 steps.

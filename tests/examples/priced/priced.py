@@ -2,11 +2,11 @@
 
 from pydantic import Field
 
-from recrl.agents.actor_critic import fresh_agent, indexed
-from recrl.agents.advantages import SMALLEST_STD
+from recrl.agents.algorithms.trpo import step_up
 from recrl.agents.config import TrustRegionConfig
+from recrl.agents.learning.actor_critic import fresh_agent, indexed
+from recrl.agents.learning.advantages import SMALLEST_STD
 from recrl.agents.registry import AgentEntry
-from recrl.agents.trpo import step_up
 
 
 class PricedConfig(TrustRegionConfig):

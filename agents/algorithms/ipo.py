@@ -1,0 +1,125 @@
+"""Interior-point policy optimisation (Liu, Ding and Liu 2020): a logarithmic barrier before each limit.
+
+The policy climbs, in cost per step,
+
+    L_r + sum_i phi(s_i),  s_i = -(L_i + c_i),  c_i = (mean episode cost i - limit i) / mean episode length,
+
+with L_r the clipped surrogate of the reward, L_i that of cost i, and phi(s) = log(s) / t. L_i is, ours, the
+*pessimistic* surrogate of ``p3o``: with the source's plain one, a violated constraint sends the policy as far
+as it can within an update, for a relief that is true only nearby (on a RiverGrid, to one goal for good). The
+optimum gives away 1 / t of reward a step for each constraint that binds. The paper leaves open what happens
+where there is no slack: there phi goes on along its tangent (Kervadec et al. 2022), from the slack
+1 / (t kappa) at which its slope is kappa,
+
+    phi(s) = log(s) / t                                if s >= 1 / (t kappa),
+             kappa s - (1 + log(t kappa)) / t          otherwise,
+
+so that a violated constraint is an exact penalty with the factor kappa. All advantages and c are in standard
+deviations of the reward's advantages, so that kappa is in reward per unit of cost, as multipliers are.
+
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
+pairs, k costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from recrl.agents.algorithm_configs import IPOConfig
+from recrl.agents.experience import ActiveConstraints, Experience
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.surrogates import (
+    SignedAdvantages,
+    clipped_surrogate,
+    pessimistic_relief,
+    surrogate,
+)
+from recrl.environments.cmdp import CMDPSpec, Floats
+
+
+def barrier(slack: Tensor, *, sharpness: float, slope: float) -> Tensor:
+    """The barrier phi of each slack, any shape; ``sharpness`` is t and ``slope`` is kappa."""
+    edge = 1.0 / (sharpness * slope)
+    inside = torch.log(slack.clamp(min=edge)) / sharpness
+    return inside + slope * (slack - edge).clamp(max=0.0)
+
+
+def slopes(slack: npt.NDArray[np.floating], config: IPOConfig) -> Floats:
+    """The derivatives of the barriers, what they charge for cost: 1 / (t s), or kappa without that slack."""
+    edge = 1.0 / (config.barrier_sharpness * config.barrier_slope)
+    charged = 1.0 / (config.barrier_sharpness * np.maximum(slack, edge))
+    return np.asarray(charged, dtype=np.float64)
+
+
+def relief_of(batch: LearningBatch, costs: Floats, config: IPOConfig) -> Callable[[Tensor], Tensor]:
+    """-L_i, how far the surrogates of costs, [N, j], have fallen, as a function of the ratios, [D] -> [j]."""
+    if config.cost_surrogate == "pessimistic":
+        split = [SignedAdvantages.split(batch, -column) for column in costs.T]
+        return partial(pessimistic_relief, relief=split, clip=config.clip)
+    per_pair = batch.per_pair(-costs)
+    return lambda ratios: surrogate(ratios - 1.0, per_pair)
+
+
+def barrier_surrogate_objective(
+    batch: LearningBatch, rewards: Floats, costs: Floats, violations: Floats, config: IPOConfig
+) -> Callable[[Tensor], tuple[Tensor, float]]:
+    """The module's formula, a function of the ratios, with the sum of the barriers' slopes.
+
+    A minibatch's mean cost advantage is not 0, as that of all samples is; it says nothing about the policy,
+    so surrogates of cost are counted from their value at ratios of 1.
+
+    Args:
+        batch: the samples.
+        rewards: centred advantages, [N].
+        costs: centred advantages of the costs that have a limit, [N, j].
+        violations: c, [j].
+        config: clip, cost_surrogate, t and kappa.
+    """
+    signed = SignedAdvantages.split(batch, rewards)
+    offsets = to_tensor(violations)
+    shape = partial(barrier, sharpness=config.barrier_sharpness, slope=config.barrier_slope)
+    relief = relief_of(batch, costs, config)
+
+    def surrogate_objective(ratios: Tensor) -> tuple[Tensor, float]:
+        slack = relief(ratios) - offsets
+        charged = slopes(slack.detach().numpy(force=True), config)
+        return clipped_surrogate(ratios, signed, config.clip) + shape(slack).sum(), float(charged.sum())
+
+    return surrogate_objective
+
+
+class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
+    """The rule of ``ipo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Climb the surrogate between the barriers, unless nothing is known about the constraints."""
+        config, constraints = self._config, experience.constraints
+        if not constraints.known:
+            return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
+        rewards, costs, violations = experience.in_reward_spreads()
+
+        def objective(part: Experience) -> Objective:
+            return with_prices(barrier_surrogate_objective(part.batch, rewards, costs, violations, config))
+
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
+        multipliers = np.zeros_like(constraints.limits)
+        multipliers[ActiveConstraints.of(constraints).index] = slopes(-violations, config)
+        return {**metrics, **indexed("multiplier", multipliers)}
+
+
+def make_ipo(cmdp: CMDPSpec, config: IPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
+    """A fresh IPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))

@@ -1,0 +1,95 @@
+"""Penalised proximal policy optimisation (Zhang et al. 2022): an exact penalty instead of multipliers.
+
+The policy climbs, in cost per step,
+
+    L_r - kappa sum_i max(0, L_i + c_i),  c_i = (mean episode cost i - limit i) / mean episode length,
+
+with L_r the clipped surrogate of the reward and L_i that of cost i, which is *pessimistic about cost*: the
+mean of max(ratio A_i, clip(ratio) A_i). The penalty is exact: if kappa exceeds every multiplier of the
+constrained problem, both have the same optimum, and nothing has to adapt. All advantages and c are divided by
+the standard deviation of the reward's, so that kappa is in reward per unit of cost, as multipliers are.
+
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
+pairs, k costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recrl.agents.algorithm_configs import P3OConfig
+from recrl.agents.experience import Experience
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
+from recrl.environments.cmdp import CMDPSpec, Floats
+
+
+def penalised_surrogate_objective(
+    batch: LearningBatch,
+    rewards: Floats,
+    costs: Floats,
+    violations: Floats,
+    *,
+    clip: float,
+    factor: float,
+) -> Callable[[Tensor], tuple[Tensor, float]]:
+    """The module's formula, a function of the ratios, with the sum of the penalty factors in force.
+
+    A minibatch's mean cost advantage is not 0, as that of all samples is; it says nothing about the policy,
+    so surrogates of cost are counted from their value at ratios of 1.
+
+    Args:
+        batch: the samples.
+        rewards: centred advantages, [N].
+        costs: centred advantages of the costs that have a limit, [N, j].
+        violations: c, [j].
+        clip: e in (0, 1).
+        factor: kappa.
+    """
+    signed = SignedAdvantages.split(batch, rewards)
+    relief = [SignedAdvantages.split(batch, -column) for column in costs.T]
+    offsets = to_tensor(violations)
+
+    def surrogate_objective(ratios: Tensor) -> tuple[Tensor, float]:
+        excess = torch.relu(offsets - pessimistic_relief(ratios, relief, clip))
+        value = clipped_surrogate(ratios, signed, clip) - factor * excess.sum()
+        return value, factor * float((excess.detach() > 0.0).sum())
+
+    return surrogate_objective
+
+
+class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
+    """The rule of ``p3o``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Climb the penalised surrogate, unless nothing is known about the constraints."""
+        config, constraints = self._config, experience.constraints
+        if not constraints.known:
+            return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
+        rewards, costs, violations = experience.in_reward_spreads()
+
+        def objective(part: Experience) -> Objective:
+            surrogate_objective = penalised_surrogate_objective(
+                part.batch, rewards, costs, violations, clip=config.clip, factor=config.penalty_factor
+            )
+            return with_prices(surrogate_objective)
+
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
+        multipliers = np.where(constraints.gaps > 0.0, config.penalty_factor, 0.0)
+        return {**metrics, **indexed("multiplier", multipliers)}
+
+
+def make_p3o(cmdp: CMDPSpec, config: P3OConfig, seed: np.random.SeedSequence) -> ActorCritic:
+    """A fresh P3O agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy))

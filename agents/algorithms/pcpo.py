@@ -1,0 +1,80 @@
+"""Projection-based constrained policy optimisation (Yang et al. 2020), for any small number of constraints.
+
+First the step that improves the reward, y = -sqrt(2 delta / q) v, then its projection, in the metric H, onto
+the set where the linearised constraints hold (symbols as in ``recrl.agents.trust_region.cpo_dual``):
+
+    minimise (x - y).H (x - y) / 2  subject to  b_i.x + c_i <= 0 for i = 1..k.
+
+The optimum is x = y - sum_i nu_i w_i, where nu >= 0 solves the complementarity problem
+
+    e - S nu <= 0,  nu.(e - S nu) = 0,    e = c - sqrt(2 delta / q) r  (the excesses b_i.y + c_i of y);
+
+for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far from feasible is far from it
+too: the paper bounds the damage, here the step is scaled back into the trust region. Then it is shortened by
+``cpo``'s line search, which the paper leaves out.
+
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, k
+costs, P parameters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recrl.agents.algorithm_configs import PCPOConfig
+from recrl.agents.algorithms.cpo import constrained_step
+from recrl.agents.experience import Experience
+from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.trust_region.cpo_dual import (
+    NO_INFLUENCE,
+    DualSolution,
+    StepCase,
+    StepProblem,
+    projection_weights,
+)
+from recrl.environments.cmdp import CMDPSpec
+
+
+def projected_step(problem: StepProblem) -> DualSolution:
+    """The reward's step, projected and scaled back into the trust region.
+
+    Where the constraints contradict one another, only the one that is violated most is projected on.
+    """
+    squared = problem.squared_gradient
+    reach = float(np.sqrt(2.0 * problem.radius / squared)) if squared > NO_INFLUENCE else 0.0
+    excesses = problem.violations - reach * problem.mixed
+    weights = projection_weights(problem.gram, excesses)
+    if weights is None:
+        spreads = np.sqrt(np.maximum(np.diag(problem.gram), NO_INFLUENCE))
+        worst = int(np.argmax(excesses / spreads))
+        weights = np.zeros_like(excesses)
+        weights[worst] = excesses[worst] / spreads[worst] ** 2
+    length = (
+        reach**2 * squared
+        + 2.0 * reach * float(weights @ problem.mixed)
+        + float(weights @ problem.gram @ weights)
+    )
+    scale = min(1.0, float(np.sqrt(2.0 * problem.radius / max(length, NO_INFLUENCE))))
+    case = StepCase.CONSTRAINED if weights.any() else StepCase.UNCONSTRAINED
+    multipliers = weights / reach if reach > 0.0 else np.full_like(weights, np.nan)
+    return DualSolution(case, scale * reach, scale * weights, multipliers, ())
+
+
+class ProjectionBasedConstrainedPolicyOptimisation:
+    """The rule of ``pcpo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+
+    def __init__(self, config: PCPOConfig) -> None:
+        self._config = config
+        self.parts: dict[str, Stateful] = {}
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Take one projected step, unless nothing is known about the constraints."""
+        return constrained_step(policy, experience, projected_step, self._config, generator)
+
+
+def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
+    """A fresh PCPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))

@@ -1,0 +1,95 @@
+"""PPO on the Lagrangian (Ray et al. 2019, section 5).
+
+Multipliers first answer the gaps; then the policy climbs the penalised surrogate until its steps are done or
+it has moved too far. If no episode finished, nothing is known about the constraints: the multipliers stay.
+
+The objective is (L_r - sum_i p_i L_i) / (1 + sum_i p_i), p the multipliers. ``separate`` clips the reward's
+surrogate only (the paper's agents); ``combined`` clips the surrogate of the penalised advantage
+A_r - sum_i p_i A_i, so that the policy gains nothing from leaving the clip range for a cost's sake either.
+
+Notation: N samples, D unique pairs, k costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from torch import Tensor
+
+from recrl.agents.algorithm_configs import PPOLagConfig
+from recrl.agents.constraints.multipliers import Multipliers
+from recrl.agents.experience import Experience
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.advantages import penalised_advantages
+from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
+from recrl.environments.cmdp import CMDPSpec, Floats
+
+
+def combined_surrogate_objective(
+    batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
+) -> Callable[[Tensor], Tensor]:
+    """The clipped surrogate of the penalised advantages, as a function of the ratios, [D].
+
+    Args:
+        batch: the samples.
+        rewards: standardised advantages, [N].
+        costs: centred advantages, [N, k].
+        multipliers: p, [k].
+        clip: e in (0, 1).
+    """
+    penalised = SignedAdvantages.split(batch, penalised_advantages(rewards, costs, multipliers))
+    return lambda ratios: clipped_surrogate(ratios, penalised, clip)
+
+
+def separate_surrogate_objective(
+    batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
+) -> Callable[[Tensor], Tensor]:
+    """The reward's clipped surrogate minus the multiplied costs' surrogates.
+
+    The arguments are those of ``combined_surrogate_objective``.
+    """
+    weight = 1.0 / (1.0 + float(multipliers.sum()))
+    signed = SignedAdvantages.split(batch, weight * rewards)
+    penalty = batch.per_pair(weight * (costs @ multipliers))
+    return lambda ratios: clipped_surrogate(ratios, signed, clip) - surrogate(ratios, penalty)
+
+
+# By the name that the option ``penalty`` has.
+SURROGATE_OBJECTIVES = {"combined": combined_surrogate_objective, "separate": separate_surrogate_objective}
+
+
+class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
+    """The rule of ``ppo-lag``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+
+    def __init__(self, config: PPOLagConfig, policy: StochasticPolicy, num_costs: int) -> None:
+        super().__init__(config, policy)
+        self._multipliers = Multipliers(config, num_costs)
+        self.parts["multipliers"] = self._multipliers
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Move the multipliers, then the policy."""
+        config = self._config
+        penalty = self._multipliers.update(experience)
+        surrogate_objective_of = SURROGATE_OBJECTIVES[config.penalty]
+
+        def objective(part: Experience) -> Objective:
+            surrogate_objective = surrogate_objective_of(
+                part.batch, penalty.rewards, penalty.costs, penalty.multipliers, config.clip
+            )
+            return with_entropy(surrogate_objective, part.batch, config.entropy_bonus)
+
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
+        return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
+
+
+def make_ppo_lag(cmdp: CMDPSpec, config: PPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
+    """A fresh PPO-Lagrangian agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: PPOLagrangian(config, policy, cmdp.num_costs))

@@ -1,0 +1,52 @@
+"""TRPO on the Lagrangian (Ray et al. 2019, section 5).
+
+Multipliers first answer the gaps; then the policy takes one trust-region step up the surrogate of
+(A_r - sum_i p_i A_i) / (1 + sum_i p_i), p the multipliers. If no episode finished, the multipliers stay.
+
+At a saddle of the Lagrangian that surrogate has no gradient, but a step that always reaches the edge of the
+trust region is as long there as anywhere, and the policy swings about the limit for ever. So, ours, a nat of
+KL must be worth ``kl_price`` in that surrogate, and steps end with the gain.
+
+Notation: N samples, k costs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recrl.agents.algorithm_configs import TRPOLagConfig
+from recrl.agents.algorithms.trpo import step_up
+from recrl.agents.constraints.multipliers import Multipliers
+from recrl.agents.experience import Experience
+from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.environments.cmdp import CMDPSpec
+
+
+class TRPOLagrangian:
+    """The rule of ``trpo-lag``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+
+    def __init__(self, config: TRPOLagConfig, num_costs: int) -> None:
+        self._config = config
+        self._multipliers = Multipliers(config, num_costs)
+        self.parts: dict[str, Stateful] = {"multipliers": self._multipliers}
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Move the multipliers, then the policy."""
+        penalty = self._multipliers.update(experience)
+        metrics = step_up(
+            policy,
+            experience,
+            penalty.advantages,
+            self._config,
+            generator,
+            kl_price=self._config.kl_price,
+        )
+        return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
+
+
+def make_trpo_lag(cmdp: CMDPSpec, config: TRPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
+    """A fresh TRPO-Lagrangian agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: TRPOLagrangian(config, cmdp.num_costs))

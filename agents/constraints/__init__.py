@@ -1,0 +1,1 @@
+"""How an agent measures its constraints and moves its Lagrange multipliers."""

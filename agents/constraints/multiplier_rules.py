@@ -1,0 +1,180 @@
+"""Rules that move Lagrange multipliers, each a pure function on a small state.
+
+A constrained learner maximises J_r - sum_i lambda_i (J_i - d_i) over the policy and minimises it over
+lambda >= 0. A rule takes the *gaps* J_i - d_i (mean undiscounted episode cost minus limit, positive where
+the constraint is violated) and returns the next state. A dimension whose limit is infinite is no
+constraint: its multiplier is 0 and the rest of its state stands still.
+
+A state is a dict of float64 arrays [k], so that a checkpoint can hold it as it is; ``multipliers`` is in
+each. Notation: k costs.
+
+Which to use: ``projected_ascent`` alone is an integrator, and so it swings about the limit; the proportional
+term of ``pid`` damps it. Neither winds down below 0 nor remembers old violations, so both answer at once when
+the limit moves. ``softplus_adam`` winds down and remembers; it is kept because the paper's agents use it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from recrl.agents.learning.scales import quotient
+from recrl.environments.cmdp import Floats
+
+MultiplierState = Mapping[str, Floats]
+
+ADAM_BETAS = (0.9, 0.999)
+ADAM_EPSILON = 1e-8
+LARGEST_RELATIVE_GAP = 10.0
+
+
+def start_projected_ascent(num_costs: int, initial: float) -> dict[str, Floats]:
+    """All multipliers at ``initial``, at least 0."""
+    return {"multipliers": np.full(num_costs, initial)}
+
+
+def projected_ascent(
+    state: MultiplierState, gaps: Floats, *, step_size: float | Floats, maximum: float
+) -> dict[str, Floats]:
+    """Projected dual ascent: lambda <- clip(lambda + step_size (J - d), 0, maximum).
+
+    Args:
+        state: ``multipliers``.
+        gaps: J - d, [k]; -inf where there is no constraint.
+        step_size: multiplier units per unit of episode cost, above 0, one number or [k].
+        maximum: the largest multiplier, possibly infinite.
+    """
+    return {"multipliers": np.clip(state["multipliers"] + step_size * gaps, 0.0, maximum)}
+
+
+def start_softplus_adam(num_costs: int, initial: float) -> dict[str, Floats]:
+    """All multipliers at ``initial``, above 0: theta = log(e^initial - 1)."""
+    zeros = np.zeros(num_costs)
+    return {
+        "multipliers": np.full(num_costs, initial),
+        "theta": np.full(num_costs, np.log(np.expm1(initial))),
+        "first_moment": zeros,
+        "second_moment": zeros,
+        "steps": zeros,
+    }
+
+
+def softplus_adam(state: MultiplierState, gaps: Floats, *, learning_rate: float) -> dict[str, Floats]:
+    """Softplus with Adam: lambda = softplus(theta), Adam on the loss -theta (J - d) (safety-starter-agents).
+
+    Its second moment remembers early violations for a thousand updates, and theta falls without bound while
+    the constraint holds, so it answers a moving limit late.
+
+    Args:
+        state: ``multipliers``, ``theta``, ``first_moment``, ``second_moment``, ``steps``.
+        gaps: J - d, [k]; -inf where there is no constraint.
+        learning_rate: Adam's, above 0.
+    """
+    active = np.isfinite(gaps)
+    gradient = np.where(active, -gaps, 0.0)
+    steps = state["steps"] + active
+    first = np.where(
+        active, ADAM_BETAS[0] * state["first_moment"] + (1 - ADAM_BETAS[0]) * gradient, state["first_moment"]
+    )
+    second = np.where(
+        active,
+        ADAM_BETAS[1] * state["second_moment"] + (1 - ADAM_BETAS[1]) * gradient**2,
+        state["second_moment"],
+    )
+    count = np.maximum(steps, 1.0)
+    direction = (first / (1 - ADAM_BETAS[0] ** count)) / (
+        np.sqrt(second / (1 - ADAM_BETAS[1] ** count)) + ADAM_EPSILON
+    )
+    theta = np.where(active, state["theta"] - learning_rate * direction, state["theta"])
+    return {
+        "multipliers": np.where(active, np.logaddexp(0.0, theta), 0.0),
+        "theta": theta,
+        "first_moment": first,
+        "second_moment": second,
+        "steps": steps,
+    }
+
+
+def start_pid(num_costs: int, initial: float) -> dict[str, Floats]:
+    """All multipliers and integrals at ``initial``, at least 0; no gap seen yet."""
+    return {
+        "multipliers": np.full(num_costs, initial),
+        "integral": np.full(num_costs, initial),
+        "last_gap": np.full(num_costs, np.nan),
+    }
+
+
+def pid(
+    state: MultiplierState,
+    gaps: Floats,
+    *,
+    largest: float | Floats,
+    proportional: float | Floats,
+    integral: float | Floats,
+    derivative: float | Floats,
+    maximum: float,
+) -> dict[str, Floats]:
+    """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
+
+    I <- clip(I + K_I min(gap, largest), 0, maximum);
+    lambda = clip(K_P gap + I + K_D max(0, gap - last gap), 0, maximum).
+
+    The derivative acts only on growing violations, as in the source. The integral is held within what the
+    multiplier itself can be, so that neither a long satisfied nor a long hopeless constraint winds it up; it
+    includes its gain, so that a changed K_I does not make lambda jump.
+
+    The gap that is summed up is bounded, too. An episode costs at least 0, so it is never further than d
+    below the limit, but an untrained policy may be any distance above it: what ten updates of a cost of 50
+    sum up under a limit of 1, no 400 later ones can take back. So a violation counts no more than the best
+    that can undo it.
+
+    Args:
+        state: ``multipliers``, ``integral``, ``last_gap``.
+        gaps: J - d in any unit, [k]; -inf where there is no constraint.
+        largest: the largest violation that is summed up, in that unit, one number or [k].
+        proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k]; so are the
+            next two.
+        integral: K_I.
+        derivative: K_D.
+        maximum: the largest multiplier, possibly infinite.
+    """
+    active = np.isfinite(gaps)
+    gap = np.where(active, gaps, 0.0)
+    rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
+    summed = np.clip(state["integral"] + integral * np.minimum(gap, largest), 0.0, maximum)
+    output = np.clip(proportional * gap + summed + derivative * rise, 0.0, maximum)
+    return {
+        "multipliers": np.where(active, output, 0.0),
+        "integral": np.where(active, summed, state["integral"]),
+        "last_gap": np.where(active, gap, np.nan),
+    }
+
+
+def relative_gaps(gaps: Floats, limits: Floats, standard_errors: Floats) -> Floats:
+    """Divide gaps by what they are large or small against: (J - d) / sqrt(d^2 + s^2), [k].
+
+    A gap of 1 is nothing under a limit of 25, and everything under one of 1; and a gap of one standard error
+    s says little, however small the limit. The result has no unit, is at least -1, and is cut off at 10,
+    which matters where both d and s are 0.
+
+    Args:
+        gaps: J - d, [k]; -inf where there is no constraint.
+        limits: d, [k], possibly infinite.
+        standard_errors: s, of J, [k], at least 0.
+
+    >>> relative_gaps(np.array([10.0, -4.0, 2.0]), np.array([4.0, 4.0, 0.0]), np.array([3.0, 3.0, 0.0]))
+    array([ 2. , -0.8, 10. ])
+    """
+    active = np.isfinite(gaps)
+    sizes = np.hypot(np.where(active, limits, 1.0), standard_errors)
+    floors = np.maximum(sizes, np.abs(np.where(active, gaps, 0.0)) / LARGEST_RELATIVE_GAP)
+    return np.where(active, quotient(np.where(active, gaps, 0.0), floors), -np.inf)
+
+
+# How each rule begins, by the name that an agent's options use.
+STARTS: dict[str, Callable[[int, float], dict[str, Floats]]] = {
+    "projected": start_projected_ascent,
+    "softplus-adam": start_softplus_adam,
+    "pid": start_pid,
+}

@@ -1,0 +1,128 @@
+"""The Lagrange multipliers of an agent: a rule of ``constraints.multiplier_rules``, its state, and its units.
+
+An update first moves the multipliers by the violations, then gives the advantages of reward and costs in
+units in which the multipliers apply: the agent climbs A_r - sum_i mu_i A_i.
+
+``multiplier_unit: relative`` knows no unit of the task. Violations are relative (``relative_gaps``). A
+multiplier mu_i is counted in u_i = spread of the reward's advantages / spread of cost i's advantages, each a
+running root mean square over all updates; the CMDP's own, in reward per unit of cost, is lambda_i = mu_i u_i.
+``cost`` is the paper's: violations in episode cost, standardised reward advantages, raw cost advantages.
+
+If no episode finished, nothing is known about the constraints and the multipliers stay. A cost whose limit is
+infinite has the multiplier 0.
+
+Notation: N samples, k costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from recrl.agents.config import LagrangianConfig
+from recrl.agents.constraints.multiplier_rules import (
+    STARTS,
+    MultiplierState,
+    pid,
+    projected_ascent,
+    relative_gaps,
+    softplus_adam,
+)
+from recrl.agents.experience import Constraints, Experience
+from recrl.agents.learning.advantages import penalised_advantages, reward_spread
+from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.environments.cmdp import Floats
+
+# (state, gaps in the rule's unit [k]) -> the next state
+MultiplierRule = Callable[[MultiplierState, Floats], MultiplierState]
+
+
+@dataclass(frozen=True, eq=False)
+class Penalty:
+    """Advantages and multipliers in one unit.
+
+    Attributes:
+        rewards: centred advantages in their standard deviations, [N].
+        costs: centred advantages in the multipliers' unit, [N, k].
+        multipliers: mu, [k], at least 0.
+        task_multipliers: lambda, the multipliers as they are reported, [k].
+    """
+
+    rewards: Floats
+    costs: Floats
+    multipliers: Floats
+    task_multipliers: Floats
+
+    @property
+    def advantages(self) -> Floats:
+        """Those of the Lagrangian, (A_r - sum_i mu_i A_i) / (1 + sum_i mu_i), [N]."""
+        return penalised_advantages(self.rewards, self.costs, self.multipliers)
+
+
+class Multipliers:
+    """One multiplier a cost, moved by the rule that the options name.
+
+    Args:
+        config: the rule, its gains and its unit.
+        num_costs: k.
+    """
+
+    def __init__(self, config: LagrangianConfig, num_costs: int) -> None:
+        self._state: MultiplierState = STARTS[config.multiplier_rule](num_costs, config.multiplier_initial)
+        self._is_relative = config.multiplier_unit == "relative"
+        self._step = multiplier_step(config)
+        self._spreads = RunningScale(1 + num_costs)
+
+    def update(self, experience: Experience) -> Penalty:
+        """Move with the violations, unless they are unknown, and price the advantages."""
+        multipliers = self.move(experience.constraints)
+        centred = experience.advantages - experience.advantages.mean(axis=0)
+        spread = reward_spread(centred)
+        rewards, costs = centred[:, 0] / spread, centred[:, 1:]
+        if not self._is_relative:
+            return Penalty(rewards, costs, multipliers, multipliers)
+        self._spreads.add((centred**2).mean(axis=0))
+        exchange = quotient(self._spreads.values[:1], self._spreads.values[1:])
+        return Penalty(rewards, costs * (exchange / spread), multipliers, multipliers * exchange)
+
+    def move(self, constraints: Constraints) -> Floats:
+        """Move with the violations, unless they are unknown; return the multipliers in force, mu, [k]."""
+        if constraints.known:
+            gaps = constraints.gaps
+            if self._is_relative:
+                gaps = relative_gaps(gaps, constraints.limits, constraints.standard_errors)
+            self._state = self._step(self._state, gaps)
+        return np.where(np.isfinite(constraints.limits), self._state["multipliers"], 0.0)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The rule's state and the advantages' spreads."""
+        return {
+            "multipliers": {key: values.copy() for key, values in self._state.items()},
+            "spreads": self._spreads.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._state = {key: np.array(values, np.float64) for key, values in state["multipliers"].items()}
+        self._spreads.load_state_dict(state["spreads"])
+
+
+def multiplier_step(config: LagrangianConfig) -> MultiplierRule:
+    """The multiplier rule that the options name, as a function of state and gaps."""
+    step, maximum = config.multiplier_step, config.multiplier_maximum
+    if config.multiplier_rule == "softplus-adam":
+        return lambda state, gaps: softplus_adam(state, gaps, learning_rate=step)
+    if config.multiplier_rule == "projected":
+        return lambda state, gaps: projected_ascent(state, gaps, step_size=step, maximum=maximum)
+    return lambda state, gaps: pid(
+        state,
+        gaps,
+        largest=1.0 if config.multiplier_unit == "relative" else np.inf,
+        proportional=config.multiplier_proportional,
+        integral=step,
+        derivative=config.multiplier_derivative,
+        maximum=maximum,
+    )

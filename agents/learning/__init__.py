@@ -1,0 +1,1 @@
+"""What all algorithms share: actor and critics, networks, policies, advantages, batches, surrogates."""

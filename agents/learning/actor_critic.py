@@ -1,0 +1,422 @@
+"""What all agents here have in common: a policy, 1 + k critics, and the walk of an update.
+
+An agent is an ``ActorCritic`` with a *rule* that improves the policy; PPO-Lagrangian and CPO are rules. An
+update collapses the rollout, estimates advantages, lets the rule improve the policy, and fits the critics.
+
+An agent lives on the device that was PyTorch's default one when it was made (``with torch.device("cuda")``):
+there it learns, with equal initial parameters on all. Rollouts come, and actions go, as NumPy arrays.
+
+Notation: T steps, B environments, N = T B samples, k costs, C = 1 + k signals, U unique observations, M
+truncated steps, E finished episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from recrl.agents.agent import Rollout
+from recrl.agents.config import ActorCriticConfig
+from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, TailCost
+from recrl.agents.encoding import Encoder
+from recrl.agents.errors import require_finite
+from recrl.agents.experience import Constraints, Experience
+from recrl.agents.learning.advantages import generalised_advantages, next_values
+from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.distributions import mean_divergence
+from recrl.agents.learning.networks import INITIALISERS, Adam, Critics, NetworkForm
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.agents.learning.surrogates import surrogate
+from recrl.agents.spaces import observation_size
+from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
+
+
+class Stateful(Protocol):
+    """Something that is saved and restored with an agent."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All it has learnt and adapted: a tree of dicts, lists, JSON scalars and NumPy arrays."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        ...
+
+
+class PolicyRule(Protocol):
+    """How an agent's policy gets better: what tells the algorithms apart."""
+
+    @property
+    def parts(self) -> Mapping[str, Stateful]:
+        """What the rule keeps from one update to the next, by name."""
+        ...
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Change the policy once.
+
+        Args:
+            policy: the one that collected the samples; changed in place.
+            experience: the samples, raw advantages, and how the constraints stand.
+            generator: the agent's own randomness.
+
+        Returns:
+            Metrics, the same keys every time: ``policy_steps``, ``multiplier_i``, and the rule's own.
+        """
+        ...
+
+
+def indexed(name: str, values: npt.NDArray[np.floating]) -> dict[str, float]:
+    """One metric a cost, [k]: ``name_0``, ``name_1``, ...; infinite values are NaN, as metrics must be."""
+    return {
+        f"{name}_{i}": float(value) if np.isfinite(value) else float("nan") for i, value in enumerate(values)
+    }
+
+
+def improve_and_measure(
+    rule: PolicyRule, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+) -> dict[str, float]:
+    """Let a rule improve the policy; its metrics, and how far the policy has come.
+
+    Returns:
+        The rule's metrics; ``kl``, the mean KL from the old policy in nats; the mean ``entropy``; and
+        ``surrogate_reward`` and ``surrogate_cost_i``, the gains to first order in the advantages' unit.
+    """
+    metrics = rule.improve(policy, experience, generator)
+    batch, advantages = experience.batch, experience.advantages
+    new = policy.distribution(batch.unique_observations)
+    centred = batch.per_pair(advantages - advantages.mean(axis=0))
+    gains = surrogate(experience.ratios(new), centred).numpy(force=True)
+    return {
+        **metrics,
+        "kl": float(mean_divergence(experience.old, new, batch.observation_weights)),
+        "entropy": float(torch.dot(batch.observation_weights, new.entropy())),
+        "surrogate_reward": float(gains[0]),
+        **indexed("surrogate_cost", gains[1:]),
+    }
+
+
+class ActorCritic:
+    """An agent; see ``recrl.agents.agent.Agent`` for what its methods promise.
+
+    Args:
+        cmdp: what the task fixes.
+        config: the settings that agents share.
+        encoder: of the observations that policy and critics see.
+        policy: of the encoded observations and the task's actions.
+        critics: of the reward and the k costs.
+        rule: improves the policy.
+        generator: of the minibatches.
+    """
+
+    learns_rewarded_entropy: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        cmdp: CMDPSpec,
+        config: ActorCriticConfig,
+        *,
+        encoder: Encoder,
+        policy: StochasticPolicy,
+        critics: Critics,
+        rule: PolicyRule,
+        generator: np.random.Generator,
+    ) -> None:
+        self._cmdp = cmdp
+        self._config = config
+        self._encoder = encoder
+        self._policy = policy
+        self._critics = critics
+        self._critic_optimiser = Adam(critics.parameters, config.critic_learning_rate)
+        self._value_scale = RunningScale(1 + cmdp.num_costs)
+        self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
+        self._rule = rule
+        self._generator = generator
+        self._form = (
+            TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
+        )
+        self._parts: dict[str, Stateful] = {
+            "encoder": self._encoder,
+            "critic_optimiser": self._critic_optimiser,
+            "value_scale": self._value_scale,
+            "recent_episodes": self._recent,
+            "constraint": self._form,
+            **rule.parts,
+        }
+
+    def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
+        """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        return self._policy.sample(self._encoder(observations), generator)
+
+    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """What ``act`` inverts at B observations [B, n], float64 [B, A]; for Discrete actions only."""
+        return self._policy.cumulative_masses(self._encoder(observations))
+
+    def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
+        """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        return self._policy.mode(self._encoder(observations))
+
+    def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
+        return self._policy.probabilities(self._encoder(observations))
+
+    def update(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
+        """Improve the policy by the rule, then fit the critics to the rollout.
+
+        Raises:
+            DivergedError: a reward, a loss or a parameter is not finite.
+        """
+        with self._on_its_device():
+            metrics = self._learn(rollout, episode_costs, step)
+        self._policy.publish()
+        require_finite("policy parameters", self._policy.parameters.to_numpy())
+        require_finite("critic parameters", self._critics.parameters.to_numpy())
+        return metrics
+
+    def _learn(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
+        config, limits = self._config, step.limits.array
+        observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
+        actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
+        batch = LearningBatch.deduplicate(
+            self._encoder(observations),
+            actions,
+            compact=config.compaction,
+            most_observations=config.minibatch_size,
+        )
+        recent_costs, lengths = self._recent.add(episode_costs, rollout.finished_lengths())
+        costs, constrained = self._form.constraint_costs(rollout, recent_costs, limits)
+        estimates = self._estimate(rollout, costs, batch)
+        advantages = estimates.advantages
+        constraints = Constraints.measure(recent_costs, lengths, constrained, limits)
+        experience = Experience.of(self._policy, batch, advantages, constraints)
+        if step.entropy_coefficient:
+            experience = experience.with_entropy(step.entropy_coefficient)
+        metrics = {
+            **improve_and_measure(self._rule, self._policy, experience, self._generator),
+            **indexed("cost_gap", constraints.gaps),
+            **indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0)),  # eps of Lemma 1
+            **estimates.explained_variances(),
+            **self._fit_critics(batch, estimates.targets),
+        }
+        self._encoder.learn(observations)
+        return metrics
+
+    def _estimate(self, rollout: Rollout, costs: Floats, batch: LearningBatch) -> Estimates:
+        """Estimate advantages and value targets of the reward and the costs, [T, B, k]."""
+        config = self._config
+        signals = np.concatenate([rollout.rewards[..., None], costs], axis=2)
+        require_finite("rewards and costs", signals)
+        ended = rollout.terminated | rollout.truncated
+        if config.value_scale == "running" and not self._value_scale.is_known:
+            zeros = np.zeros_like(signals)
+            first_returns = generalised_advantages(
+                signals,
+                zeros,
+                zeros,
+                ended=ended,
+                discount=config.discount,
+                trace_decays=np.ones(signals.shape[2]),
+            )
+            self._value_scale.add((first_returns**2).mean(axis=(0, 1)))
+        values = batch.per_sample(self._values(batch.unique_observations)).reshape(signals.shape)
+        beyond = np.concatenate([rollout.final_observations, rollout.last_observations])
+        beyond_values = self._values(torch.as_tensor(self._encoder(beyond)))
+        num_final = len(rollout.final_observations)
+        following = next_values(
+            values,
+            terminated=rollout.terminated,
+            truncated=rollout.truncated,
+            final_values=beyond_values[:num_final],
+            last_values=beyond_values[num_final:],
+        )
+        decays = np.array(
+            [config.reward_trace_decay] + [config.cost_trace_decay] * self._cmdp.num_costs, dtype=np.float64
+        )
+        advantages = generalised_advantages(
+            signals, values, following, ended=ended, discount=config.discount, trace_decays=decays
+        )
+        returns = values + generalised_advantages(
+            signals,
+            values,
+            following,
+            ended=ended,
+            discount=config.discount,
+            trace_decays=np.ones_like(decays),
+        )
+        targets = advantages + values if config.value_target == "lambda-return" else returns
+        flat = (-1, signals.shape[2])
+        return Estimates(
+            advantages.reshape(flat), targets.reshape(flat), values.reshape(flat), returns.reshape(flat)
+        )
+
+    def _values(self, rows: Tensor) -> Floats:
+        """The values of every row in the task's units, [U, n] -> [U, C]."""
+        values = self._critics.values(rows)
+        return values * self._value_scale.values if self._config.value_scale == "running" else values
+
+    def _scaled(self, targets: Floats) -> tuple[Floats, Floats]:
+        """Include the targets, [N, C], in their running scale; return them in it, and the scale, [C].
+
+        The critics' last layers change by as much as the scale, so that the values stay what they are.
+        """
+        if self._config.value_scale == "none":
+            return targets, np.ones(targets.shape[1])
+        before = self._value_scale.values
+        self._value_scale.add((targets**2).mean(axis=0))
+        scale = self._value_scale.values
+        self._critics.rescale(np.where(before > 0.0, quotient(before, scale), 1.0))
+        return quotient(targets, scale), scale
+
+    def _fit_critics(self, batch: LearningBatch, targets: Floats) -> dict[str, float]:
+        """Regress all critics on their targets, [N, C]; they share no parameter, so one loss serves all.
+
+        They take ``critic_steps`` steps, or as many as ``critic_passes`` passes over the samples need,
+        whichever is more.
+
+        Returns:
+            The mean squared errors over the last pass, each sample's before the step that it was part of.
+        """
+        config = self._config
+        targets, scale = self._scaled(targets)
+        num_parts = batch.num_parts(config.minibatch_size)
+        steps = max(config.critic_steps, config.critic_passes * num_parts)
+        regression_on = lru_cache(maxsize=1)(lambda part: row_targets(part, targets))
+        losses = []
+        for part in islice(batch.parts(config.minibatch_size, self._generator), steps):
+            means, spread = regression_on(part)
+            losses.append(
+                self._critics.differentiate(part.unique_observations, part.observation_weights, means)
+                + spread
+            )
+            self._critic_optimiser.step()
+        mean = torch.stack(losses[-num_parts:]).mean(dim=0).numpy(force=True) * scale**2
+        require_finite("value losses", mean)
+        return {"value_loss_reward": float(mean[0])} | indexed("value_loss_cost", mean[1:])
+
+    def add_noise(self, noise: float, observations: npt.NDArray[np.float32]) -> dict[str, float]:
+        """Make the policy more random once; see ``recrl.agents.learning.noise``."""
+        with self._on_its_device():
+            metrics = self._policy.add_noise(noise, self._encoder(observations), self._config.noise_form)
+        self._policy.publish()
+        require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
+        return metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """Parameters, generator, and the state of every part."""
+        return {
+            "policy": self._policy.parameters.to_numpy(),
+            "critics": self._critics.parameters.to_numpy(),
+            "generator": self._generator.bit_generator.state,
+            **{name: part.state_dict() for name, part in self._parts.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._policy.parameters.load(state["policy"])
+        self._policy.publish()
+        self._critics.parameters.load(state["critics"])
+        self._generator.bit_generator.state = state["generator"]
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+
+    def _on_its_device(self) -> AbstractContextManager[Any]:
+        """New tensors are where the parameters are; on a CPU they are anyway, and asking costs time."""
+        device = self._policy.parameters.values.device
+        return nullcontext() if device.type == "cpu" else device
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What a rollout says about the signals, all [N, C].
+
+    Attributes:
+        advantages: generalised advantage estimates.
+        targets: what the critics learn.
+        values: what the critics said before they saw the rollout.
+        returns: discounted sums of the signals up to the episode's or the rollout's end, where the last value
+            stands for the rest.
+    """
+
+    advantages: Floats
+    targets: Floats
+    values: Floats
+    returns: Floats
+
+    def explained_variances(self) -> dict[str, float]:
+        """The critics' explained variance of fresh returns, 1 - Var(returns - values) / Var(returns).
+
+        1 is perfect, 0 is no better than a constant, NaN where all returns are equal. The last value in the
+        returns is the critics' own, which flatters them a little.
+        """
+        spread = self.returns.var(axis=0)
+        unexplained = (self.returns - self.values).var(axis=0)
+        shares = np.where(spread > 0.0, 1.0 - quotient(unexplained, spread), np.nan)
+        return {"explained_variance_reward": float(shares[0])} | indexed(
+            "explained_variance_cost", shares[1:]
+        )
+
+
+def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
+    """What to regress on at each row so that the mean squared error over the samples is minimal.
+
+    The mean squared error over samples is that about the mean target of each row, weighted by the
+    row's share of the samples, plus the targets' spread about those means, which no critic can lower.
+
+    Args:
+        batch: the samples.
+        targets: of all samples of the rollout, [N, C].
+
+    Returns:
+        The mean targets, [C, U], and the spread, [C].
+    """
+    sums = batch.per_observation(targets)
+    shares = batch.observation_weights.numpy(force=True).astype(np.float64)[:, None]
+    spread = np.mean(batch.own(targets) ** 2, axis=0) - np.sum(sums**2 / shares, axis=0)
+    return to_tensor((sums / shares).T.copy()), to_tensor(np.maximum(spread, 0.0))
+
+
+def fresh_agent(
+    cmdp: CMDPSpec,
+    config: ActorCriticConfig,
+    seed: np.random.SeedSequence,
+    make_rule: Callable[[StochasticPolicy], PolicyRule],
+) -> ActorCritic:
+    """An agent before its first update; the same seed gives all with the same networks the same policy.
+
+    Args:
+        cmdp: what the task fixes.
+        config: the agent's settings.
+        seed: of the initial parameters and of the order of minibatches.
+        make_rule: the agent's rule for a policy.
+    """
+    generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
+    encoder = Encoder(
+        observation_size(cmdp.observation_space),
+        cmdp.components,
+        scales=config.proximity_scales if config.encoder == "proximity" else (),
+        normalise=config.normalise_observations,
+    )
+    form = NetworkForm(config.hidden_sizes, INITIALISERS[config.initialisation])
+    policy = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
+    critics = Critics(encoder.size, cmdp.num_costs, form, generator)
+    order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))
+    return ActorCritic(
+        cmdp,
+        config,
+        encoder=encoder,
+        policy=policy,
+        critics=critics,
+        rule=make_rule(policy),
+        generator=np.random.default_rng(order),
+    )

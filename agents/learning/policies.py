@@ -1,0 +1,317 @@
+"""Stochastic policies: a tanh network with a categorical or a diagonal Gaussian head.
+
+Acting is plain NumPy, on a CPU on the parameters' own memory: at 16 observations, PyTorch's overhead would
+cost more than the arithmetic. Learning is PyTorch. The probabilities that learning compares with are computed
+by PyTorch too, at the start of an update, so that the ratio of an unchanged policy is exactly 1.
+
+Notation: U rows, B observations, n observation components, A actions, m action components, P parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+from weakref import ref
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium.spaces import Box, Discrete
+from torch import Tensor
+
+from recrl.agents.learning.batch import find_repeated
+from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
+from recrl.agents.learning.networks import FlatParameters, NetworkForm, Scratch, TanhStack, blocks
+from recrl.agents.learning.noise import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.spaces import action_size
+from recrl.environments.cmdp import Floats
+
+# safety-starter-agents' and the usual start of a Gaussian policy's spread.
+INITIAL_LOG_STD = -0.5
+# Noise 1 would make a tempered Gaussian infinitely wide; it becomes a thousand times wider.
+SMALLEST_TEMPERING = 1e-3
+
+
+class StochasticPolicy:
+    """pi(a | s); categorical for Discrete actions, diagonal Gaussian for Box.
+
+    The Gaussian's log_std does not depend on the state; it is the last m of the parameters.
+
+    Args:
+        num_observations: n.
+        action_space: of one environment.
+        form: of the network.
+        last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
+        generator: the initialisation's randomness.
+
+    Attributes:
+        parameters: all of them, in one block.
+        stack: the network.
+    """
+
+    def __init__(
+        self,
+        num_observations: int,
+        action_space: gymnasium.Space[Any],
+        form: NetworkForm,
+        last_scale: float,
+        generator: torch.Generator,
+    ) -> None:
+        num_outputs = action_size(action_space)
+        sizes = (num_observations, *form.hidden_sizes, num_outputs)
+        shapes = TanhStack.shapes(1, sizes)
+        self._is_categorical = isinstance(action_space, Discrete)
+        if not self._is_categorical:
+            shapes.append((num_outputs,))
+        self.parameters = FlatParameters(shapes)
+        self.stack = TanhStack(self.parameters, len(sizes) - 1)
+        self.stack.initialise(form.initialiser, last_scale, generator)
+        if isinstance(action_space, Box):
+            self.log_std.fill_(INITIAL_LOG_STD)
+            half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
+            self._half_ranges = np.where(np.isfinite(half), half, 1.0)
+        self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
+        acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
+        layers = [layer[0] for layer in acting[: len(self.stack.layers)]]
+        self._weights = [layer[:-1] for layer in layers]
+        self._biases = [layer[-1] for layer in layers]
+        self._acting_log_std = acting[-1]
+        self._scratch: list[Scratch] = []
+        self._latest: _Latest | None = None
+
+    def publish(self) -> None:
+        """Let acting know of changed parameters; on a CPU it always does."""
+        self._acting.copy_(self.parameters.values)
+
+    @property
+    def log_std(self) -> Tensor:
+        """The Gaussian's log standard deviations, [m]."""
+        return self.parameters.tensors[-1]
+
+    def outputs(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Logits or means of B observations, [B, n] -> [B, A] or [B, m]; no autograd."""
+        hidden = observations
+        for weight, bias in zip(self._weights[:-1], self._biases[:-1], strict=True):
+            hidden = hidden @ weight
+            hidden += bias
+            np.tanh(hidden, out=hidden)
+        outputs: npt.NDArray[np.float32] = hidden @ self._weights[-1] + self._biases[-1]
+        return outputs
+
+    def sample(
+        self, observations: npt.NDArray[np.float32], generator: np.random.Generator
+    ) -> npt.NDArray[Any]:
+        """Draw actions for B observations [B, n]: int64 [B] by inversion, or float32 [B, m]."""
+        outputs = self.outputs(observations)
+        if not self._is_categorical:
+            spread = np.exp(self._acting_log_std)
+            outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
+            return outputs
+        cumulative = _cumulative(outputs)
+        thresholds = generator.random(len(outputs)) * cumulative[:, -1]
+        # A threshold may round up to the whole mass, so the last action is what is left.
+        actions: npt.NDArray[np.int64] = (cumulative[:, :-1] <= thresholds[:, None]).sum(axis=1)
+        return actions
+
+    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """What ``sample`` inverts: cumulative masses, not normalised, of B observations, float64 [B, A].
+
+        Raises:
+            ValueError: actions are continuous.
+        """
+        if not self._is_categorical:
+            raise ValueError("continuous actions have densities, not probabilities")
+        return _cumulative(self.outputs(observations))
+
+    def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
+        """The most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
+        outputs = self.outputs(observations)
+        return outputs.argmax(axis=1) if self._is_categorical else outputs
+
+    def probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """pi(a | s) at B observations [B, n], float64 [B, A].
+
+        Raises:
+            ValueError: actions are continuous.
+        """
+        if not self._is_categorical:
+            raise ValueError("continuous actions have densities, not probabilities")
+        outputs = self.outputs(observations).astype(np.float64)
+        masses = np.exp(outputs - outputs.max(axis=1, keepdims=True))
+        probabilities: Floats = masses / masses.sum(axis=1, keepdims=True)
+        return probabilities
+
+    def distribution(self, rows: Tensor) -> Distribution:
+        """The action distributions at U rows, [U, n]; not differentiable, see ``evaluate``.
+
+        Asked again for the same rows at the same parameters, it gives what it gave: what a line search has
+        accepted is not evaluated anew to be measured.
+        """
+        latest = self._latest
+        if latest is None or not latest.is_of(rows, self.parameters.values):
+            kept = self.log_std.clone()  # the policy will move
+            distribution = self.head(self.stack.outputs(rows)[0], kept)
+            self._latest = latest = _Latest(ref(rows), self.parameters.values.clone(), distribution)
+        return latest.distribution
+
+    def evaluate(self, rows: Tensor) -> PolicyEvaluation:
+        """The action distributions at U rows, [U, n], of which a loss can be differentiated."""
+        pieces = blocks(len(rows))
+        self._scratch += [Scratch() for _ in pieces[len(self._scratch) :]]
+        activations = [
+            self.stack.activations(rows[block], scratch)
+            for block, scratch in zip(pieces, self._scratch, strict=False)
+        ]
+        outputs = (
+            activations[0][-1][0] if len(pieces) == 1 else torch.cat([each[-1][0] for each in activations])
+        )
+        outputs.requires_grad_()
+        leaves = [outputs]
+        if not self._is_categorical:
+            leaves.append(self.log_std.clone().requires_grad_())
+        return PolicyEvaluation(self, activations, leaves, self.head(outputs, leaves[-1]))
+
+    def head(self, outputs: Tensor, log_std: Tensor) -> Distribution:
+        """The distributions that outputs, [U, A] or [U, m], stand for; only a Gaussian has a log_std."""
+        if self._is_categorical:
+            return Categorical(torch.log_softmax(outputs, dim=1))
+        return Gaussian(outputs, log_std)
+
+    def add_noise(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
+        """Make the policy more random, once; ``recrl.agents.learning.noise`` says how.
+
+        Args:
+            noise: eps_pi in (0, 1].
+            observations: where its randomness is measured, [N, n].
+            form: ``match-mixture`` or ``temperature``.
+
+        Returns:
+            ``noise_scale``, the factor on the last layer (categorical) or on the mean standard deviation
+            (Gaussian), and ``randomness_before`` and ``_after``, the mean off-greedy mass or the mean
+            standard deviation.
+        """
+        if self._is_categorical:
+            return self._soften(noise, observations, form)
+        return self._widen(noise, form)
+
+    def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
+        distinct = find_repeated(observations)
+        weights = np.full(len(observations), 1.0 / len(observations))
+        if distinct is not None:  # on a tabular task a sixteenth of them
+            first, row = distinct
+            observations, weights = observations[first], np.bincount(row) / len(observations)
+        logits = self.outputs(observations).astype(np.float64)
+        scale = 1.0 - noise if form == "temperature" else matching_scale(logits, weights, noise)
+        self.stack.layers[-1].mul_(scale)
+        return {
+            "noise_scale": scale,
+            "randomness_before": off_greedy_mass(logits, weights),
+            "randomness_after": off_greedy_mass(scale * logits, weights),
+        }
+
+    def _widen(self, noise: float, form: str) -> dict[str, float]:
+        before = self._acting_log_std.astype(np.float64)
+        if form == "temperature":
+            after = before - np.log(max(1.0 - noise, SMALLEST_TEMPERING))
+        else:
+            after = matching_log_std(before, self._half_ranges, noise)
+        self.log_std.copy_(torch.as_tensor(after))
+        mean_before, mean_after = float(np.exp(before).mean()), float(np.exp(after).mean())
+        return {
+            "noise_scale": mean_after / mean_before,
+            "randomness_before": mean_before,
+            "randomness_after": mean_after,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Latest:
+    """What a policy was asked for last.
+
+    Attributes:
+        rows: where; not kept alive.
+        parameters: with which, a copy, [P].
+        distribution: what came out.
+    """
+
+    rows: ref[Tensor]
+    parameters: Tensor
+    distribution: Distribution
+
+    def is_of(self, rows: Tensor, parameters: Tensor) -> bool:
+        """Whether it is what these rows, as long as nobody writes to them, and parameters give."""
+        return self.rows() is rows and torch.equal(self.parameters, parameters)
+
+
+def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:
+    """The softmax of logits [B, A], but for its normalisation, summed up over the actions."""
+    masses: Floats = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
+    return masses
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyEvaluation:
+    """A policy evaluated at some rows; valid until its parameters change or it is evaluated again.
+
+    The part between the network's outputs and a loss is differentiated automatically, so that an agent may
+    write any loss of the distribution; the network itself is ``TanhStack``'s to differentiate.
+
+    Attributes:
+        policy: what was evaluated.
+        activations: of its network, block by block of the rows.
+        leaves: the outputs, and a Gaussian's log_std: what losses are differentiated by.
+        distribution: at the rows; a differentiable function of the leaves.
+    """
+
+    policy: StochasticPolicy
+    activations: list[list[Tensor]]
+    leaves: list[Tensor]
+    distribution: Distribution
+
+    def gradient(self, loss: Tensor, *, retain_graph: bool = False) -> Tensor:
+        """The gradient of a scalar loss by all parameters, [P]: the policy's gradient block."""
+        slopes = torch.autograd.grad(loss, self.leaves, retain_graph=retain_graph)
+        for block, activations in zip(blocks(len(slopes[0])), self.activations, strict=True):
+            self.policy.stack.pull_back(activations, slopes[0][None, block], add=block.start > 0)
+        if len(slopes) > 1:
+            self.policy.parameters.gradients[-1].copy_(slopes[1])
+        return self.policy.parameters.gradient
+
+
+class FisherMetric:
+    """The metric of the trust region: the Hessian of the mean KL at the present parameters, plus damping.
+
+    H v = J^T F J v + damping v, with J the Jacobian of the network's outputs and F the Fisher metric on
+    them, averaged over the samples. At the parameters that collected the samples this *is* the Hessian of
+    the mean KL: the term it leaves out has the gradient of the KL as a factor, which is 0 there. It costs
+    one forward and one backward sweep a product, a third of differentiating twice.
+
+    Args:
+        policy: at the parameters of the metric; they must not change while it is used.
+        rows: the distinct observations, [U, n].
+        observation_weights: share of the samples at each row, [U], summing to 1.
+        damping: multiple of the identity added, at least 0.
+    """
+
+    def __init__(
+        self, policy: StochasticPolicy, rows: Tensor, observation_weights: Tensor, damping: float
+    ) -> None:
+        self._policy = policy
+        self._damping = damping
+        self._blocks: list[tuple[list[Tensor], Distribution, Tensor]] = []
+        for block in blocks(len(rows)):
+            activations = policy.stack.activations(rows[block], Scratch())
+            distribution = policy.head(activations[-1][0], policy.log_std)
+            self._blocks.append((activations, distribution, observation_weights[block, None]))
+
+    def __call__(self, vector: Tensor) -> Tensor:
+        """H times a vector of parameter changes, [P] -> [P]; overwrites the policy's gradient block."""
+        stack, parameters = self._policy.stack, self._policy.parameters
+        change = parameters.pieces(vector)
+        for number, (activations, distribution, weights) in enumerate(self._blocks):
+            moved = stack.output_change(activations, change)[0]
+            stack.pull_back(activations, (weights * distribution.fisher(moved))[None], add=number > 0)
+        if len(change) > len(stack.layers):
+            parameters.gradients[-1].copy_(2.0 * change[-1])  # the Fisher metric of log_std is 2
+        return parameters.gradient + self._damping * vector

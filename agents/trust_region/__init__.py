@@ -1,0 +1,1 @@
+"""Conjugate gradient, line search, and the exact dual of CPO's step."""

@@ -1,0 +1,258 @@
+"""A finished sweep in one small file, from which all its figures and tables can be drawn again.
+
+A zip archive of plain text, so that any tool can open it:
+
+    sweep.json         name, notes, grid file, the trials (spec, standing, provenance), digests of the tables
+    phases.csv, ...    the other frames of ``recrl.analysis.data.sweep_data`` but KEY: ``trial`` is the
+    position of the
+                       trial in sweep.json
+
+Left out are single episodes (``phases`` has their sums), timing, and the students' metrics that no figure
+reads. What was measured at single updates, and the policies' tables, are rounded to DIGITS significant
+digits; outcomes (phases, evaluations) are exact. Equal sweeps give equal bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from recrl.analysis.data.sweep_data import (
+    EVENT_COLUMNS,
+    PHASE_COLUMNS,
+    ROWS,
+    TRIAL,
+    Sweep,
+    TrialFacts,
+    assemble,
+    drawn_columns,
+)
+from recrl.environments.registry import TASKS, task_options
+from recrl.orchestrator.errors import DamagedError, RecrlError, missing
+from recrl.orchestrator.files.archives import UNREADABLE, unpacked
+from recrl.orchestrator.files.row_files import Extent
+from recrl.orchestrator.files.small_files import write_atomically
+from recrl.orchestrator.files.store import EVALUATION_COLUMNS, UPDATE_COLUMNS
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.untrusted import LimitValues, checked_name
+from recrl.orchestrator.validation import sentences
+
+SUFFIX = ".zip"
+FORMAT = 2
+WITHOUT_DIGESTS = 1  # the format before: its tables are read as they are
+DIGITS = 6
+ROUNDED = ("updates", "policies")
+MAX_BYTES = 512 * 2**20  # unpacked; about 50 times the largest sweep so far
+# Columns that every frame must have if it has rows, those that it has for each cost, and those of text.
+REQUIRED = {
+    "phases": PHASE_COLUMNS,
+    "updates": drawn_columns(UPDATE_COLUMNS),
+    "evaluations": EVALUATION_COLUMNS,
+    "events": EVENT_COLUMNS,
+    "policies": ("state", "action_0"),
+}
+COSTLY = {
+    "phases": ("cost",),
+    "updates": ("cost", "limit"),
+    "evaluations": ("cost",),
+    "events": (),
+    "policies": (),
+}
+TEXTS = ("phase", "policy", "event")
+LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: zip knows none before
+
+
+def save(sweep: Sweep, path: Path) -> Path:
+    """Write the compact file of a sweep.
+
+    Args:
+        sweep: finished or not.
+        path: of the file; its folder is made if it is not there.
+
+    Raises:
+        RecrlError: nobody would read it back, as it is too large, or its folder cannot be made.
+    """
+    tables = {}
+    for name in ROWS:
+        rows = sweep.rows(name)
+        if name == "updates":
+            rows = rows[[TRIAL, *drawn_columns(map(str, rows))]]
+        tables[f"{name}.csv"] = (_rounded(rows) if name in ROUNDED else rows).to_csv(
+            index=False, lineterminator="\n"
+        )
+    digests = {name: Extent.of(text.encode()).sha256 for name, text in tables.items()}
+    told = json.dumps({**_told(sweep), "digests": digests}, indent=1, allow_nan=False) + "\n"
+    members = {"sweep.json": told, **tables}
+    size = sum(len(text.encode()) for text in members.values())
+    if size > MAX_BYTES:
+        raise RecrlError(f"{path}: a compact file may unpack to {MAX_BYTES} bytes, this one has {size}")
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for name, text in members.items():
+            archive.writestr(zipfile.ZipInfo(name, LONG_AGO), text, zipfile.ZIP_LZMA)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, FileNotFoundError, NotADirectoryError) as error:
+        raise RecrlError(f"{path}: its folder cannot be made ({error.strerror})") from error
+    write_atomically(path, data.getvalue())
+    return path
+
+
+def load(path: Path) -> Sweep:
+    """Read a compact file back.
+
+    Raises:
+        RecrlError: the file is not there, is none, or unpacks to more than MAX_BYTES.
+    """
+    names = ("sweep.json", *(f"{name}.csv" for name in ROWS))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sweep, *frames = unpacked(archive, names, max_bytes=MAX_BYTES)
+        told = json.loads(sweep)
+        rows = {name: pd.read_csv(io.BytesIO(data)) for name, data in zip(ROWS, frames, strict=True)}
+    except FileNotFoundError as error:
+        raise RecrlError(f"{path}: {missing(path)}") from error
+    except UNREADABLE as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({reason})") from error
+    found = told.get("format") if isinstance(told, dict) else None
+    if found not in (FORMAT, WITHOUT_DIGESTS):
+        raise RecrlError(f"{path}: its format must be {FORMAT} or {WITHOUT_DIGESTS}, got {found!r:.60}")
+    try:
+        checked = _SweepFile.model_validate(told)
+        for name, data in zip(names[1:], frames, strict=True):
+            if found == FORMAT and Extent.of(data).sha256 != checked.digests.get(name):
+                raise DamagedError(f"{path}: its {name} is not what was written; export the sweep again")
+        facts = [_facts(trial, checked.provenance) for trial in told["trials"]]
+        for name, frame in rows.items():
+            _check_rows(name, frame, facts)
+        checked_name(checked.name)
+        if any(it.start_limits and len(it.start_limits) != len(it.spec.deploy_limits) for it in facts):
+            raise ValueError("start_limits must be as many as deploy_limits")
+        for task in {json.dumps([it.spec.task.name, it.spec.task.options]) for it in facts}:
+            _check_task(*json.loads(task))
+    except ValidationError as error:
+        place, sentence = next(sentences(error, None))
+        raise RecrlError(f"{path}: sweep.json: {'.'.join(map(str, place))}: {sentence}") from error
+    except (ValueError, IndexError, OverflowError) as error:
+        raise RecrlError(f"{path}: is no sweep's compact file: {error}") from error
+    return assemble(checked.name, facts, **rows, grid=checked.grid, notes=checked.notes)
+
+
+class _TrialFile(BaseModel):
+    """What sweep.json says of a trial, but for its spec, which ``TrialSpec`` checks itself."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    spec: dict[str, Any]
+    status: Literal["waiting", "running", "complete", "failed", "damaged"]
+    error: str
+    env_steps: int = Field(ge=0, le=10**15)
+    cpu_seconds: float = Field(ge=0, le=1e12)
+    start_limits: LimitValues | None
+    provenance: int = Field(ge=0)
+
+
+class _SweepFile(BaseModel):
+    """The content of sweep.json."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+    format: int
+    name: str
+    notes: list[str]
+    grid: str
+    provenance: list[str]
+    trials: list[_TrialFile]
+    digests: dict[str, str] = Field(default_factory=dict)
+
+
+def _check_task(name: str, options: dict[str, Any]) -> None:
+    """Check the options of a task of ours: its optimum and its maps are computed from them.
+
+    Raises:
+        ValueError: they are wrong.
+    """
+    if name in TASKS:
+        try:
+            task_options(name, options)
+        except ValidationError as error:
+            place, sentence = next(sentences(error, None))
+            raise ValueError(f"the options of {name}: {'.'.join(map(str, place))}: {sentence}") from error
+
+
+def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> None:
+    """Check that a frame has the columns that the others rely on, and numbers where these are numbers.
+
+    Raises:
+        ValueError: it has not.
+    """
+    columns = list(map(str, rows))
+    if TRIAL not in columns:
+        raise ValueError(f"{name}.csv has no column {TRIAL!r}")
+    if not len(rows):
+        return
+    costs = max(len(it.spec.deploy_limits) for it in facts) if facts else 0
+    for column in (*REQUIRED[name], *(f"{kind}_{i}" for kind in COSTLY[name] for i in range(costs))):
+        if column not in columns:
+            raise ValueError(f"{name}.csv has no column {column!r}")
+    for column in columns:
+        if column not in TEXTS and not pd.api.types.is_numeric_dtype(rows[column].dtype):
+            raise ValueError(f"{name}.csv: the column {column!r} must hold numbers")
+    trials = rows[TRIAL].to_numpy()
+    if trials.dtype.kind != "i" or trials.min() < 0 or trials.max() >= len(facts):
+        raise ValueError(f"{name}.csv: the column {TRIAL!r} must be positions from 0 to {len(facts) - 1}")
+
+
+def _told(sweep: Sweep) -> dict[str, Any]:
+    """Everything but the frames; equal provenances are there once."""
+    origins = list(Counter(it.provenance for it in sweep.facts))
+    return {
+        "format": FORMAT,
+        "name": sweep.name,
+        "notes": list(sweep.notes),
+        "grid": sweep.grid,
+        "provenance": origins,
+        "trials": [
+            {
+                "spec": it.spec.to_json(),
+                "status": it.status.value,
+                "error": it.error,
+                "env_steps": it.env_steps,
+                "cpu_seconds": it.cpu_seconds,
+                "start_limits": it.start_limits,
+                "provenance": origins.index(it.provenance),
+            }
+            for it in sweep.facts
+        ],
+    }
+
+
+def _facts(value: dict[str, Any], origins: list[str]) -> TrialFacts:
+    facts = TrialFacts(
+        **{**value, "spec": TrialSpec.from_json(value["spec"]), "provenance": origins[value["provenance"]]}
+    )
+    return replace(facts, status=TrialState(facts.status))
+
+
+def _rounded(rows: pd.DataFrame) -> pd.DataFrame:
+    """Floats with DIGITS significant digits, as the shortest text."""
+    floats = rows.select_dtypes("float").columns
+    return rows.assign(**{name: _significant(rows[name].to_numpy(np.float64)) for name in floats})
+
+
+def _significant(values: np.ndarray) -> np.ndarray:
+    """Each value at DIGITS significant digits.
+
+    >>> _significant(np.array([0.0012345678, -98765.4321, np.inf])).tolist()
+    [0.00123457, -98765.4, inf]
+    """
+    return np.array([float(f"{value:.{DIGITS}g}") for value in values.tolist()])

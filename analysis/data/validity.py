@@ -1,0 +1,33 @@
+"""What speaks against a sweep's numbers: damaged trials, other code, and curricula that are none."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from recrl.analysis.data.sweep_data import Sweep, TrialFacts
+from recrl.orchestrator.files.code_changes import no_curriculum_sentence, other_code, other_code_sentence
+from recrl.orchestrator.spec import TrialState
+
+
+def damages(sweep: Sweep) -> list[str]:
+    """A sentence for each damaged trial, of which nothing is in the frames."""
+    return [f"{it.spec.title}: {it.error}" for it in sweep.facts if it.status is TrialState.DAMAGED]
+
+
+def doubts(sweep: Sweep) -> list[str]:
+    """Sentences on trials that ran other code than is installed now, and on curricula that are none."""
+    changed = [it for it in sweep.facts if other_code(_attempts(it), it.spec)]
+    complete = sum(it.status is TrialState.COMPLETE for it in changed)
+    none = [it.spec.title for it in sweep.facts if it.spec.is_no_curriculum(it.start_limits)]
+    said = (other_code_sentence(complete, len(changed) - complete), no_curriculum_sentence(none))
+    return [sentence for sentence in said if sentence]
+
+
+def _attempts(trial: TrialFacts) -> list[dict[str, Any]]:
+    """What is known of where each attempt comes from; nothing in files of older versions."""
+    try:
+        attempts = json.loads(trial.provenance).get("attempts", [])
+    except (ValueError, AttributeError):
+        return []
+    return [attempt for attempt in attempts if isinstance(attempt, dict) and "code" in attempt]

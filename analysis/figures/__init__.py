@@ -1,0 +1,1 @@
+"""The figures, one file each, and the style that they share."""

@@ -1,0 +1,117 @@
+"""The cumulative cost of training beside its bounds: Proposition 1 on one axis with what happened.
+
+A row a task, a column a method; policies of the training phase are added up from left to right, one expected
+episode each. What the lines are is in ``recrl.analysis.statistics.cumulative_cost``. The cost axis is
+logarithmic, as the proven bounds are far from what happens; each panel says how far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from recrl.analysis.data.sweep_data import KEY, Sweep, occurring
+from recrl.analysis.figures import panels, styles
+from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
+from recrl.analysis.statistics.cumulative_cost import policies_of, training_runs
+from recrl.environments.cmdp import Floats
+
+# Colour, dashes and name of every sum but the measured one.
+REFERENCES: dict[str, tuple[str, Literal["-"] | tuple[float, Sequence[float]], str]] = {
+    "limit": (LIMIT_COLOUR, panels.DASHED, "limits in force"),
+    "discounted_bound": ("#5b3a8c", (0.0, (1.2, 1.2)), "Proposition 1, discounted cost"),
+    "bound": ("black", (0.0, (6.0, 1.5, 1.2, 1.5)), "bound, undiscounted cost"),
+    "ceiling": ("#8a8a8a", "-", "ceiling: every step at the largest cost"),
+}
+
+
+def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | None:
+    """Measured cost, limits and bounds, summed over the policies of the training phase.
+
+    Args:
+        sweep: the frames.
+        agent: the student's label.
+        cost: i, which cost.
+
+    Returns:
+        Every run thin, the mean over runs thick; or None if no trial of the student has finished its
+        training phase.
+    """
+    trials = sweep.trials[
+        (sweep.trials["agent"] == agent)
+        & (sweep.trials["env_steps"] >= sweep.trials["boundary_step"])
+        & sweep.trials[f"deploy_limit_{cost}"].notna()
+    ]
+    if not len(trials):
+        return None
+    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    tasks = occurring(trials["task"])
+    methods = [method for method in look if (trials["method"] == method).any()]
+    runs = training_runs(sweep)
+    with styles.context():
+        figure = Figure(figsize=(TEXT_WIDTH, 1.55 * len(tasks) + 0.75), layout="constrained")
+        grid = figure.subplots(len(tasks), len(methods), squeeze=False, sharex="row", sharey="row")
+        for row, task in zip(grid, tasks, strict=True):
+            for axes, method in zip(row, methods, strict=True):
+                chosen = trials[(trials["task"] == task) & (trials["method"] == method)]
+                series = [
+                    policies_of(sweep, trial, runs[tuple(trial[name] for name in KEY)], cost=cost)
+                    for _, trial in chosen.iterrows()
+                ]
+                axes.set_title(method)
+                if series:
+                    _panel(axes, series, look[method])
+            row[0].set_ylabel(f"{task}\ncumulative cost")
+        for axes in grid[-1]:
+            axes.set_xlabel("environment steps")
+        drawn = {str(line.get_label()) for axes in grid.flat for line in axes.get_lines()}
+        _legend(figure, agent, drawn)
+    return figure
+
+
+def _panel(axes: Axes, series: list[pd.DataFrame], style: MethodStyle) -> None:
+    """One method's sums; ``series`` are of ``policy_costs``, one a run."""
+    steps = series[0]["end_step"].to_numpy(np.float64)
+    measured = _sums(series, "cost")
+    axes.set_yscale("log")
+    for run in measured:
+        axes.plot(steps, run, color=style.colour, linewidth=0.4, alpha=0.55)
+    axes.plot(steps, measured.mean(axis=0), color=style.colour, linewidth=1.5, zorder=4.0)
+    for name, (colour, dashes, label) in REFERENCES.items():
+        mean = _sums(series, name).mean(axis=0)
+        if np.isfinite(mean).any():
+            axes.plot(steps, mean, color=colour, linestyle=dashes, linewidth=0.9, label=label, zorder=3.0)
+    bound = _sums(series, "bound").mean(axis=0)[-1]
+    if np.isfinite(bound):
+        note = f"bound {bound / measured.mean(axis=0)[-1]:.3g} times\nwhat it cost"
+        axes.text(0.97, 0.04, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.0)
+    panels.step_axis(axes, 0.0, float(steps[-1]))
+
+
+def _sums(series: list[pd.DataFrame], name: str) -> Floats:
+    """Running sums of every run, [n, policies]; an infinite limit counts as the cost, as in ``limit_sum``."""
+    rows = []
+    for run in series:
+        values = run[name].to_numpy(np.float64)
+        if name == "limit":
+            values = np.where(np.isfinite(values), values, run["cost"])
+        rows.append(np.cumsum(values))
+    return np.array(rows)
+
+
+def _legend(figure: Figure, agent: str, drawn: set[str]) -> None:
+    """What is drawn: students but CPO have no bounds, unknown tasks no ceiling."""
+    handles = [Line2D([], [], color="0.2", linewidth=1.5, label="measured cost, undiscounted")]
+    handles += [
+        Line2D([], [], color=colour, linestyle=dashes, linewidth=0.9, label=name)
+        for colour, dashes, name in REFERENCES.values()
+        if name in drawn
+    ]
+    title = f"{agent}: cost of the training phase, summed over its policies; every run thin, the mean thick"
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, title=title)

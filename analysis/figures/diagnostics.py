@@ -1,0 +1,150 @@
+"""What a curriculum did to its student: limit, cost, multiplier and step size on one axis, for each method.
+
+A figure a task and student; a column a method. From above: the student's own cost under the limit in force;
+the mean multipliers (where the student has them); what the critics of the reward and of the cost explain of
+the variance of fresh returns; the mean KL divergence of its updates. Ticks below the costs mark where noise
+was added to some run's policy; ticks below the KL divergence mark CPO's recovery steps, in which it only
+lowers the cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.figures import panels, styles
+from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
+from recrl.analysis.statistics.metrics import mean_curve, step_grid
+from recrl.environments.cmdp import Floats
+
+BINS = 100
+NOISE_EVENT = "policy noise"
+RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only lowers the cost
+LARGE_MULTIPLIER = 50.0
+EVENT_TICK = (0.0, 0.05)  # share of the panel's height
+EXPLAINED = "explained_variance_"
+LEAST_EXPLAINED = -0.5  # critics may be arbitrarily wrong; what is below this is cut off
+
+
+def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0) -> Figure:
+    """Limit, cost, multiplier, KL divergence and events of every method.
+
+    Args:
+        sweep: with at least one update of this task and student.
+        task: its label.
+        agent: the student's label.
+        cost: i, which cost and limit to show.
+
+    Returns:
+        Lines are means over seeds, bands one standard error.
+    """
+    trials, updates, events = (
+        _of(frame, task, agent) for frame in (sweep.trials, sweep.updates, sweep.events)
+    )
+    boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
+    count = int(total // trials["steps_per_update"].min())
+    edges = step_grid(boundary, total, updates=count, bins=BINS)
+    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    methods = [method for method in look if (updates["method"] == method).any()]
+    quantities = (
+        f"cost_{cost}",
+        f"multiplier_{cost}",
+        f"{EXPLAINED}reward",
+        f"{EXPLAINED}cost_{cost}",
+        "kl",
+    )
+    rows = [name for name in quantities if _known(updates, name)]
+    limit = float(trials[f"deploy_limit_{cost}"].iloc[0])
+    with styles.context():
+        figure = Figure(figsize=(TEXT_WIDTH, 1.15 * len(rows) + 0.85), layout="constrained")
+        grid = figure.subplots(len(rows), len(methods), squeeze=False, sharex=True, sharey="row")
+        for column, method in zip(grid.T, methods, strict=True):
+            chosen, style = updates[updates["method"] == method], look[method]
+            for axes, quantity in zip(column, rows, strict=True):
+                _panel(axes, chosen, quantity, edges, style)
+                panels.phase_boundary(axes, boundary, total)
+            _limits(column[0], chosen, f"limit_{cost}")
+            _event_ticks(column[0], events.loc[_is_noise(events, method), "end_step"], style)
+            if "case" in chosen and "kl" in rows:
+                recovering = chosen.loc[chosen["case"] == RECOVERY_CASE, "end_step"]
+                _event_ticks(column[rows.index("kl")], recovering, style)
+            column[0].set_title(method)
+            panels.step_axis(column[-1], 0.0, total)
+            column[-1].set_xlabel("environment steps")
+        panels.cost_axis(grid[0, 0], limit, float(np.nanmax(updates[f"cost_{cost}"].to_numpy(np.float64))))
+        for axes, quantity in zip(grid[:, 0], rows, strict=True):
+            axes.set_ylabel(_label(quantity), fontsize=7.0)
+            if quantity.startswith(EXPLAINED):
+                axes.set_ylim(LEAST_EXPLAINED, 1.0)
+            if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
+                axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
+                axes.set_ylim(bottom=-0.3)
+        _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}")
+    return figure
+
+
+def _label(quantity: str) -> str:
+    """What an axis is called."""
+    if quantity.startswith(EXPLAINED):
+        signal = quantity.removeprefix(EXPLAINED).split("_")[0]
+        return f"explained\nvariance, {signal}"
+    return {"kl": "KL divergence"}.get(quantity, quantity.split("_", maxsplit=1)[0])
+
+
+def _panel(axes: Axes, updates: pd.DataFrame, quantity: str, edges: Floats, style: MethodStyle) -> None:
+    if not _known(updates, quantity):
+        return
+    curve = mean_curve(updates, quantity, edges)
+    drawn = np.isfinite(curve.centre)
+    axes.plot(curve.steps[drawn], curve.centre[drawn], color=style.colour, linewidth=1.1, zorder=3.0)
+    panels.draw_band(axes, curve, style)
+
+
+def _limits(axes: Axes, updates: pd.DataFrame, quantity: str) -> None:
+    """Every run's limit; infinite ones are left out."""
+    for _, run in updates.groupby("seed"):
+        values = run[quantity].where(np.isfinite(run[quantity]))
+        axes.plot(
+            run["end_step"], values, color=LIMIT_COLOUR, linewidth=0.7, drawstyle="steps-pre", zorder=2.5
+        )
+
+
+def _event_ticks(axes: Axes, steps: Iterable[float], style: MethodStyle) -> None:
+    """A tick at the lower edge for every event."""
+    for step in sorted(set(steps)):
+        axes.plot(
+            [step, step],
+            EVENT_TICK,
+            color=style.colour,
+            linewidth=0.6,
+            transform=axes.get_xaxis_transform(),
+            zorder=2.0,
+        )
+
+
+def _legend(figure: Figure, title: str) -> None:
+    handles = [
+        Line2D([], [], color="0.2", linewidth=1.1, label="mean ± standard error"),
+        Line2D([], [], color=LIMIT_COLOUR, linewidth=0.9, label="limit in force, every run"),
+        Line2D([], [], color="black", linewidth=0.8, linestyle=panels.DASHED, label="deployment begins"),
+        Line2D([], [], color="0.2", linestyle="none", marker="|", label="noise added / recovery step"),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), title=title)
+
+
+def _is_noise(events: pd.DataFrame, method: str) -> pd.Series[bool]:
+    return (events["method"] == method) & (events["event"] == NOISE_EVENT)
+
+
+def _known(updates: pd.DataFrame, quantity: str) -> bool:
+    return quantity in updates and bool(np.isfinite(updates[quantity]).any())
+
+
+def _of(frame: pd.DataFrame, task: str, agent: str) -> pd.DataFrame:
+    return frame[(frame["task"] == task) & (frame["agent"] == agent)]

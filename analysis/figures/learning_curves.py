@@ -1,0 +1,225 @@
+"""The paper's figures, from a sweep's frames: functions that return a matplotlib Figure.
+
+``learning_curves`` is Figures 3 and 4 (one a student): return and cost over training, and magnified over
+deployment. ``curricula`` is Figure 5: the limits in force. Trials are averaged on a common grid of
+environment steps (``metrics.step_grid``), about 100 bins over a whole trial and 25 over its deployment.
+
+Costs begin far above the limit and end near it. Where they exceed ten limits, the cost axis is linear up to
+the deployment limit and logarithmic above it, so that the limit can be read; the axis says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from recrl.analysis.data.sweep_data import Sweep, occurring
+from recrl.analysis.figures import panels, styles
+from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
+from recrl.analysis.statistics.metrics import MEAN, Averaging, mean_curve, step_grid
+from recrl.environments.cmdp import Floats
+
+BINS = 100
+DEPLOYMENT_BINS = 25
+ROW_HEIGHT = 1.42
+WORTH_MARKING = 0.03  # of a trial: shorter spells of infinite limits (the measuring of d_t) are not marked
+
+
+def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) -> Figure:
+    """The paper's Figures 3 and 4: a row a task, return and cost over training and over deployment.
+
+    Args:
+        sweep: with at least one update of this student.
+        agent: its label.
+        averaging: what lines and bands are; means and standard errors as in the paper by default.
+    """
+    trials = sweep.trials[sweep.trials["agent"] == agent]
+    updates = sweep.updates[sweep.updates["agent"] == agent]
+    tasks = occurring(updates["task"])
+    num_costs = int(trials["num_costs"].max())
+    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    columns = 2 + 2 * num_costs
+    with styles.context():
+        figure = Figure(
+            figsize=(TEXT_WIDTH * max(1.0, columns / 4), ROW_HEIGHT * len(tasks) + 0.8), layout="constrained"
+        )
+        grid = figure.subplots(
+            len(tasks), columns, squeeze=False, gridspec_kw={"width_ratios": [1.7, 1.0] * (columns // 2)}
+        )
+        for row, task in zip(grid, tasks, strict=True):
+            _task_row(
+                row,
+                trials[trials["task"] == task],
+                updates[updates["task"] == task],
+                look,
+                averaging=averaging,
+            )
+        for axes, title in zip(grid[0], _column_titles(num_costs), strict=True):
+            axes.set_title(title)
+        for axes in grid[-1]:
+            axes.set_xlabel("environment steps")
+        present = [method for method in look if (updates["method"] == method).any()]
+        optimum = bool(trials["optimal_return"].notna().any())
+        seeds = int(updates.groupby(["task", "method"], observed=True)["seed"].nunique().min())
+        title = f"{agent}: {averaging.describe(seeds)}"
+        panels.legend(figure, look, present, optimum=optimum, title=title)
+    return figure
+
+
+def curricula(sweep: Sweep) -> Figure:
+    """The paper's Figure 5: the cost limits in force; a row a task and cost, a column a student.
+
+    Every run is a thin line, the mean over seeds a thick one; the student's own cost, a mean over seeds too,
+    is a faint line. Infinite limits, which no axis reaches, are drawn along the upper edge and marked with
+    the sign of infinity, unless they only last as long as the measuring of d_t.
+
+    Args:
+        sweep: with at least one update.
+    """
+    updates = sweep.updates
+    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    agents = occurring(updates["agent"])
+    cells = [
+        (task, i)
+        for task in updates["task"].cat.categories
+        for i in range(sweep.num_costs)
+        if updates.loc[updates["task"] == task, f"limit_{i}"].notna().any()
+    ]
+    with styles.context():
+        figure = Figure(figsize=(TEXT_WIDTH, 1.6 * len(cells) + 0.75), layout="constrained")
+        grid = figure.subplots(len(cells), len(agents), squeeze=False, sharey="row")
+        for row, (task, i) in zip(grid, cells, strict=True):
+            for axes, agent in zip(row, agents, strict=True):
+                trials, rows = _of(sweep.trials, task, agent), _of(updates, task, agent)
+                if len(rows):
+                    _curriculum_panel(axes, trials, rows, look, i)
+                    axes.set_title(panels.panel_title(trials, rows), loc="left", pad=3.0)
+                else:
+                    axes.set_title(f"{task}: nothing run yet", loc="left", pad=3.0)
+                    axes.set_xticks([])
+            row[0].set_ylabel("cost limit" if sweep.num_costs == 1 else f"limit of cost {i + 1}")
+        for axes, agent in zip(grid[0], agents, strict=True):
+            axes.set_title(f"{agent}\n{axes.get_title(loc='left')}", loc="left", pad=3.0)
+        for axes in grid[-1]:
+            axes.set_xlabel("environment steps")
+        present = [method for method in look if (updates["method"] == method).any()]
+        panels.legend(
+            figure,
+            look,
+            present,
+            optimum=False,
+            title="cost limits in force: every run thin, their mean thick; the student's own cost faint",
+        )
+    return figure
+
+
+def _task_row(
+    row: Sequence[Axes],
+    trials: pd.DataFrame,
+    updates: pd.DataFrame,
+    look: dict[str, MethodStyle],
+    *,
+    averaging: Averaging,
+) -> None:
+    """One task's panels: return, return in deployment, then the same for each cost."""
+    boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
+    count = int(trials["total_steps"].max() // trials["steps_per_update"].min())
+    whole = step_grid(boundary, total, updates=count, bins=BINS)
+    deployment_updates = max(2, round(count * (total - boundary) / total))
+    magnified = np.linspace(boundary, total, min(DEPLOYMENT_BINS, deployment_updates) + 1)
+    quantities = ["episode_return", *(f"cost_{i}" for i in range((len(row) - 2) // 2))]
+    deployed = updates[updates["end_step"] > boundary]
+    for position, quantity in enumerate(quantities):
+        if not updates[quantity].notna().any():  # this task has fewer costs than another one
+            row[2 * position].set_axis_off()
+            row[2 * position + 1].set_axis_off()
+            continue
+        for axes, edges, rows in (
+            (row[2 * position], whole, updates),
+            (row[2 * position + 1], magnified, deployed),
+        ):
+            _curves(axes, rows, quantity, edges, look, averaging=averaging)
+            panels.step_axis(axes, edges[0], edges[-1])
+            panels.reference_lines(axes, trials, quantity)
+        panels.phase_boundary(row[2 * position], boundary, total)
+        panels.phase_boundary(row[2 * position + 1], boundary, total)
+        if not len(deployed):
+            row[2 * position + 1].text(
+                0.5, 0.5, "not yet", transform=row[2 * position + 1].transAxes, ha="center", color="0.4"
+            )
+        if quantity != "episode_return":
+            limit = float(trials[f"deploy_limit_{position - 1}"].iloc[0])
+            largest = float(np.nanmax(updates[quantity].to_numpy(np.float64)))
+            panels.cost_axis(row[2 * position], limit, largest)
+    row[0].set_ylabel(panels.panel_title(trials, updates, separator="\n"))
+
+
+def _curves(
+    axes: Axes,
+    updates: pd.DataFrame,
+    quantity: str,
+    edges: Floats,
+    look: dict[str, MethodStyle],
+    *,
+    averaging: Averaging,
+) -> None:
+    """Every method's line with its band; markers are staggered so that equal lines can be told apart."""
+    for position, (method, style) in enumerate(look.items()):
+        chosen = updates[updates["method"] == method]
+        if not len(chosen):
+            continue
+        curve = averaging.curve(chosen, quantity, edges)
+        panels.draw_curve(axes, curve, style, place=(position, len(look)))
+        panels.draw_band(axes, curve, style)
+
+
+def _curriculum_panel(
+    axes: Axes, trials: pd.DataFrame, updates: pd.DataFrame, look: dict[str, MethodStyle], i: int
+) -> None:
+    boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
+    count = int(total // trials["steps_per_update"].min())
+    edges = step_grid(boundary, total, updates=count, bins=BINS)
+    for position, (method, style) in enumerate(look.items()):
+        chosen = updates[updates["method"] == method]
+        for _, run in chosen.groupby("seed"):
+            limits = run[f"limit_{i}"].where(np.isfinite(run[f"limit_{i}"]))
+            axes.plot(
+                run["end_step"],
+                limits,
+                color=style.colour,
+                linewidth=0.4,
+                alpha=0.55,
+                drawstyle="steps-pre",
+                zorder=2.0,
+            )
+        if not len(chosen):
+            continue
+        cost = mean_curve(chosen, f"cost_{i}", edges)
+        axes.plot(cost.steps, cost.centre, color=style.colour, linewidth=1.0, alpha=0.35, zorder=1.8)
+        curve = mean_curve(chosen, f"limit_{i}", edges)
+        panels.draw_curve(axes, curve, style, place=(position, len(look)), wider=0.3)
+        last = float(chosen["end_step"].where(np.isinf(chosen[f"limit_{i}"])).max())
+        if last >= WORTH_MARKING * total:
+            edge = axes.get_xaxis_transform()
+            axes.plot([0.0, last], [1.0, 1.0], **style.line, transform=edge, clip_on=False)
+            axes.text(last, 1.0, " ∞", color=style.colour, va="center", fontsize=9.0, transform=edge)
+    panels.step_axis(axes, 0.0, total)
+    panels.reference_lines(axes, trials, f"cost_{i}")
+    panels.phase_boundary(axes, boundary, total)
+    axes.set_ylim(bottom=0.0)
+
+
+def _column_titles(num_costs: int) -> list[str]:
+    titles = ["return", "return in deployment"]
+    for i in range(num_costs):
+        name = "episode cost" if num_costs == 1 else f"episode cost {i + 1}"
+        titles += [name, f"{name.removeprefix('episode ')} in deployment"]
+    return titles
+
+
+def _of(frame: pd.DataFrame, task: str, agent: str) -> pd.DataFrame:
+    return frame[(frame["task"] == task) & (frame["agent"] == agent)]

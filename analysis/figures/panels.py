@@ -1,0 +1,162 @@
+"""Parts that all panels over environment steps share: axes, reference lines, titles, the legend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, MethodStyle
+from recrl.analysis.statistics.metrics import Curve
+
+LOG_AXIS_FROM = 10.0  # times the limit
+MARKERS_A_LINE = 6
+METHODS_A_LINE = 7
+DASHED = (0.0, (4.0, 2.0))
+
+
+def draw_curve(
+    axes: Axes, curve: Curve, style: MethodStyle, *, place: tuple[int, int], wider: float = 0.0
+) -> None:
+    """A method's line; methods that coincide can be told apart.
+
+    Markers are staggered from method to method, and dashed lines lie on top of solid ones.
+
+    Args:
+        axes: to draw on.
+        curve: what to draw; bins without data are bridged.
+        style: of the method.
+        place: the method's position and the number of methods.
+        wider: points added to the line's width.
+    """
+    drawn = np.isfinite(curve.centre)
+    position, methods = place
+    bins = max(1, int(drawn.sum()))
+    gap = max(methods, bins // MARKERS_A_LINE)
+    axes.plot(
+        curve.steps[drawn],
+        curve.centre[drawn],
+        color=style.colour,
+        linestyle=style.linestyle,
+        linewidth=style.width + wider,
+        marker=style.marker,
+        markevery=(position * gap // methods % bins, gap),
+        markeredgewidth=0.0,
+        zorder=3.0 + 0.5 * bool(style.dashes) + 0.01 * position,
+    )
+
+
+def draw_band(axes: Axes, curve: Curve, style: MethodStyle) -> None:
+    """The band around the line."""
+    drawn = np.isfinite(curve.centre)
+    axes.fill_between(
+        curve.steps[drawn],
+        curve.low[drawn],
+        curve.high[drawn],
+        color=style.colour,
+        alpha=0.18,
+        linewidth=0.0,
+        zorder=2,
+    )
+
+
+def reference_lines(axes: Axes, trials: pd.DataFrame, quantity: str) -> None:
+    """The deployment limit on cost panels, the optimum J*(d_d) on return panels."""
+    if quantity == "episode_return":
+        for optimum in sorted(set(trials["optimal_return"].dropna())):
+            axes.axhline(optimum, color=OPTIMUM_COLOUR, linewidth=0.7, zorder=1.0)
+        return
+    for limit in sorted(set(trials[f"deploy_limit_{quantity.removeprefix('cost_')}"].dropna())):
+        axes.axhline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=DASHED, zorder=4.0)
+
+
+def phase_boundary(axes: Axes, step: int, total: int) -> None:
+    """Where deployment begins."""
+    if 0 < step < total:
+        axes.axvline(step, color="black", linewidth=0.8, linestyle=DASHED, zorder=1.5)
+
+
+def step_axis(axes: Axes, first: float, last: float) -> None:
+    """Ticks like 0.5M: short enough for small panels."""
+    axes.set_xlim(first, last)
+    axes.xaxis.set_major_locator(MaxNLocator(4 if first == 0.0 else 2, steps=[1, 2, 2.5, 5, 10]))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_steps(value)))
+
+
+def cost_axis(axes: Axes, limit: float, largest: float) -> None:
+    """Linear to the limit and logarithmic above, if the costs exceed ten limits; begins just below 0."""
+    if largest <= LOG_AXIS_FROM * limit:
+        axes.set_ylim(bottom=-0.04 * largest)
+        return
+    linear_to = limit if limit > 0.0 else 1.0
+    axes.set_yscale("symlog", linthresh=linear_to, linscale=0.8)
+    axes.set_ylim(-0.15 * linear_to, 1.25 * largest)
+    axes.yaxis.set_major_locator(FixedLocator([0.0, linear_to, *_log_ticks(2.0 * linear_to, largest)]))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_ylabel("log above $d_d$", fontsize=6.0, labelpad=1.0)
+
+
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Powers of ten within [low, high]; with 2 and 5 times each, if there are fewer than two.
+
+    >>> _log_ticks(2.0, 120.0), _log_ticks(10.0, 90.0)
+    ([10.0, 100.0], [10.0, 20.0, 50.0])
+    """
+    decades = [10.0**power for power in range(-6, 13)]
+    powers = [value for value in decades if low <= value <= high]
+    between = [scale * value for value in decades for scale in (1.0, 2.0, 5.0)]
+    return powers if len(powers) > 1 else [value for value in between if low <= value <= high]
+
+
+def short_steps(steps: float) -> str:
+    """A number of steps in at most five characters.
+
+    >>> [short_steps(value) for value in (0, 500, 12_000, 960_000, 1_260_000, 1e7)]
+    ['0', '500', '12k', '960k', '1.26M', '10M']
+    """
+    if abs(steps) >= 1e6:
+        return f"{steps / 1e6:.4g}M"
+    return f"{steps / 1e3:.4g}k" if abs(steps) >= 1e3 else f"{steps:g}"
+
+
+def panel_title(trials: pd.DataFrame, updates: pd.DataFrame, *, separator: str = ": ") -> str:
+    """Task, number of seeds (a range, if not every method has as many at the end) and steps."""
+    seeds = updates.groupby("method", observed=True)["seed"]
+    ended = updates[updates["end_step"] >= trials["total_steps"].max()]
+    finished = ended.groupby("method", observed=True)["seed"].nunique()
+    high = int(seeds.nunique().max())
+    low = min(int(finished.get(method, 0)) for method in seeds.nunique().index)
+    count = f"{high}" if low == high else f"{low}–{high}"
+    task, total = trials["task"].iloc[0], short_steps(float(trials["total_steps"].max()))
+    return f"{task}{separator}{count} seed{'s' if high > 1 else ''}, {total} steps"
+
+
+def legend(
+    figure: Figure, look: dict[str, MethodStyle], methods: Sequence[str], *, optimum: bool, title: str
+) -> None:
+    """The methods, in their order, above all panels, and the reference lines below."""
+    lines = [
+        Line2D([], [], **look[method].line, marker=look[method].marker, markeredgewidth=0.0, label=method)
+        for method in methods
+    ]
+    references = [
+        Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=DASHED, label="limit $d_d$"),
+        Line2D([], [], color="black", linewidth=0.8, linestyle=DASHED, label="deployment begins"),
+    ]
+    if optimum:
+        references.append(Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.7, label="optimum $J^*(d_d)$"))
+    figure.legend(
+        handles=lines,
+        loc="outside upper center",
+        ncols=min(len(lines), METHODS_A_LINE),
+        handlelength=3.2,
+        columnspacing=1.6,
+        title=title,
+    )
+    figure.legend(handles=references, loc="outside lower center", ncols=3, handlelength=2.6)

@@ -1,0 +1,152 @@
+"""How every figure looks: one colour, dash and marker a method, print sizes, and files that never vary.
+
+Colours are Okabe and Ito's (2008), told apart by all common forms of colour blindness; dashes and markers
+tell them apart in greyscale. A known method keeps its style in every figure of every sweep; others take the
+spare styles in order of their names. Nothing here touches matplotlib's global state: ``context`` holds for
+a ``with`` block.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from recrl.analysis.data.sweep_data import METHOD_ORDER, ordered
+
+# The formulas in figures: ours, and those that matplotlib makes of numbers on an axis.
+OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$")
+TEXT_WIDTH = 7.0  # inches, of a page with two columns
+PNG_DPI = 200
+LIMIT_COLOUR = "#00b7c7"
+OPTIMUM_COLOUR = "#8a8a8a"
+
+
+@dataclass(frozen=True)
+class MethodStyle:
+    """How a method's line looks.
+
+    Attributes:
+        colour: hexadecimal.
+        dashes: matplotlib's on/off pattern in points; empty for a solid line.
+        marker: matplotlib's marker.
+        width: of the line, points.
+    """
+
+    colour: str
+    dashes: tuple[float, ...]
+    marker: str
+    width: float = 1.1
+
+    @property
+    def linestyle(self) -> Literal["-"] | tuple[float, Sequence[float]]:
+        """As matplotlib wants it."""
+        return (0.0, self.dashes) if self.dashes else "-"
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """The line as keywords of ``Axes.plot``, without the marker."""
+        return {"color": self.colour, "linestyle": self.linestyle, "linewidth": self.width}
+
+
+STYLES = {
+    "none": MethodStyle("#000000", (), "o"),
+    "linear": MethodStyle("#e69f00", (5.0, 1.5), "s"),
+    "cosine": MethodStyle("#0072b2", (5.0, 1.5, 1.2, 1.5), "^"),
+    "exponential": MethodStyle("#009e73", (1.4, 1.2), "v"),
+    "dynamic": MethodStyle("#d55e00", (), "D", 1.5),
+    "cooling": MethodStyle("#44aa99", (4.0, 1.0, 1.0, 1.0), ">"),
+    "step": MethodStyle("#cc79a7", (8.0, 2.0), "P"),
+    "unconstrained": MethodStyle("#7a7a7a", (3.0, 1.2, 1.0, 1.2, 1.0, 1.2), "X"),
+}
+SPARE_STYLES = (
+    MethodStyle("#aa4499", (6.0, 1.2, 3.0, 1.2), "H"),
+    MethodStyle("#56b4e9", (2.5, 1.0), "p"),
+    MethodStyle("#117733", (7.0, 1.5, 1.2, 1.5, 1.2, 1.5), "d"),
+    MethodStyle("#b8a800", (1.0, 0.8), "h"),
+    MethodStyle("#332288", (4.0, 2.5), "*"),
+)
+
+
+def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
+    """The style of every method, in the order of METHOD_ORDER and then of the names.
+
+    >>> list(method_styles(["mine", "dynamic", "none"]))
+    ['none', 'dynamic', 'mine']
+    """
+    spare = [method for method in ordered(methods, METHOD_ORDER) if method not in STYLES]
+    taken = {method: SPARE_STYLES[index % len(SPARE_STYLES)] for index, method in enumerate(spare)}
+    return {method: STYLES.get(method) or taken[method] for method in ordered(methods, METHOD_ORDER)}
+
+
+def context() -> AbstractContextManager[None]:
+    """Matplotlib's defaults with our sizes, whatever the user's own settings are, for a ``with`` block."""
+    settings = dict(mpl.rcParamsDefault)
+    settings.pop("backend", None)  # setting it would load a user interface
+    settings |= {
+        "font.family": "DejaVu Sans",
+        "font.size": 7.0,
+        "axes.titlesize": 7.0,
+        "axes.labelsize": 7.0,
+        "xtick.labelsize": 6.0,
+        "ytick.labelsize": 6.0,
+        "legend.fontsize": 7.0,
+        "axes.linewidth": 0.6,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": False,
+        "axes.ymargin": 0.09,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "xtick.major.size": 2.5,
+        "ytick.major.size": 2.5,
+        "lines.markersize": 3.0,
+        "legend.frameon": False,
+        "pdf.fonttype": 42,  # TrueType: text stays text, as publishers ask
+        "figure.dpi": 100,
+    }
+    return mpl.rc_context(settings)
+
+
+def save(figure: Figure, folder: Path, stem: str) -> list[Path]:
+    """Write a figure as PDF (vector) and PNG (200 dpi); equal figures give equal bytes.
+
+    Args:
+        figure: made within ``context``.
+        folder: made if it is not there.
+        stem: of the two file names.
+    """
+    pdf, png = folder / f"{stem}.pdf", save_png(figure, folder / f"{stem}.png")
+    blank = {"Creator": "recrl", "Producer": None, "CreationDate": None}
+    with context():  # ticks are only made now
+        figure.set_layout_engine("none")  # keep the places just found: finding them takes a second
+        figure.savefig(pdf, metadata=blank)
+    return [pdf, png]
+
+
+def save_png(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG; equal figures give equal bytes.
+
+    Args:
+        figure: made within ``context``.
+        path: of the file; its folder is made if it is not there.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _show_dollars(figure)
+    with context():
+        figure.savefig(path, dpi=PNG_DPI, metadata={"Software": None})
+    return path
+
+
+def _show_dollars(figure: Figure) -> None:
+    """Let a label that holds a dollar sign be text and not TeX, which it need not be right as."""
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and "$" in OUR_FORMULAS.sub("", text.get_text()):
+            text.set_parse_math(False)

@@ -1,0 +1,192 @@
+"""What the trials achieved, as tables: CSV with every digit for programs, Markdown and LaTeX for people.
+
+In the tables for people a value is "mean ± standard error" over seeds, and a share of seeds is "3 of 5" with
+Wilson's 95% interval in percent behind it: never a percentage without the numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from recrl.analysis.data.sweep_data import GROUP
+from recrl.analysis.statistics.metrics import Measure
+from recrl.orchestrator.redaction import printable
+
+DASH = "–"
+TOO_FEW = "†"
+LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "&": r"\&",
+    "%": r"\%",
+    "_": r"\_",
+    "#": r"\#",
+    "±": r"$\pm$",
+    "≤": r"$\leq$",
+    TOO_FEW: r"$\dagger$",
+}
+
+
+def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+    """Return, costs, gap to the optimum and share of feasible seeds, as text.
+
+    The gap is only an honest score where the seeds are feasible: who breaks the limit can be above J*(d_d).
+
+    Args:
+        summary: of ``metrics.summary``.
+        measure: which of the three outcomes.
+    """
+    rows = summary[summary["measure"] == measure.value]
+    costs = [name for name in map(str, rows) if f"{name}_se" in rows and name.startswith("cost_")]
+    lines = []
+    for _, row in rows.iterrows():
+        line = {name: str(row[name]) for name in GROUP} | {"seeds": str(row["seeds"])}
+        line["return"] = with_error(row["episode_return"], row["episode_return_se"])
+        for name in costs:
+            title = "cost" if len(costs) == 1 else f"cost {int(name[5:]) + 1}"
+            line[title] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
+            line[f"limit of {title}"] = number(row[f"deploy_limit_{name[5:]}"])
+        line["optimum"] = number(row["optimal_return"])
+        line["gap"] = with_error(row["gap"], row["gap_se"])
+        seeds = int(row["seeds"])
+        low, high = round(100 * row["feasible_low"]), round(100 * row["feasible_high"])
+        line["cost ≤ limit"] = f"{row['feasible_seeds']} of {seeds} ({low}–{high}%)"
+        line["within one s.e."] = f"{row['feasible_within_se_seeds']} of {seeds}"
+        low, high = round(100 * row["optimal_low"]), round(100 * row["optimal_high"])
+        found = f"{row['optimal_seeds']} of {seeds} ({low}–{high}%)"
+        line["at the optimum"] = DASH if math.isnan(row["optimal_return"]) else found
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def comparison_table(comparisons: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+    """Paired differences to the student without a curriculum, as text.
+
+    Args:
+        comparisons: of ``metrics.comparisons``.
+        measure: which of the three outcomes.
+    """
+    rows = comparisons[comparisons["measure"] == measure.value]
+    costs = [name for name in map(str, rows) if name.startswith("cost_") and name.endswith("_difference")]
+    lines = []
+    for _, row in rows.iterrows():
+        line = {name: str(row[name]) for name in GROUP} | {"pairs of seeds": str(row["pairs"])}
+        line["return gained"] = with_interval(row, "return_difference")
+        for name in costs:
+            title = "cost added" if len(costs) == 1 else f"cost {int(name.split('_')[1]) + 1} added"
+            line[title] = with_interval(row, name)
+        mark = TOO_FEW if row["too_few_seeds"] else ""
+        line["P(higher return)"] = with_interval(row, "improvement") + mark
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def number(value: float) -> str:
+    """A value with as many digits as it deserves; a dash for NaN.
+
+    >>> [number(value) for value in (9.5, 128.44, 0.0312, 0.0, float("nan"))]
+    ['9.50', '128.4', '0.031', '0.00', '–']
+    """
+    if math.isnan(value):
+        return DASH
+    size = abs(value)
+    digits = 1 if size >= 100.0 else 3 if 0.0 < size < 0.1 else 2
+    return f"{value:.{digits}f}"
+
+
+def with_error(mean: float, error: float, *, digits: int = 2) -> str:
+    """Mean ± standard error, the error left out where one seed has none.
+
+    Args:
+        mean: NaN becomes a dash.
+        error: of the mean, or NaN.
+        digits: after the point; one is enough from 100 on.
+
+    >>> with_error(9.41, 0.05), with_error(9.41, float("nan")), with_error(-20.0, 0.0)
+    ('9.41 ± 0.05', '9.41', '-20.00 ± 0.00')
+    >>> with_error(5.002, 0.001, digits=3), with_error(-0.001, 0.012)
+    ('5.002 ± 0.001', '0.00 ± 0.01')
+    """
+    if math.isnan(mean):
+        return DASH
+    shown = 1 if abs(mean) >= 100.0 else digits
+    value = round(mean, shown) + 0.0  # no -0.00
+    return f"{value:.{shown}f}" if math.isnan(error) else f"{value:.{shown}f} ± {error:.{shown}f}"
+
+
+def with_interval(row: pd.Series, name: str) -> str:
+    """Estimate [low, high] from the three columns of an interval; without ends where there are none."""
+    estimate, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    ends = "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
+    return DASH if math.isnan(estimate) else f"{estimate:.2f}{ends}"
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A Markdown table; repeated labels in the first columns stay, so that it can be sorted and searched.
+
+    >>> print(markdown(pd.DataFrame({"task": ["1a"], "return": ["9.50"]})))
+    | task | return |
+    | --- | --- |
+    | 1a | 9.50 |
+    """
+    lines = [list(map(str, table)), ["---"] * len(table.columns), *table.astype(str).to_numpy().tolist()]
+    return "\n".join("| " + " | ".join(map(markdown_text, line)) + " |" for line in lines)
+
+
+def markdown_text(text: str) -> str:
+    r"""A text that Markdown shows as it is where it would be HTML, a link or the end of a cell.
+
+    >>> markdown_text("<img src=x> [a](b) | c")
+    '&lt;img src=x&gt; [a]\\(b) \\| c'
+    """
+    text = " ".join(printable(text).split())
+    for mark, escaped in {"<": "&lt;", ">": "&gt;", "](": r"]\(", "|": r"\|"}.items():
+        text = text.replace(mark, escaped)
+    return text
+
+
+def latex(table: pd.DataFrame) -> str:
+    """A LaTeX tabular for the package booktabs, with a rule between tasks."""
+    lines = [r"\begin{tabular}{" + "l" * len(table.columns) + "}", r"\toprule"]
+    lines += [_latex_line(list(map(str, table))), r"\midrule"]
+    before = None
+    for cells in table.astype(str).to_numpy().tolist():
+        if before is not None and cells[0] != before:
+            lines.append(r"\midrule")
+        before = cells[0]
+        lines.append(_latex_line(cells))
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
+
+
+def write_csv(frame: pd.DataFrame, path: Path) -> Path:
+    """A frame with every digit; floats as the shortest text that reads back equal."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame.to_csv(path, index=False, lineterminator="\n")
+    return path
+
+
+def write_parquet(frame: pd.DataFrame, path: Path) -> Path:
+    """A frame with its types, for programs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame.to_parquet(path, index=False)
+    return path
+
+
+def write_text(text: str, path: Path) -> Path:
+    """A text file that ends with a line feed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+    return path
+
+
+def _latex_line(cells: Sequence[str]) -> str:
+    escaped = ["".join(LATEX.get(letter, letter) for letter in cell.replace("–", "--")) for cell in cells]
+    return " & ".join(escaped) + r" \\"

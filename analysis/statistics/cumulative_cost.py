@@ -1,0 +1,309 @@
+"""What a training phase cost beside what theory allows: Proposition 1 on the trials of a sweep.
+
+Everything is summed over the n policies of the training phase, one expected episode each, as in
+``recrl.teachers.bounds``; a trial that collects E episodes with each policy costs E times as much.
+
+Undiscounted (the unit of all limits here), a row a trial:
+
+    cost_sum         sum_b C_b, the measured mean episode cost of each policy
+    limit_sum        sum_b D_b, the limits that were in force (the cost itself where they were infinite)
+    overshoot_sum    sum_b max(0, C_b - D_b), what the student really went over them
+    violation_sum    sum_b max(0, C_b - d_d), what relaxing really cost
+    bound            H c_max + sum_{b<n} min(D_b + excess_b, H c_max), what the n policies are expected to
+                     cost at most if every update solves CPO's problem: policy b + 1 is the answer to the
+                     problem with limit D_b (``bounds.undiscounted_excess``), the first one is nobody's
+    ceiling_sum      n H c_max, what n policies can cost at all
+
+Discounted, as the paper has it, never to be added to the above:
+
+    discounted_excess_sum   the sum over b < n of Lemma 1's sqrt(2 delta_b) gamma eps_b / (1 - gamma)^2
+    discounted_bound        H c_max + sum_{b<n} min(D_b + discounted excess_b, H c_max): Proposition 1 on the
+                            limits that were in force
+
+delta_b is the mean KL divergence that the trial measured of the update from policy b, gamma the student's
+own. eps_b is at most c_max / (1 - gamma). Where the student reports its largest cost advantage in the batch
+(``cost_advantage_max_i``), that is taken if it is less: an estimate, which no proof covers. The undiscounted
+advantages are not measured: H c_max bounds them, crudely, and so the undiscounted bound is near the ceiling.
+A policy's discounted cost, which is not recorded, is at most its undiscounted one: a run whose cost_sum is
+within ``discounted_bound`` keeps Proposition 1 all the more.
+
+Updates under an infinite limit (a d_t that is still being measured) have no bound but the ceiling. Where
+horizon and largest cost are unknown there is no ceiling: the first policy then counts with what it cost, and
+only ``discounted_bound`` can be told.
+
+Letters: b policies, n their number, C_b, D_b cost and limit, d_t, d_d training and deployment limit, H
+horizon, c_max largest cost of a step, delta, eps, gamma as in ``bounds``.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from recrl.analysis.data.sweep_data import GROUP, KEY, Sweep
+from recrl.analysis.report_tables import number
+from recrl.environments.cmdp import Floats, Phase
+from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
+from recrl.environments.registry import find_task, make_vector, task_options
+from recrl.orchestrator.errors import RecrlError
+from recrl.teachers.bounds import (
+    MEAN_WEIGHTS,
+    discounted_excess,
+    largest_train_limit,
+    undiscounted_excess,
+)
+
+
+@dataclass(frozen=True)
+class TaskSizes:
+    """What bounds any policy's cost on a finite task.
+
+    Attributes:
+        horizon: H, most steps of an episode.
+        largest_cost: c_max, of a step.
+    """
+
+    horizon: int
+    largest_cost: float
+
+    @property
+    def ceiling(self) -> float:
+        """H c_max, the most that an episode can cost."""
+        return self.horizon * self.largest_cost
+
+
+def policy_costs(
+    updates: pd.DataFrame, *, cost: int, sizes: TaskSizes | None, discount: float | None
+) -> pd.DataFrame:
+    """What each policy of one trial's training phase cost, and at most was expected to: a row a policy.
+
+    Args:
+        updates: of the trial's training phase.
+        cost: i, which cost.
+        sizes: of the task, None if unknown.
+        discount: gamma of a CPO student; None for others, of which nothing is proven.
+
+    Returns:
+        end_step, cost, limit, ceiling, bound, discounted_excess (of the update that made the policy, 0 for
+        the first), discounted_bound: the summands of what the module's docstring lists; NaN where unknown.
+    """
+    costs = updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)  # none ended: as the one before
+    limits = updates[f"limit_{cost}"].to_numpy(np.float64)
+    ceiling = math.inf if sizes is None else sizes.ceiling
+    first = costs[0] if sizes is None else ceiling
+
+    def bounded(excesses: Sequence[float]) -> Floats:
+        return np.array([first, *np.minimum(limits[:-1] + np.array(excesses), ceiling)])
+
+    policies = pd.DataFrame({"end_step": updates["end_step"].to_numpy(), "cost": costs, "limit": limits})
+    policies["ceiling"] = math.nan if sizes is None else ceiling
+    policies[["bound", "discounted_excess", "discounted_bound"]] = math.nan
+    if discount is None or "kl" not in updates:
+        return policies
+    divergences = updates["kl"].to_numpy(np.float64)[:-1].clip(min=0.0).tolist()
+    advantages = _advantages(updates, cost, sizes, discount)[:-1].tolist()
+    discounted = [
+        discounted_excess(kl, eps, discount=discount) for kl, eps in zip(divergences, advantages, strict=True)
+    ]
+    policies["discounted_excess"] = [0.0, *discounted]
+    policies["discounted_bound"] = bounded(discounted)
+    if sizes is not None:
+        excesses = [undiscounted_excess(kl, ceiling, horizon=sizes.horizon) for kl in divergences]
+        policies["bound"] = bounded(excesses)
+    return policies
+
+
+def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, discount: float) -> Floats:
+    """The eps of each update: the largest that can be, or that the student saw, if that is less."""
+    largest = math.inf if sizes is None else sizes.largest_cost / (1.0 - discount)
+    name = f"cost_advantage_max_{cost}"
+    seen = updates[name].to_numpy(np.float64) if name in updates else np.full(len(updates), math.inf)
+    return np.asarray(np.fmin(seen, largest))
+
+
+def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
+    """Measured sums and bounds: a row a trial whose training phase is done.
+
+    Args:
+        sweep: the frames.
+        cost: i, which cost.
+
+    Returns:
+        KEY, policies (n), episodes_per_policy, train_limit (the d_t in force at the start of the
+        curriculum), deploy_limit, and the quantities that the module's docstring lists; NaN where they are
+        unknown, the bounds also for students but CPO, of which nothing is proven.
+    """
+    trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
+    runs = training_runs(sweep)
+    lines = []
+    for _, trial in trained[trained[f"deploy_limit_{cost}"].notna()].iterrows():
+        key = tuple(trial[name] for name in KEY)
+        start = trial[f"start_limit_{cost}"]
+        given = trial[f"train_limit_{cost}"] if math.isnan(start) else start
+        deploy = float(trial[f"deploy_limit_{cost}"])
+        lines.append(
+            dict(zip(KEY, key, strict=True))
+            | {"train_limit": float(given), "deploy_limit": deploy}
+            | {"episodes_per_policy": float(runs[key]["episodes"].mean())}
+            | _sums(policies_of(sweep, trial, runs[key], cost=cost), deploy)
+        )
+    rows = pd.DataFrame(lines)
+    for name in KEY[:3] if len(rows) else ():
+        rows[name] = rows[name].astype(sweep.trials[name].dtype)
+    return rows
+
+
+def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.DataFrame:
+    """The largest d_t that a budget of cumulative violation allows: a row a GROUP with a bound.
+
+    The inverse of Proposition 1 (``bounds.largest_train_limit``). The excess of an update is not the proven
+    one, which allows nothing, but the mean overshoot that the group's runs measured, the worst run's.
+
+    Args:
+        rows: of ``cumulative_costs``.
+        sweep: the same.
+        budget: expected cost above d_d, summed over all episodes of a training phase, at least 0.
+
+    Returns:
+        GROUP, policies, episodes_per_policy, overshoot (assumed, per policy), used_train_limit (the
+        largest of the runs'), measured_violation (of the worst run, all its episodes),
+        largest_train_limit (NaN where d_t = d_d already exceeds the budget, infinite where d_t does not
+        matter).
+    """
+    if not budget >= 0.0:
+        raise RecrlError(f"--budget: must be at least 0, got {budget:g}")
+    names = {str(label): str(name) for label, name in sweep.trials[["method", "method_name"]].to_numpy()}
+    lines = []
+    for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
+        if (curriculum := names[str(group[2])]) not in MEAN_WEIGHTS:
+            continue
+        policies, episodes = int(runs["policies"].iloc[0]), float(runs["episodes_per_policy"].mean())
+        overshoot = float((runs["overshoot_sum"] / runs["policies"]).max())
+        deploy = float(runs["deploy_limit"].iloc[0])
+        allowed = policies * deploy + budget / episodes
+        try:
+            limit = largest_train_limit(
+                curriculum, allowed, deploy, excesses=[overshoot] * policies, clock="start"
+            )
+        except ValueError:  # less than what d_t = d_d costs
+            limit = math.nan
+        lines.append(
+            dict(zip(GROUP, group, strict=True))
+            | {"policies": policies, "episodes_per_policy": episodes, "overshoot": overshoot}
+            | {"used_train_limit": float(runs["train_limit"].max())}
+            | {"measured_violation": float((runs["violation_sum"] * runs["episodes_per_policy"]).max())}
+            | {"largest_train_limit": limit}
+        )
+    return pd.DataFrame(lines)
+
+
+def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """The sums of ``cumulative_costs`` as text: a row a GROUP, means over its runs."""
+    lines = []
+    for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
+        line = {name: str(label) for name, label in zip(GROUP, group, strict=True)}
+        line |= {"runs": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
+        for title, name in (
+            ("cost", "cost_sum"),
+            ("limits", "limit_sum"),
+            ("over limits", "overshoot_sum"),
+            ("over d_d", "violation_sum"),
+            ("bound for CPO", "bound"),
+            ("discounted", "discounted_bound"),
+            ("ceiling", "ceiling_sum"),
+        ):
+            line[title] = number(float(runs[name].mean()))
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """The limits of ``admissible_limits`` as text."""
+    lines = []
+    for _, row in rows.iterrows():
+        limit = float(row["largest_train_limit"])
+        lines.append(
+            {name: str(row[name]) for name in GROUP}
+            | {"overshoot a policy": number(row["overshoot"])}
+            | {"violation of the worst run": number(row["measured_violation"])}
+            | {"its d_t": number(row["used_train_limit"])}
+            | {"largest d_t": "any" if math.isinf(limit) else "none" if math.isnan(limit) else number(limit)}
+        )
+    return pd.DataFrame(lines)
+
+
+def training_runs(sweep: Sweep) -> dict[Any, pd.DataFrame]:
+    """The updates of every trial's training phase, by KEY."""
+    updates = sweep.updates[sweep.updates["phase"] == Phase.TRAINING.value]
+    return dict(iter(updates.groupby(list(KEY), observed=True)))
+
+
+def policies_of(sweep: Sweep, trial: pd.Series, updates: pd.DataFrame, *, cost: int) -> pd.DataFrame:
+    """``policy_costs`` of a trial.
+
+    Args:
+        sweep: what it is a trial of.
+        trial: its row of ``sweep.trials``.
+        updates: of its training phase.
+        cost: i, which cost.
+    """
+    sizes = task_sizes(str(trial["task_name"]), sweep.task_options[str(trial["task"])], cost)
+    return policy_costs(updates, cost=cost, sizes=sizes, discount=_discount(sweep, trial))
+
+
+def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | None:
+    """Horizon and largest cost of a step of a finite task; None for others."""
+    try:
+        if find_task(name).optimum is None:  # no finite task is without, and others can be slow to build
+            return None
+    except (UnknownNameError, UntrustedNameError):  # not installed here
+        return None
+    return _sizes_of(name, task_options(name, options).model_dump_json(), cost)
+
+
+@functools.lru_cache(maxsize=256)
+def _sizes_of(name: str, canonical: str, cost: int) -> TaskSizes | None:
+    environment = make_vector(name, 1, options=json.loads(canonical))
+    if not isinstance(environment, FiniteVectorEnv):
+        return None
+    model = environment.finite_cmdp()
+    return TaskSizes(model.horizon, float(model.costs[:, :, cost].max()))
+
+
+def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
+    """The discount gamma of a CPO student, None for others: Lemma 1 is not about them."""
+    options = sweep.agent_options[str(trial["agent"])]
+    discount = options.get("discount", math.nan)
+    if trial["agent_name"] != "cpo":
+        return None
+    return float(discount) if isinstance(discount, int | float) else math.nan
+
+
+def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:
+    """The sums over the policies of a trial."""
+    costs, limits = policies["cost"].to_numpy(np.float64), policies["limit"].to_numpy(np.float64)
+    return {
+        "policies": len(costs),
+        "cost_sum": float(costs.sum()),
+        "limit_sum": float(np.where(np.isfinite(limits), limits, costs).sum()),
+        "overshoot_sum": float(np.maximum(costs - limits, 0.0).sum()),
+        "violation_sum": float(np.maximum(costs - deploy, 0.0).sum()),
+        "bound": _sum(policies["bound"]),
+        "ceiling_sum": _sum(policies["ceiling"]),
+        "discounted_excess_sum": _sum(policies["discounted_excess"]),
+        "discounted_bound": _sum(policies["discounted_bound"]),
+    }
+
+
+def _sum(values: pd.Series[float]) -> float:
+    """NaN where one is unknown or infinite: then nothing is told."""
+    total = math.fsum(values) if np.isfinite(values).all() else math.nan
+    return float(total)

@@ -1,0 +1,137 @@
+"""What limits another teacher would have set on the recorded episodes of a run.
+
+A teacher is a pure function of what it is told, so a run's files are enough to ask it again: every policy
+update becomes the ``ProgressReport`` that the trial sent. A run's own teacher gives the run's own limits.
+
+What it cannot say is how the student would have done under the other limits: the episodes stay those that
+were played under the recorded ones. It shows what a teacher makes of a given course of training, for example
+whether a dynamic curriculum's window or tolerance would have let it move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from recrl.analysis.report_tables import number
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.spec import Choice
+from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import ProgressReport, TeacherSpec
+
+
+def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
+    """Ask a teacher for its limits on a run's recorded episodes: a row a policy update.
+
+    Args:
+        trial: the run, finished or not.
+        method: the teacher and its options.
+
+    Returns:
+        update, phase, end_step, cost_i, limit_i and noise as recorded, replayed_limit_i and replayed_noise.
+
+    Raises:
+        RecrlError: the run has no update yet.
+        UnknownNameError: nobody provides the teacher.
+        pydantic.ValidationError: its options are wrong.
+    """
+    updates = trial.updates()
+    if not len(updates):
+        raise RecrlError(f"{trial.spec.title}: cannot be replayed, because it has no policy update yet")
+    spec = trial.spec
+    teacher = make_teacher(
+        TeacherSpec(method.name, method.options, spec.train_limits, spec.deploy_limits, spec.train_steps)
+    )
+    step, state = teacher.start()
+    steps = []
+    for report in progress_reports(trial, updates):
+        steps.append(step)
+        if report.env_steps < spec.train_steps:
+            step, state = teacher.step(state, report)
+        else:
+            step = CurriculumStep(spec.deploy_limits)
+    costs = range(len(spec.deploy_limits))
+    recorded = (f"{name}_{i}" for name in ("cost", "limit") for i in costs)
+    columns = ["update", "phase", "end_step", *recorded, "noise"]
+    limits = {f"replayed_limit_{i}": [each.limits[i] for each in steps] for i in costs}
+    return updates[columns].assign(**limits, replayed_noise=[each.policy_noise for each in steps])
+
+
+def progress_reports(trial: TrialStore, updates: pd.DataFrame) -> Iterator[ProgressReport]:
+    """What the trial told its teacher after each policy update.
+
+    Args:
+        trial: the run.
+        updates: its committed updates.
+    """
+    episodes = trial.episodes()
+    num_costs = len(trial.spec.deploy_limits)
+    ends = np.cumsum(updates["episodes"].to_numpy(np.int64)).tolist()
+    starts = [0, *ends[:-1]]
+    rows = episodes.to_dict("records") if len(episodes) else []
+    for update, end_step, first, last in zip(
+        updates["update"], updates["end_step"], starts, ends, strict=True
+    ):
+        batch = tuple(_episode(row, num_costs) for row in rows[first:last])
+        yield ProgressReport(update=int(update), env_steps=int(end_step), episodes=batch)
+
+
+def replay_summary(trial: TrialStore, rows: pd.DataFrame) -> pd.DataFrame:
+    """How far a replay departs from the record: a row a cost, as text.
+
+    Args:
+        trial: the run.
+        rows: of ``replay``.
+    """
+    training = rows[rows["phase"] == Phase.TRAINING.value]
+    lines = []
+    for i, deploy in enumerate(trial.spec.deploy_limits):
+        own = training[f"limit_{i}"].to_numpy(np.float64)
+        other = training[f"replayed_limit_{i}"].to_numpy(np.float64)
+        differ = own != other
+        lines.append(
+            {"trial": trial.spec.title, "cost": str(i + 1), "updates": str(len(training))}
+            | {"other limit": str(int(differ.sum()))}
+            | {"mean limit": _mean(own), "replayed": _mean(other)}
+            | {"reaches d_d": _reached(training, own, deploy)}
+            | {"replayed reaches d_d": _reached(training, other, deploy)}
+            | {
+                "noise": str(_times(training["noise"])),
+                "replayed noise": str(_times(training["replayed_noise"])),
+            }
+        )
+    return pd.DataFrame(lines)
+
+
+def _episode(row: dict[Any, Any], num_costs: int) -> EpisodeStats:
+    return EpisodeStats(
+        index=row["index"],
+        phase=Phase(row["phase"]),
+        end_step=row["end_step"],
+        length=row["length"],
+        episode_return=row["episode_return"],
+        costs=tuple(row[f"cost_{i}"] for i in range(num_costs)),
+        limits=CostLimits(tuple(row[f"limit_{i}"] for i in range(num_costs))),
+        noise=row["noise"],
+    )
+
+
+def _mean(limits: Sequence[float] | np.ndarray) -> str:
+    """The mean of the finite limits."""
+    finite = np.asarray(limits)[np.isfinite(limits)]
+    return number(float(finite.mean())) if len(finite) else "∞"
+
+
+def _reached(training: pd.DataFrame, limits: np.ndarray, deploy: float) -> str:
+    """When a limit is first d_d, as a share of the training phase."""
+    steps = training.loc[limits <= deploy, "end_step"]
+    return f"{steps.iloc[0] / training['end_step'].iloc[-1]:.0%}" if len(steps) else "at its end"
+
+
+def _times(noise: pd.Series) -> str:
+    return str(int((noise > 0.0).sum()))

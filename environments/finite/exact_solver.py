@@ -1,0 +1,310 @@
+"""The constrained optimum J*(d) of a finite CMDP, and the exact return and costs of any policy.
+
+Two independent solvers of
+
+    J*(d) = max_pi J(pi)    such that    C_i(pi) <= d_i for all i,
+
+over all policies, time-dependent and random ones included, undiscounted over a finite horizon:
+``solve_by_linear_program`` states it over occupation measures (Altman 1999, chapter 3) and is for small
+horizons and for tests; ``solve_by_lagrangian`` solves RiverGrid's 200 steps in some 0.1 s. They agree under
+test.
+
+J* bounds what a student can reach from above: a student's policy sees no clock.
+
+Letters: H horizon, S states, A actions, k costs, t a time step, x an occupation measure, lambda the
+multipliers [k].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linprog
+from scipy.sparse import coo_array
+
+from recrl.environments.cmdp import CostLimits, Floats
+from recrl.environments.finite.finite_cmdp import FiniteCMDP, InfeasibleLimitsError, Integers
+
+TOLERANCE = 1e-9  # relative; on returns and costs
+MAX_POLICIES = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyValue:
+    """What a policy is worth over an episode.
+
+    Attributes:
+        episode_return: expected undiscounted return.
+        costs: expected undiscounted episode costs, [k].
+        visits: expected number of times that each pair is left, [S, A]; sums to the expected length.
+    """
+
+    episode_return: float
+    costs: Floats
+    visits: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class ConstrainedOptimum:
+    """A solution of a constrained problem.
+
+    Attributes:
+        episode_return: J*(d).
+        costs: expected undiscounted episode costs of ``policy``, [k].
+        multipliers: lambda_i = dJ*/dd_i >= 0, what raising a limit by 1 is worth, [k]; 0 for infinite ones.
+        policy: an optimal policy, pi_t(a | s), [H, S, A].
+    """
+
+    episode_return: float
+    costs: Floats
+    multipliers: Floats
+    policy: Floats
+
+
+def evaluate_policy(model: FiniteCMDP, policy: Floats) -> PolicyValue:
+    """The exact value of a policy, by carrying the state distribution forward.
+
+    mu_0 = start, x_t(s, a) = mu_t(s) pi_t(a | s), mu_{t+1}(s') = sum_{s, a} x_t(s, a) T(s' | s, a).
+
+    Args:
+        model: the CMDP.
+        policy: pi(a | s), [S, A] (stationary) or [H, S, A].
+    """
+    table = (model.num_states, model.num_actions)
+    if policy.shape not in {table, (model.horizon, *table)}:
+        raise ValueError(
+            f"the policy must have shape {table} or {(model.horizon, *table)}, got {policy.shape}"
+        )
+    visits = _occupation(model, np.broadcast_to(policy, (model.horizon, *table))).sum(axis=0)
+    return PolicyValue(
+        episode_return=float(np.sum(visits * model.rewards)),
+        costs=np.einsum("sa,sak->k", visits, model.costs),
+        visits=visits,
+    )
+
+
+def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOptimum:
+    """J*(d) by its dual, min_{lambda >= 0} max_pi J(pi) - lambda . (C(pi) - d).
+
+    For a fixed lambda backward induction gives a best deterministic policy; a small linear program mixes the
+    policies found so far within the limits and its duals are the next lambda (the dual's cutting planes,
+    Dantzig-Wolfe). It ends when no policy beats the mixture at its own prices: then the two bounds meet. A
+    first round does the same to the smallest total excess over the limits, to know whether they can be kept.
+
+    Raises:
+        InfeasibleLimitsError: no policy keeps the limits.
+    """
+    constrained = np.array(limits.finite)
+    bounds = _checked_limits(model, limits)[constrained]
+    found = [_backward_induction(model, reward_weight=1.0, prices=np.zeros(model.num_costs))]
+    for reward_weight in (0.0, 1.0):
+        for _ in range(MAX_POLICIES):
+            weights, prices, bound = _mixture(found, bounds, constrained, reward_weight)
+            candidate = _backward_induction(model, reward_weight=reward_weight, prices=prices)
+            value = reward_weight * candidate.episode_return - prices @ candidate.costs
+            if value <= bound + TOLERANCE * (1.0 + abs(bound)):
+                break
+            found.append(candidate)
+        else:
+            raise RuntimeError(f"no optimum after {MAX_POLICIES} policies")
+        costs = weights @ np.array([policy.costs for policy in found[: len(weights)]])
+        excess = float(np.maximum(costs[constrained] - bounds, 0.0).sum())
+        if reward_weight == 0.0 and excess > 1e-6 * (1.0 + bounds.sum()):
+            raise InfeasibleLimitsError(
+                f"no policy keeps the limits {limits.to_json()}, the smallest total excess is {excess:.6g}"
+            )
+        bounds = np.maximum(bounds, costs[constrained])  # rounding must not make the next round infeasible
+    used = [(weight, policy) for weight, policy in zip(weights, found, strict=False) if weight > 0.0]
+    one_hot = np.eye(model.num_actions)
+    occupation = np.sum(
+        [weight * _occupation(model, one_hot[policy.actions]) for weight, policy in used], axis=0
+    )
+    return ConstrainedOptimum(
+        episode_return=float(sum(weight * policy.episode_return for weight, policy in used)),
+        costs=np.asarray(costs, np.float64),
+        multipliers=prices,
+        policy=_conditional(occupation),
+    )
+
+
+def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOptimum:
+    """J*(d) by linear programming over occupation measures x_t(s, a) >= 0 (HiGHS).
+
+    maximise    sum_{t, s, a} x_t(s, a) R(s, a)
+    subject to  sum_a x_0(s, a) = start(s),
+                sum_a x_t(s', a) = sum_{s, a} x_{t-1}(s, a) T(s' | s, a)    for every s' that is not terminal,
+                sum_{t, s, a} x_t(s, a) C_i(s, a) <= d_i,
+
+    and pi_t(a | s) is proportional to x_t(s, a). Only states that can be reached at time t get variables.
+
+    Raises:
+        InfeasibleLimitsError: no policy keeps the limits.
+    """
+    constrained = np.array(limits.finite)
+    bounds = _checked_limits(model, limits)[constrained]
+    times, states, flow, inflow = _flow_constraints(model)
+    solution = _minimise(
+        -model.rewards[states].reshape(-1),
+        at_most=(model.costs[states].reshape(-1, model.num_costs)[:, constrained].T, bounds),
+        equal=(flow, inflow),
+    )
+    if solution is None:
+        raise InfeasibleLimitsError(f"no policy keeps the limits {limits.to_json()}")
+    occupation = np.zeros((model.horizon, model.num_states, model.num_actions))
+    occupation[times, states] = np.maximum(solution.x, 0.0).reshape(-1, model.num_actions)
+    multipliers = np.zeros(model.num_costs)
+    multipliers[constrained] = solution.prices
+    return ConstrainedOptimum(
+        episode_return=float(np.sum(occupation * model.rewards)),
+        costs=np.einsum("tsa,sak->k", occupation, model.costs),
+        multipliers=multipliers,
+        policy=_conditional(occupation),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _DeterministicPolicy:
+    """One vertex of the set of (return, costs) that policies reach; ``actions`` is [H, S]."""
+
+    actions: npt.NDArray[np.int8]
+    episode_return: float
+    costs: Floats
+
+
+def _backward_induction(model: FiniteCMDP, *, reward_weight: float, prices: Floats) -> _DeterministicPolicy:
+    """A policy that maximises reward_weight J - prices . C, with its own J and C.
+
+    V_H = 0,  Q_t(s, a) = [R, C](s, a) + sum_s' T(s' | s, a) V_{t+1}(s'),
+    V_t(s) = Q_t(s, argmax_a [reward_weight, -prices] . Q_t(s, a)).
+    """
+    weights = np.concatenate([[reward_weight], -prices])
+    immediate = np.concatenate([model.rewards[:, :, None], model.costs], axis=2)
+    going_on = ~model.terminal[:, None]
+    values = np.zeros((model.num_states, 1 + model.num_costs))
+    actions = np.zeros((model.horizon, model.num_states), np.int8)
+    state = np.arange(model.num_states)
+    for step in reversed(range(model.horizon)):
+        future = np.einsum("sam,samc->sac", model.probabilities, (values * going_on)[model.successors])
+        action_values = immediate + future
+        actions[step] = np.argmax(action_values @ weights, axis=1)
+        values = action_values[state, actions[step]]
+    totals = model.start @ values
+    return _DeterministicPolicy(actions, float(totals[0]), totals[1:])
+
+
+def _mixture(
+    found: list[_DeterministicPolicy],
+    bounds: Floats,
+    constrained: npt.NDArray[np.bool_],
+    reward_weight: float,
+) -> tuple[Floats, Floats, float]:
+    """The best mixture of the policies found: weights, the prices of the limits [k], the bound to beat.
+
+    reward_weight 1: maximise the return within the limits. 0: minimise the total excess over them.
+    """
+    costs = np.array([policy.costs for policy in found])[:, constrained]
+    returns = np.array([policy.episode_return for policy in found])
+    # Excess over the limits is allowed, and the objective, only where the return is not.
+    slacks = 0 if reward_weight else len(bounds)
+    solution = _minimise(
+        np.concatenate([-reward_weight * returns, np.ones(slacks)]),
+        at_most=(np.hstack([costs.T, -np.eye(len(bounds), slacks)]), bounds),
+        equal=(np.concatenate([np.ones(len(found)), np.zeros(slacks)])[None], np.ones(1)),
+    )
+    assert solution is not None, "the first round leaves a mixture that keeps the limits"
+    prices = np.zeros(len(constrained))
+    prices[constrained] = solution.prices
+    return solution.x[: len(found)], prices, -float(solution.equality_marginals[0])
+
+
+@dataclass(frozen=True, eq=False)
+class _LinearSolution:
+    """A minimiser, and what a unit of right-hand side is worth.
+
+    Attributes:
+        x: the minimiser.
+        prices: how far the minimum falls per unit of each upper bound, >= 0.
+        equality_marginals: how far it rises per unit of each equality.
+    """
+
+    x: Floats
+    prices: Floats
+    equality_marginals: Floats
+
+
+def _minimise(
+    objective: Floats, *, at_most: tuple[Floats, Floats], equal: tuple[Any, Floats]
+) -> _LinearSolution | None:
+    """Minimise c . x over x >= 0 with A x <= b, A' x = b' (A' may be sparse); None if infeasible."""
+    (upper_matrix, upper), (equal_matrix, right_hand_side) = at_most, equal
+    solution = linprog(objective, upper_matrix, upper, equal_matrix, right_hand_side, method="highs")
+    if solution.status == 2:
+        return None
+    if solution.status != 0:
+        raise RuntimeError(f"the linear program was not solved: {solution.message}")
+    return _LinearSolution(
+        x=np.asarray(solution.x),
+        prices=np.maximum(-np.asarray(solution.ineqlin.marginals), 0.0),
+        equality_marginals=np.asarray(solution.eqlin.marginals),
+    )
+
+
+def _occupation(model: FiniteCMDP, policy: Floats) -> Floats:
+    """x_t(s, a) of a policy [H, S, A], in the policy's shape."""
+    occupation = np.zeros((model.horizon, model.num_states, model.num_actions))
+    distribution: Floats = model.start
+    successors = model.successors.reshape(-1)
+    for step in range(model.horizon):
+        occupation[step] = distribution[:, None] * policy[step]
+        flow = (occupation[step][:, :, None] * model.probabilities).reshape(-1)
+        distribution = np.bincount(successors, weights=flow, minlength=model.num_states).astype(np.float64)
+        distribution[model.terminal] = 0.0
+    return occupation
+
+
+def _conditional(occupation: Floats) -> Floats:
+    """pi_t(a | s) = x_t(s, a) / sum_a x_t(s, a); uniform where nobody gets."""
+    mass = occupation.sum(axis=2, keepdims=True)
+    policy: Floats = np.full_like(occupation, 1.0 / occupation.shape[2])
+    np.divide(occupation, mass, out=policy, where=mass > 1e-12)
+    return policy
+
+
+def _flow_constraints(model: FiniteCMDP) -> tuple[Integers, Integers, coo_array, Floats]:
+    """The variables' times and states (each with A actions), and the flow equations on them."""
+    reachable = np.zeros((model.horizon, model.num_states), np.bool_)
+    reachable[0] = model.start > 0.0
+    for step in range(1, model.horizon):
+        previous = reachable[step - 1]
+        possible = model.successors[previous][model.probabilities[previous] > 0.0]
+        reachable[step, possible] = True
+        reachable[step, model.terminal] = False
+    times, states = np.nonzero(reachable)
+    row_of = np.full((model.horizon + 1, model.num_states), -1)
+    row_of[times, states] = np.arange(len(times))
+    columns = np.arange(len(times) * model.num_actions)
+    own_rows = np.repeat(np.arange(len(times)), model.num_actions)
+    num_successors = model.successors.shape[2]
+    next_rows = row_of[times[:, None, None] + 1, model.successors[states]].reshape(-1)
+    flowing = model.probabilities[states].reshape(-1)
+    counted = (next_rows >= 0) & (flowing > 0.0)
+    flow = coo_array(
+        (
+            np.concatenate([np.ones(len(columns)), -flowing[counted]]),
+            (
+                np.concatenate([own_rows, next_rows[counted]]),
+                np.concatenate([columns, np.repeat(columns, num_successors)[counted]]),
+            ),
+        ),
+        shape=(len(times), len(columns)),
+    )
+    return times, states, flow, np.where(times == 0, model.start[states], 0.0)
+
+
+def _checked_limits(model: FiniteCMDP, limits: CostLimits) -> Floats:
+    if len(limits) != model.num_costs:
+        raise ValueError(f"the CMDP has {model.num_costs} costs, got {len(limits)} limits")
+    return limits.array

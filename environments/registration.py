@@ -1,0 +1,45 @@
+"""Names of our tasks in Gymnasium's registry.
+
+    gymnasium.make("recrl.environments.registration:recrl/CarGoal2-v0")
+
+Gymnasium imports the module before the colon, which registers all tasks. The tasks themselves are imported
+when one of them is made.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from recrl.environments.rivergrid.maps import MAPS
+from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.velocity.tasks import VELOCITY_TASKS
+
+RIVER_GRID = "recrl.environments.rivergrid.minigrid_env:RiverGridEnv"
+SAFETY_GYM = "recrl.environments.safety_gym.environments"
+VELOCITY = "recrl.environments.velocity.environments"
+
+
+def register_all() -> None:
+    """Make all tasks known to Gymnasium: ``recrl/RiverGrid-1a-v0``, ``recrl/CarGoal2-v0``, and so on."""
+    if "recrl/RiverGrid-v0" in gymnasium.registry:
+        return
+    gymnasium.register("recrl/RiverGrid-v0", entry_point=RIVER_GRID)
+    for name, drawing in MAPS.items():
+        gymnasium.register(f"recrl/RiverGrid-{name}-v0", entry_point=RIVER_GRID, kwargs={"drawing": drawing})
+    for name in SAFETY_TASKS:
+        _register(f"recrl/{name}-v0", name, f"{SAFETY_GYM}:SafetyGymEnv", f"{SAFETY_GYM}:SafetyGymVectorEnv")
+    for name in VELOCITY_TASKS:
+        _register(f"recrl/{name}-v1", name, f"{VELOCITY}:VelocityEnv", f"{VELOCITY}:VelocityVectorEnv")
+
+
+def _register(identifier: str, task: str, single: str, batch: str) -> None:
+    gymnasium.register(
+        identifier,
+        entry_point=single,
+        vector_entry_point=batch,
+        kwargs={"task": task},
+        disable_env_checker=True,  # its checks would take a tenth of every step; the tests make them
+    )
+
+
+register_all()

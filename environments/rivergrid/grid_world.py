@@ -1,0 +1,226 @@
+"""RiverGrid (paper, section 5 and figure 1): a grid world in which the short way leads through a river.
+
+Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), float32 [width + height + 4].
+Action: Discrete(3), MiniGrid's first three: 0 turn left, 1 turn right, 2 forward (into a wall: stay).
+Reward: -0.1 a step; +10 instead on the step that reaches a goal.
+Cost: ``river`` 1 for every time step that ends on a river tile, turning and bumping there included; on demand
+    ``turns`` 1 for every turn, and ``mud`` 1 for every time step that ends on a muddy tile, which make tasks
+    with two and three constraints whose optimum is still exact.
+Termination: at a goal; truncated after ``horizon`` steps (200).
+Source: the paper's section 5 for the idea, the limits and the cost (time steps in the water). It gives
+    neither maps (its figure is not in its text) nor rewards nor a horizon: those are ours, such that every
+    statement of the paper about the two instances holds (``recrl.environments.rivergrid.maps``).
+
+Deterministic: seeding is accepted and changes nothing. ``RiverGridVectorEnv`` steps tables;
+``recrl.environments.rivergrid.minigrid_env`` is the same CMDP on MiniGrid, step for step equal under test.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError, Integers
+from recrl.environments.plugins import load_attribute
+from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance
+from recrl.environments.rivergrid.maps import (
+    GOAL,
+    MAPS,
+    MUD,
+    RIVER,
+    STEPS,
+    WALL,
+    MapGenerator,
+    RiverMap,
+    generate_map,
+    parse_map,
+    read_map,
+)
+
+STEP_REWARD = -0.1
+GOAL_REWARD = 10.0
+HORIZON = 200
+HEADINGS = 4
+LEFT, RIGHT, FORWARD = 0, 1, 2
+CostName = Literal["river", "turns", "mud"]
+
+
+class RiverGridOptions(BaseModel):
+    """Settings of ``rivergrid-1a`` and ``rivergrid-1b``, and of the other maps besides their own."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    horizon: int = Field(
+        default=HORIZON, ge=1, le=10_000, description="H, steps after which an episode is truncated (ours)."
+    )
+    costs: tuple[CostName, ...] = Field(
+        default=("river",),
+        min_length=1,
+        description="The cost functions in order, river (the paper's), turns and mud (ours), 1 a step each.",
+    )
+
+    @field_validator("costs")
+    @classmethod
+    def _distinct(cls, costs: tuple[CostName, ...]) -> tuple[CostName, ...]:
+        if len(set(costs)) != len(costs):
+            raise ValueError(f"must differ, got {', '.join(costs)}")
+        return costs
+
+
+class RiverGridMapOptions(RiverGridOptions):
+    """Settings of ``rivergrid``: a map of one's own, or a random one."""
+
+    map: str | None = Field(
+        default=None,
+        description="The drawing itself, or the path of a text file that holds it; the drawing is kept.",
+    )
+    generate: MapGenerator | None = Field(default=None, description="What to draw a random map from.")
+
+    @field_validator("map")
+    @classmethod
+    def _drawn(cls, text: str | None) -> str | None:
+        if text is None:
+            return None
+        # The drawing, not the path, is what a trial depends on, so it is what the options keep.
+        return str(parse_map(text) if "\n" in text else read_map(Path(text)))
+
+    @field_validator("generate")
+    @classmethod
+    def _possible(cls, settings: MapGenerator | None) -> MapGenerator | None:
+        if settings is not None:
+            generate_map(settings)
+        return settings
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.map is None) == (self.generate is None):
+            raise ValueError("rivergrid needs either map or generate (or use rivergrid-1a, rivergrid-1b)")
+        return self
+
+    def river_map(self) -> RiverMap:
+        """The map that the settings stand for."""
+        return generate_map(self.generate) if self.generate is not None else parse_map(self.map or "")
+
+
+class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):
+    """Settings of ``rivergrid-generated``: an instance like the paper's two, drawn at random."""
+
+    @model_validator(mode="after")
+    def _can_be_drawn(self) -> Self:
+        self.river_map()
+        return self
+
+    def river_map(self) -> RiverMap:
+        """The map that the settings stand for."""
+        return draw_instance(self)
+
+
+def state_index(river_map: RiverMap, x: int, y: int, heading: int) -> int:
+    """The number of state (x, y, heading): (x * height + y) * 4 + heading."""
+    return (x * river_map.height + y) * HEADINGS + heading
+
+
+def river_observations(river_map: RiverMap) -> npt.NDArray[np.float32]:
+    """What an agent sees in each state, float32 [S, width + height + 4]."""
+    shape = (river_map.width, river_map.height, HEADINGS)
+    columns = np.indices(shape).reshape(3, -1)
+    return np.concatenate(
+        [np.eye(size, dtype=np.float32)[index] for size, index in zip(shape, columns, strict=True)], axis=1
+    )
+
+
+def river_cmdp(river_map: RiverMap, *, costs: Sequence[CostName], horizon: int) -> FiniteCMDP:
+    """The tables of RiverGrid: S = 4 width height states, walls included though nobody gets there."""
+    num_states = river_map.width * river_map.height * HEADINGS
+    successors: Integers = np.zeros((num_states, 3), np.int64)
+    tiles = np.full(num_states, WALL)
+    for x in range(river_map.width):
+        for y in range(river_map.height):
+            tile = river_map.tile((x, y))
+            for heading in range(HEADINGS):
+                state = state_index(river_map, x, y, heading)
+                tiles[state] = tile
+                successors[state, LEFT] = state_index(river_map, x, y, (heading - 1) % HEADINGS)
+                successors[state, RIGHT] = state_index(river_map, x, y, (heading + 1) % HEADINGS)
+                successors[state, FORWARD] = state
+                ahead = (x + STEPS[heading][0], y + STEPS[heading][1])
+                if tile != WALL and river_map.tile(ahead) != WALL:
+                    successors[state, FORWARD] = state_index(river_map, *ahead, heading)
+    reached, terminal = tiles[successors], tiles == GOAL
+    cost_tables = {
+        "river": (reached == RIVER).astype(np.float64),
+        "turns": np.tile([1.0, 1.0, 0.0], (num_states, 1)),
+        "mud": (reached == MUD).astype(np.float64),
+    }
+    start = np.zeros(num_states)
+    start[state_index(river_map, *river_map.start, river_map.heading)] = 1.0
+    return FiniteCMDP(
+        successors=successors[:, :, None],
+        probabilities=np.ones((num_states, 3, 1)),
+        rewards=np.where(terminal[successors], GOAL_REWARD, STEP_REWARD),
+        costs=np.stack([cost_tables[name] for name in costs], axis=2),
+        terminal=terminal,
+        start=start,
+        horizon=horizon,
+        cost_names=tuple(costs),
+    )
+
+
+class RiverGridVectorEnv(FiniteVectorEnv):
+    """B RiverGrids stepped by table look-ups; see the module's docstring.
+
+    Attributes:
+        river_map: the map.
+    """
+
+    render_mode = "rgb_array"
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        **FiniteVectorEnv.metadata,
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+    }
+
+    def __init__(self, name: str, river_map: RiverMap, options: RiverGridOptions, *, num_envs: int) -> None:
+        model = river_cmdp(river_map, costs=options.costs, horizon=options.horizon)
+        observations = river_observations(river_map)
+        super().__init__(name, model, observations, num_envs=num_envs)
+        self.river_map = river_map
+
+    def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
+        """One RGB frame per environment, uint8 [height * 32, width * 32, 3], as MiniGrid draws it."""
+        render_frame = load_attribute("recrl.environments.rivergrid.minigrid_env:render_frame")
+        frames = []
+        for state in self.states.tolist():
+            cell, heading = divmod(state, HEADINGS)
+            frames.append(render_frame(self.river_map, divmod(cell, self.river_map.height), heading))
+        return tuple(frames)
+
+
+def task_map(name: str, options: RiverGridOptions) -> RiverMap:
+    """The map of ``rivergrid`` and ``rivergrid-generated`` (from their options) or of one of the paper's."""
+    if isinstance(options, RiverGridMapOptions | RiverGridGeneratedOptions):
+        return options.river_map()
+    return parse_map(MAPS[name.removeprefix("rivergrid-")])
+
+
+def make_river_grid(name: str, num_envs: int, options: RiverGridOptions) -> RiverGridVectorEnv:
+    """B environments of a RiverGrid task."""
+    return RiverGridVectorEnv(name, task_map(name, options), options, num_envs=num_envs)
+
+
+def river_grid_optimum(name: str, options: RiverGridOptions, limits: CostLimits) -> float:
+    """J*(d), exact to about 1e-9; -inf where no policy keeps the limits."""
+    # Loaded here because it needs SciPy, which takes half a second to import and which no trial uses.
+    solve = load_attribute("recrl.environments.finite.exact_solver:solve_by_lagrangian")
+    model = river_cmdp(task_map(name, options), costs=options.costs, horizon=options.horizon)
+    try:
+        return float(solve(model, limits).episode_return)
+    except InfeasibleLimitsError:
+        return -math.inf

@@ -1,0 +1,245 @@
+"""RiverGrid instances like the paper's two, drawn at random by rules that know no student.
+
+A river of changing width runs through the whole map, from north to south or from west to east; the start is
+drawn on one bank and the goal on the other. There is a dry way round as on 1b, or there is none as on 1a.
+
+One attempt draws, in this order: the direction of the river; its width and place in the first row and, row by
+row, a change of each by -1, 0 or 1; with a dry way round, the row in which the river can be walked through
+dry; a wall on each inner tile with probability ``wall_share``; on which bank the start lies; the start, the
+goal and the heading. Attempts are repeated until one is an instance (``is_instance``). Equal settings give
+equal maps on every machine: all draws are floor(n u) of the raw 64-bit numbers u of PCG64, which NumPy keeps
+the same for ever (its distributions it may change).
+
+What makes an instance, and which limit d_d goes with it (``suggested_limit``), is counted on the map, so that
+nothing about it can have been tuned on a student. Steps are a route's actions, turns included; its cost is
+its time steps in the river.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from recrl.environments.rivergrid.maps import (
+    DRY,
+    GENERATION_ATTEMPTS,
+    GOAL,
+    RIVER,
+    STARTS,
+    STEPS,
+    WALL,
+    MapError,
+    RiverMap,
+    enclosed,
+)
+
+LEAST_DETOUR = 5  # steps that a dry way round takes more than the quickest way; on 1b 11 against 6
+LIMIT_PARTS = 5  # with a dry way round, d_d lets one crossing in so many through; on 1b 1 of 5
+
+Tiles = list[list[str]]
+Pose = tuple[int, int, int]  # x, y, heading
+
+
+class InstanceSettings(BaseModel):
+    """What an instance is drawn from."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    map_seed: int = Field(ge=0, description="Seed of the map; equal settings give equal maps (ours).")
+    width: int = Field(default=9, ge=5, le=32, description="Columns, walls included (9 in the paper's maps).")
+    height: int = Field(default=9, ge=5, le=32, description="Rows, walls included (9 in the paper's maps).")
+    river_width: tuple[int, int] = Field(
+        default=(2, 5),
+        description="Least and largest width of the river in tiles (5 in the paper's maps).",
+    )
+    wall_share: float = Field(
+        default=0.1, ge=0.0, le=0.5, description="Probability that a tile is an inner wall (ours)."
+    )
+    dry_route: bool | None = Field(
+        default=None,
+        description="Whether there is a dry way round, as on 1b, or not, as on 1a; null lets a coin decide.",
+    )
+
+    @model_validator(mode="after")
+    def _river_fits(self) -> Self:
+        least, largest = self.river_width
+        room = min(self.width, self.height) - 4  # two walls, two banks
+        if not 1 <= least <= largest <= room:
+            raise ValueError(
+                f"river_width must be two widths from 1 to {room} in a map of {self.width} by {self.height}, "
+                f"the least first, got {least} and {largest}"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Route:
+    """A way from the start to a goal.
+
+    Attributes:
+        steps: its actions, turns included.
+        cost: the steps among them that end in the river.
+    """
+
+    steps: int
+    cost: int
+
+
+def quickest_route(river_map: RiverMap) -> Route | None:
+    """The cheapest among the ways with the fewest steps; None if there is no way."""
+    length = _shortest(river_map, step=(1, 0), wet=(0, 1))
+    return Route(steps=length[0], cost=length[1]) if length else None
+
+
+def cheapest_route(river_map: RiverMap) -> Route | None:
+    """The quickest among the ways with the least cost; None if there is no way."""
+    length = _shortest(river_map, step=(0, 1), wet=(1, 0))
+    return Route(steps=length[1], cost=length[0]) if length else None
+
+
+def _shortest(river_map: RiverMap, *, step: tuple[int, int], wet: tuple[int, int]) -> tuple[int, int] | None:
+    """The length of a shortest way to a goal (Dijkstra 1959); None if there is none.
+
+    Lengths are pairs, compared by their first numbers and, where those are equal, by their second.
+
+    Args:
+        river_map: the map.
+        step: what every step adds to a way's length.
+        wet: what a step that ends in the river adds to it.
+    """
+    frontier: list[tuple[int, int, Pose]] = [(0, 0, (*river_map.start, river_map.heading))]
+    done: set[Pose] = set()
+    while frontier:
+        first, second, pose = heapq.heappop(frontier)
+        x, y, heading = pose
+        if river_map.tile((x, y)) == GOAL:
+            return first, second
+        if pose in done:
+            continue
+        done.add(pose)
+        ahead = (x + STEPS[heading][0], y + STEPS[heading][1], heading)
+        for following in (ahead, (x, y, (heading + 1) % 4), (x, y, (heading - 1) % 4)):
+            tile = river_map.tile(following[:2])
+            if tile != WALL:
+                in_river = int(tile == RIVER)
+                length = (first + step[0] + in_river * wet[0], second + step[1] + in_river * wet[1])
+                heapq.heappush(frontier, (*length, following))
+    return None
+
+
+def is_instance(river_map: RiverMap, settings: InstanceSettings, *, dry_route: bool) -> bool:
+    """Whether a map asks of a student what the paper's two ask.
+
+    - The goal can be reached.
+    - The quickest way leads through the river and costs at least the river's least width: without a limit,
+      the optimum is in the water.
+    - ``dry_route``: there is a dry way round, of at least ``LEAST_DETOUR`` steps more, so that staying dry
+      costs at least 0.5 of return. Otherwise there is none: the river must be crossed.
+
+    Both kinds bind at ``suggested_limit``: with a dry way J*(d_d) < J*(inf); without one no smaller limit
+    lets every episode reach the goal.
+    """
+    quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
+    if quickest is None or cheapest is None or quickest.cost < settings.river_width[0]:
+        return False
+    if not dry_route:
+        return cheapest.cost > 0
+    return cheapest.cost == 0 and cheapest.steps >= quickest.steps + LEAST_DETOUR
+
+
+def suggested_limit(river_map: RiverMap) -> float:
+    """The limit d_d that a map is to be learnt under, by the rule that gives 5 on 1a and 1 on 1b.
+
+    Without a dry way, what the cheapest way costs: then it can be taken in every episode, and only it. With
+    one, a fifth of what the quickest way costs: then the optimum goes that way in at most one episode of
+    five.
+
+    Raises:
+        MapError: the quickest way is dry, so that no limit changes anything.
+    """
+    quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
+    if quickest is None or cheapest is None or quickest.cost == 0:
+        raise MapError("map: the quickest way leads through no river, so no limit makes a difference")
+    return float(cheapest.cost) if cheapest.cost else quickest.cost / LIMIT_PARTS
+
+
+def draw_instance(settings: InstanceSettings) -> RiverMap:
+    """The first attempt that is an instance.
+
+    Raises:
+        MapError: nothing fitting was drawn in ``GENERATION_ATTEMPTS`` attempts.
+    """
+    draws = _Draws(settings.map_seed)
+    dry_route = bool(draws.below(2)) if settings.dry_route is None else settings.dry_route
+    for _ in range(GENERATION_ATTEMPTS):
+        river_map = _attempt(draws, settings, dry_route)
+        if river_map is not None and is_instance(river_map, settings, dry_route=dry_route):
+            return river_map
+    raise MapError(
+        f"no instance in {GENERATION_ATTEMPTS} attempts met {InstanceSettings.model_dump_json(settings)}, "
+        f"change the size, river_width, wall_share or dry_route"
+    )
+
+
+class _Draws:
+    """Draws from the raw numbers of PCG64, which are uniform on 0 to 2^64 - 1."""
+
+    def __init__(self, seed: int) -> None:
+        self._bits = np.random.PCG64(seed)
+
+    def below(self, number: int) -> int:
+        """One of 0 to ``number`` - 1."""
+        return int(self._bits.random_raw()) * number >> 64
+
+    def happens(self, probability: float) -> bool:
+        return int(self._bits.random_raw()) < probability * 2.0**64
+
+
+def _attempt(draws: _Draws, settings: InstanceSettings, dry_route: bool) -> RiverMap | None:
+    """One map as the module describes it; None where a bank has no room for a start or a goal."""
+    across, along = settings.width - 2, settings.height - 2
+    eastward = draws.below(2) == 1
+    if eastward:  # drawn as if it ran south, then mirrored
+        across, along = along, across
+    course = _course(draws, across, along, settings.river_width)
+    ford = draws.below(along) if dry_route else None
+    tiles = [
+        [RIVER if first <= x < first + width and y != ford else DRY for x in range(across)]
+        for y, (first, width) in enumerate(course)
+    ]
+    for row in tiles:
+        row[:] = [WALL if draws.happens(settings.wall_share) else tile for tile in row]
+    banks = [
+        _dry(tiles, [range(first) for first, _ in course]),
+        _dry(tiles, [range(first + width, across) for first, width in course]),
+    ]
+    if draws.below(2):
+        banks.reverse()
+    if not all(banks):
+        return None
+    (start_x, start_y), (goal_x, goal_y) = (bank[draws.below(len(bank))] for bank in banks)
+    tiles[start_y][start_x] = STARTS[draws.below(len(STARTS))]
+    tiles[goal_y][goal_x] = GOAL
+    return enclosed("".join(row) for row in (zip(*tiles, strict=True) if eastward else tiles))
+
+
+def _course(draws: _Draws, across: int, along: int, river_width: tuple[int, int]) -> list[tuple[int, int]]:
+    """The river's first tile and width in each row; a dry tile at least stays on either side."""
+    least, largest = river_width
+    width = least + draws.below(largest - least + 1)
+    first = 1 + draws.below(across - 1 - width)
+    course = [(first, width)]
+    for _ in range(along - 1):
+        width = min(max(width + draws.below(3) - 1, least), largest)
+        first = min(max(first + draws.below(3) - 1, 1), across - 1 - width)
+        course.append((first, width))
+    return course
+
+
+def _dry(tiles: Tiles, columns: list[range]) -> list[tuple[int, int]]:
+    """The dry cells (x, y) among each row's columns, row by row."""
+    return [(x, y) for y, row in enumerate(columns) for x in row if tiles[y][x] == DRY]

@@ -1,0 +1,136 @@
+"""RiverGrid on MiniGrid, for Gymnasium; ``recrl.environments.rivergrid.grid_world`` defines the CMDP.
+
+It is for people: to look at, to wrap, to compare with. Training uses ``RiverGridVectorEnv``, which a test
+holds equal to this one, step for step.
+
+Its names are ``recrl/RiverGrid-1a-v0``, ``recrl/RiverGrid-1b-v0`` and, with the keyword ``drawing`` for a map
+of your own, ``recrl/RiverGrid-v0``:
+
+    gymnasium.make("recrl.environments.registration:recrl/RiverGrid-1a-v0", render_mode="rgb_array")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.spaces import Box, Discrete
+from minigrid.core.grid import Grid
+from minigrid.core.mission import MissionSpace
+from minigrid.core.world_object import Floor, Goal, Wall, WorldObj
+from minigrid.minigrid_env import MiniGridEnv
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.rivergrid.grid_world import (
+    FORWARD,
+    GOAL_REWARD,
+    HORIZON,
+    STEP_REWARD,
+    CostName,
+    RiverGridOptions,
+    river_observations,
+    state_index,
+    task_map,
+)
+from recrl.environments.rivergrid.maps import GOAL, MAPS, MUD, RIVER, WALL, Cell, RiverMap, parse_map
+
+TILE_PIXELS = 32
+OBJECTS: dict[str, Callable[[], WorldObj]] = {
+    WALL: Wall,
+    RIVER: Floor,  # a Floor is blue
+    MUD: partial(Floor, "yellow"),
+    GOAL: Goal,
+}
+
+
+def mission() -> str:
+    """What MiniGrid shows below the grid; a named function, because MiniGrid pickles it."""
+    return "reach the goal, mind the river"
+
+
+def river_minigrid(river_map: RiverMap) -> Grid:
+    """The map as MiniGrid's objects."""
+    grid = Grid(river_map.width, river_map.height)
+    for x in range(river_map.width):
+        for y in range(river_map.height):
+            kind = OBJECTS.get(river_map.tile((x, y)))
+            grid.set(x, y, kind() if kind else None)
+    return grid
+
+
+def render_frame(
+    river_map: RiverMap, cell: Cell, heading: int, *, tile_pixels: int = TILE_PIXELS
+) -> npt.NDArray[np.uint8]:
+    """A picture of the map with the agent in ``cell``, uint8 [height tile_pixels, width tile_pixels, 3]."""
+    frame: npt.NDArray[np.uint8] = river_minigrid(river_map).render(tile_pixels, cell, heading)
+    return frame
+
+
+class RiverGridEnv(MiniGridEnv):
+    """One RiverGrid.
+
+    Args:
+        drawing: the map, see ``recrl.environments.rivergrid.maps``.
+        max_steps: H, steps after which an episode is truncated.
+        costs: the cost functions, in order.
+        **minigrid: MiniGrid's own, such as ``render_mode``.
+    """
+
+    def __init__(
+        self,
+        drawing: str = MAPS["1a"],
+        *,
+        max_steps: int = HORIZON,
+        costs: Sequence[CostName] = ("river",),
+        **minigrid: Any,
+    ) -> None:
+        self.river_map = parse_map(drawing)
+        self.cost_names = tuple(costs)
+        self._observations = river_observations(self.river_map)
+        super().__init__(
+            mission_space=MissionSpace(mission_func=mission),
+            width=self.river_map.width,
+            height=self.river_map.height,
+            max_steps=max_steps,
+            **{"highlight": False, "tile_size": TILE_PIXELS, **minigrid},
+        )
+        self.action_space = Discrete(3)
+        self.observation_space = Box(0.0, 1.0, self._observations.shape[1:], np.float32)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take one step; ``info["cost"]`` is float64 [k]."""
+        if not self.action_space.contains(action):
+            raise ValueError(f"RiverGrid: the action must be 0, 1 or 2, got {action!r}")
+        observation, _, terminated, truncated, _ = super().step(action)
+        reward = GOAL_REWARD if terminated else STEP_REWARD
+        return observation, reward, terminated, truncated and not terminated, {"cost": self._costs(action)}
+
+    def gen_obs(self) -> npt.NDArray[np.float32]:
+        """What is seen from where the agent is, a new array."""
+        x, y = self.agent_pos
+        seen: npt.NDArray[np.float32] = self._observations[
+            state_index(self.river_map, int(x), int(y), int(self.agent_dir))
+        ]
+        return seen.copy()
+
+    def _gen_grid(self, width: int, height: int) -> None:
+        self.grid = river_minigrid(self.river_map)
+        self.agent_pos, self.agent_dir = self.river_map.start, self.river_map.heading
+
+    def _costs(self, action: int) -> Floats:
+        tile = self.river_map.tile((int(self.agent_pos[0]), int(self.agent_pos[1])))
+        costs = {"river": tile == RIVER, "turns": action != FORWARD, "mud": tile == MUD}
+        return np.array([costs[name] for name in self.cost_names], np.float64)
+
+
+def draw_river_grid(name: str, options: RiverGridOptions) -> RiverGridEnv:
+    """A RiverGrid task that draws itself, for the registry of tasks."""
+    return RiverGridEnv(
+        str(task_map(name, options)),
+        max_steps=options.horizon,
+        costs=options.costs,
+        render_mode="rgb_array",
+    )

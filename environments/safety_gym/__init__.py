@@ -1,0 +1,1 @@
+"""Safety Gym's tasks: what they are, their MuJoCo model, one environment and a batch of them."""

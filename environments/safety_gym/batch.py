@@ -1,0 +1,299 @@
+"""Safety Gym's tasks: B worlds of one task, stepped together.
+
+Observation: float32, the parts sorted by name (``SafetyTask.components``): the robot's sensors, and 16 bins
+    of pseudo-lidar for every kind of object that can be seen. CarGoal2 has 72 numbers.
+Action: two numbers in [-1, 1]; Car: the motors of the left and right wheel; Point: force forwards, turning
+    speed.
+Reward: metres by which the robot came nearer to the goal in this step; in Push, by which it came nearer to
+    the box, plus those by which the box came nearer to the goal. Clipped to +-10. Plus 1 when the goal is
+    reached, after which there is a new goal.
+Cost: the indicator of each term of ``SafetyTask.cost_terms``: the robot is over a hazard; touches a vase,
+    pillar, gremlin or wrong button; a vase moves.
+Termination: when there is no room for a new goal, or when the physics breaks down (reward -10). Truncated
+    after 1,000 steps.
+Source: openai/safety-gym ``engine.py``; where safety-gymnasium 1.0.0 differs, this follows Safety Gym.
+
+Letters: B worlds, P objects that the lidar sees, k costs.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
+from recrl.environments.safety_gym.native.environment_step import (
+    NOT_YET,
+    WORLD,
+    acceptable,
+    perceive,
+    review,
+    step,
+)
+from recrl.environments.safety_gym.native.task_record import allocate, places_of_objects, task_record
+from recrl.environments.safety_gym.scene import make_scene, upright
+from recrl.environments.safety_gym.tasks import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
+from recrl.environments.simulation.mujoco_batch import Simulations
+
+Booleans = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
+Observations = npt.NDArray[np.float32]
+
+_NOBODY = np.zeros(0, np.intp)
+
+
+class Outcome(NamedTuple):
+    """What one step brought.
+
+    Attributes:
+        rewards: [B].
+        costs: whether any term costs, 0 or 1, [1, B].
+        terms: the indicator of each cost term, in the order of ``SafetyTask.cost_terms``, [terms, B].
+        goal_met: [B].
+        terminated: [B].
+        truncated: [B].
+        broken: the physics broke down in this step, [B]; None if it did so nowhere.
+        finished: worlds whose episode is over.
+    """
+
+    rewards: Floats
+    costs: Floats
+    terms: Floats
+    goal_met: Booleans
+    terminated: Booleans
+    truncated: Booleans
+    broken: Booleans | None
+    finished: npt.NDArray[np.intp]
+
+
+class SafetyWorlds:
+    """B worlds of one task. Whoever uses them restarts those that are over.
+
+    Args:
+        task: which task.
+        number: B, at least 1.
+        horizon: steps after which an episode is truncated, at most 1,000.
+        num_threads: threads that step the worlds; results do not depend on it.
+
+    Attributes:
+        task: as given.
+        number: B.
+        horizon: as given.
+        scene: the physics' model.
+        simulations: the physics.
+        generators: one generator for each world.
+        qpos, qvel: coordinates and velocities, live views, [B, ...].
+        group: for each kind of object that the lidar sees, its slice of P.
+
+    The rest are live views of the worlds' records. Whoever writes there calls ``refresh``, and before it, if
+    ``qpos`` or ``qvel`` were written, ``simulations.forward``.
+        points: (x, y) of everything that the lidar sees, metres, [B, P, 2]; ``group`` tells which is which.
+        steps: taken in this episode, [B].
+        distances: those that the reward compares with, metres, [B, 1 or 2].
+        measured: the same as they are now. Goal and Button: from the robot to the goal, seen from above.
+            Push: from the robot to the box and from the box to the goal, in space.
+        terms: the indicator of each cost term, [B, terms].
+        goal_met: whether the goal is reached, [B].
+        goal_button: index of the button to press, [B].
+        button_timer: steps until buttons are seen and felt again, [B].
+        circles: middles of the gremlins' circles, metres, [B, gremlins, 2].
+        gremlin_yaws: radians, [B, gremlins].
+        embodied: the gremlin that is a body, or a negative number, [B].
+        acceleration: the robot's, in the world's frame, m/s^2, [B, 3].
+        touching: outermost bodies of the model that the robot touches, [B, bodies].
+    """
+
+    def __init__(
+        self, task: SafetyTask, number: int, *, horizon: int = HORIZON, num_threads: int = 1
+    ) -> None:
+        self.task = task
+        self.number = number
+        self.horizon = horizon
+        self._num_threads = num_threads
+        self.scene = make_scene(task)
+        model = self.scene.model
+        self.simulations = Simulations(model, number, num_threads=num_threads)
+        self.generators: list[np.random.Generator] = []
+        self.group = places_of_objects(task)
+
+        state = mujoco.mjtState
+        self.qpos = self.simulations.state(state.mjSTATE_QPOS, (model.nq,))
+        self.qvel = self.simulations.state(state.mjSTATE_QVEL, (model.nv,))
+        self.mocap_pos = self.simulations.state(state.mjSTATE_MOCAP_POS, (model.nmocap, 3))
+        self._memory = allocate(self.scene, number)
+        self._task = task_record(self.scene, self._memory, horizon)
+        self._address = int(self._task.ctypes.data)
+        self._view_records()
+        self.embodied[:] = NOT_YET
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = self.state_dict() if self.generators else None
+        return _rebuilt, (self.task, self.number, self.horizon, self._num_threads, state)
+
+    def seed(self, seed: int | None) -> None:
+        """Give each world a generator; world i has the same one whatever B is."""
+        streams = np.random.SeedSequence(seed).spawn(self.number)
+        self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
+
+    def restart(self, ids: npt.NDArray[np.intp]) -> None:
+        """Begin new episodes in some worlds."""
+        layouts = [sample_layout(self.task, self.generators[index]) for index in ids]
+        self.simulations.reset(ids)
+        for index, layout in zip(ids, layouts, strict=True):
+            self._put_down(index, layout)
+        self.simulations.forward(ids)
+        self.steps[ids] = 0
+        self.button_timer[ids] = 0
+        self.embodied[ids] = NOT_YET
+        self._renew_goals(ids)
+
+    def order(self, actions: npt.NDArray[Any]) -> bool:
+        """Say what to do in the next step; False if an action, [B, 2], is no number within [-1, 1]."""
+        self._action[...] = actions
+        return acceptable(self._address)
+
+    def advance(self) -> Outcome:
+        """Take one step in every world, as ordered."""
+        self.simulations.apply(step, self._address)
+        results, flags = self._memory.results.copy(), self._memory.flags.copy()
+        rewards, costs, terms = results[0], results[1:2], results[2:]
+        goal_met, broken, terminated, truncated = flags[0], flags[1], flags[2], flags[3]
+        if not (self.simulations.any_stopped or 1 in flags.tobytes()):
+            return Outcome(rewards, costs, terms, goal_met, terminated, truncated, None, _NOBODY)
+        broken |= self.simulations.stopped
+        rewards[broken] = EXCEPTION_REWARD
+        results[1:, broken] = 0.0
+        goal_met &= ~broken
+        terminated |= broken
+        if goal_met.any():
+            rewards[goal_met] += 1.0
+            reached = np.flatnonzero(goal_met)
+            self.button_timer[reached] = BUTTON_DELAY
+            terminated[reached] = ~self._renew_goals(reached)
+        truncated &= ~terminated
+        finished = np.flatnonzero(terminated | truncated)
+        failed = broken if broken.any() else None
+        return Outcome(rewards, costs, terms, goal_met, terminated, truncated, failed, finished)
+
+    def observations(self) -> Observations:
+        """What the robots perceived last, [B, size]."""
+        return self._memory.observations.copy()
+
+    def refresh(self, ids: npt.NDArray[np.intp] | None = None) -> None:
+        """Find everything in some worlds, or all, as the simulations and the records have it now."""
+        self.simulations.apply(review, self._address, ids)
+
+    def perceive(self) -> None:
+        """Observe everything as the simulations and the records have it now."""
+        self.simulations.apply(perceive, self._address)
+
+    def pressed(self) -> Booleans:
+        """Whether the robot touches each button, [B, buttons]."""
+        return self.touching[:, self.scene.touchable["buttons"]].copy()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future depends on: physics, layout, goals, counters, generators."""
+        return {
+            "physics": self.simulations.save(),
+            "worlds": {name: self._memory.worlds[name].copy() for name in WORLD.names or ()},
+            "observations": self.observations(),
+            "generators": [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        if len(state["generators"]) != self.number:
+            raise ValueError(
+                f"{self.task.name}: the saved state is of {len(state['generators'])} environments, "
+                f"these are {self.number}"
+            )
+        self.simulations.load(state["physics"])
+        for name in WORLD.names or ():
+            self._memory.worlds[name] = state["worlds"][name]
+        self._memory.observations[...] = state["observations"]
+        self.seed(0)
+        for generator, saved in zip(self.generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+
+    def _view_records(self) -> None:
+        """Name the parts of the worlds' records, without the room that this task does not need."""
+        records, task = self._memory.worlds, self.task
+        self._action: Floats = records["action"]
+        self.points: Floats = records["points"][:, : max(places.stop for places in self.group.values())]
+        distances = 2 if task.goal == "Push" else 1
+        self.distances: Floats = records["distances"][:, :distances]
+        self.measured: Floats = records["measured"][:, :distances]
+        self.terms: Floats = records["terms"][:, : len(task.cost_terms)]
+        self.goal_met: Booleans = records["goal_met"]
+        self.steps: Integers = records["steps"]
+        self.goal_button: Integers = records["goal_button"]
+        self.button_timer: Integers = records["button_timer"]
+        self.circles: Floats = records["circles"][:, : task.gremlins.number]
+        self.gremlin_yaws: Floats = records["gremlin_yaws"][:, : task.gremlins.number]
+        self.embodied: Integers = records["embodied"]
+        self.acceleration: Floats = records["acceleration"]
+        self.touching: Booleans = records["touching"].view(np.bool_)[:, : self.scene.model.nbody]
+
+    def _put_down(self, index: int, layout: dict[str, Floats]) -> None:
+        """Write one world's layout into its simulation, everything turned at random."""
+        task, scene, generator = self.task, self.scene, self.generators[index]
+        yaw = generator.uniform(0.0, 2.0 * np.pi)
+        if task.robot == "Car":
+            self.qpos[index, :2] = layout["robot"][0]
+            self.qpos[index, 3:7] = upright(yaw)
+        else:
+            self.qpos[index, :3] = (*layout["robot"][0], yaw)
+        for address, place in zip(scene.vase_qpos, layout["vases"], strict=True):
+            self.qpos[index, address : address + 2] = place
+            self.qpos[index, address + 3 : address + 7] = upright(generator.uniform(0.0, 2.0 * np.pi))
+        for address, place in zip((scene.box_qpos,), layout["box"], strict=False):
+            self.qpos[index, address : address + 2] = place
+            self.qpos[index, address + 3 : address + 7] = upright(generator.uniform(0.0, 2.0 * np.pi))
+        for kind, mocap in (("buttons", scene.button_mocap), ("pillars", scene.pillar_mocap)):
+            self.mocap_pos[index, list(mocap), :2] = layout[kind]
+        for kind, places in self.group.items():
+            if kind != "goal":
+                self.points[index, places] = layout[kind]
+        self.circles[index] = layout["gremlins"]
+        self.gremlin_yaws[index] = generator.uniform(0.0, 2.0 * np.pi, task.gremlins.number)
+
+    def _renew_goals(self, ids: npt.NDArray[np.intp]) -> Booleans:
+        """Choose new goals in some worlds; False where there is no room for one."""
+        found = np.array([self._renew_goal(index) for index in ids])
+        self.refresh(ids)
+        self.distances[ids] = self.measured[ids]
+        return found
+
+    def _renew_goal(self, index: int) -> bool:
+        generator = self.generators[index]
+        goal = self.points[index, self.group["goal"].start]
+        if self.task.goal == "Button":
+            button = int(generator.integers(self.task.buttons.number))
+            self.goal_button[index] = button
+            goal[:] = self.points[index, self.group["buttons"].start + button]
+            return True
+        places, radii = [self.qpos[index, :2]], [keepouts(self.task)["robot"][1]]
+        for kind, (number, keepout) in keepouts(self.task).items():
+            if kind in self.group and kind != "goal":
+                places.extend(self.points[index, self.group[kind]])
+                radii.extend([keepout] * number)
+        found = sample_goal(self.task, np.array(places), np.array(radii), generator)
+        if found is None:
+            return False
+        goal[:] = found
+        return True
+
+
+def _rebuilt(
+    task: SafetyTask, number: int, horizon: int, num_threads: int, state: dict[str, Any] | None
+) -> SafetyWorlds:
+    """A copy of pickled worlds."""
+    worlds = SafetyWorlds(task, number, horizon=horizon, num_threads=num_threads)
+    if state is not None:
+        worlds.load_state_dict(state)
+    return worlds

@@ -1,0 +1,1 @@
+"""The compiled environment step of the Safety Gym tasks."""

@@ -1,0 +1,616 @@
+"""One environment step of one world of a Safety Gym task, compiled to machine code.
+
+``step`` is called for each world, on whatever thread of MuJoCo's: the action, ten physics steps, what the
+robot then sees, feels, earns and pays. Nothing here looks at another world, so results depend neither on how
+many there are nor on the threads. Resets and new goals, which are drawn at random, are not made here
+(``recrl.environments.safety_gym.batch``).
+
+What a world is made of is one record ``WORLD``; what all worlds of a task share is one record ``TASK``. These
+have room for every task.
+
+Letters: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
+
+Source: openai/safety-gym ``engine.py``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from recrl.environments.simulation.machine_code import (
+    array_at,
+    compiled,
+    compiled_for_batch,
+    compiled_for_python,
+    mj_forward,
+    mj_getState,
+    mj_step,
+    mj_step2,
+)
+
+KINDS = ("goal", "box", "buttons", "hazards", "vases", "pillars", "gremlins")
+"""Kinds of objects, in the order of ``TASK``'s fields of seven."""
+GOAL, BOX, BUTTONS, HAZARDS, VASES, PILLARS, GREMLINS = range(7)
+TERMS = ("hazards", "vases_contact", "vases_velocity", "pillars", "buttons", "gremlins")
+"""All cost terms, in the order in which they are computed."""
+SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer", "ballquat_rear", "ballangvel_rear")
+"""What a robot may feel, in the order of ``TASK``'s field of it."""
+ACCELEROMETER, VELOCIMETER, GYRO, MAGNETOMETER, BALL, SPIN = range(6)
+FLAGS = ("goal_met", "broken", "terminated", "truncated")
+"""What a step brings besides rewards, costs and the indicators of the cost terms."""
+MAX_POINTS, MAX_BODIES, MAX_GEOMS, MAX_GREMLINS, MAX_TERMS = 24, 24, 64, 6, 3
+"""Room for P objects, for bodies and shapes of a model, and so on."""
+NO_GREMLIN = -1
+"""No gremlin is a body: it hovers, untied, where nothing is."""
+NOT_YET = -2
+"""A new episode: no gremlin was made a body, and the body is where the model has it."""
+
+TASK = np.dtype(
+    [
+        ("worlds", np.int64),  # address of the worlds' records
+        ("number", np.int64),
+        ("outcomes", np.int64),  # address of what the last step brought, [B] OUTCOMEs
+        ("observations", np.int64),  # address of [B, observed]
+        ("rows", np.int64),  # address of [B, 2, row]: the state that the last step left, and room for another
+        ("row", np.int64),  # numbers in a state
+        ("row_fields", np.int32),  # mjtState
+        # Fields of mjData and mjContact: where in the structure.
+        ("qpos", np.int64),
+        ("qvel", np.int64),
+        ("qacc", np.int64),
+        ("ctrl", np.int64),
+        ("qfrc_applied", np.int64),
+        ("eq_active", np.int64),
+        ("mocap_pos", np.int64),
+        ("mocap_quat", np.int64),
+        ("xpos", np.int64),
+        ("xmat", np.int64),
+        ("ncon", np.int64),
+        ("contact", np.int64),
+        ("contact_size", np.int64),
+        ("contact_geom", np.int64),
+        ("warnings", np.int64, (3,)),  # numbers of bad positions, velocities, accelerations
+        # The model.
+        ("nq", np.int64),
+        ("nv", np.int64),
+        ("nbody", np.int64),
+        ("nmocap", np.int64),
+        ("timestep", np.float64),  # seconds
+        ("substeps", np.int64),
+        ("robot", np.int64),  # its body
+        ("is_car", np.bool_),
+        ("root", np.int64, (MAX_GEOMS,)),  # the outermost body that each shape is part of
+        ("vase_qpos", np.int64),  # the vases' coordinates and velocities follow on one another
+        ("vase_qvel", np.int64),
+        ("box_qpos", np.int64),
+        # The task.
+        ("start", np.int64, (len(KINDS),)),  # each kind's places among P
+        ("stop", np.int64, (len(KINDS),)),
+        ("first_body", np.int64, (len(KINDS),)),  # bodies of each kind, if it matters who touches them
+        ("last_body", np.int64, (len(KINDS),)),
+        ("lidar", np.int64, (len(KINDS),)),  # where in an observation each kind is seen, -1: nowhere
+        ("sensors", np.int64, (len(SENSORS),)),  # where in an observation they are, -1: nowhere
+        ("observed", np.int64),  # numbers in an observation
+        ("terms", np.int64, (MAX_TERMS,)),  # what costs: indices of TERMS
+        ("num_terms", np.int64),
+        ("horizon", np.int64),
+        ("is_push", np.bool_),
+        ("is_button", np.bool_),
+        ("goal_size", np.float64),  # metres
+        ("goal_height", np.float64),
+        ("hazard_size", np.float64),
+        ("vase_speed", np.float64),  # m/s
+        ("reward_bound", np.float64),
+        ("lidar_bins", np.int64),
+        ("lidar_range", np.float64),
+        ("gravity", np.float64),
+        ("magnetic_field", np.float64),
+        # Gremlins: see recrl.environments.safety_gym.gremlins.
+        ("gremlin_qpos", np.int64),
+        ("gremlin_qvel", np.int64),
+        ("gremlin_lead", np.int64),  # what leads the body, a mocap body
+        ("gremlin_weight", np.float64),  # newtons
+        ("gremlin_travel", np.float64),
+        ("gremlin_alert", np.float64),  # metres
+        ("gremlin_on_course", np.float64),
+        ("gremlin_idle_place", np.float64, (3,)),
+        ("course_steps", np.int64),
+        ("course_positions", np.int64),  # addresses of f(t), [course_steps, 3] and [course_steps, 6]
+        ("course_velocities", np.int64),
+    ],
+    align=True,
+)
+
+WORLD = np.dtype(
+    [
+        ("action", np.float64, (2,)),
+        ("steps", np.int64),
+        ("points", np.float64, (MAX_POINTS, 2)),  # (x, y) of what the lidar sees, metres
+        ("distances", np.float64, (2,)),  # those that the reward compares with, metres
+        ("goal_button", np.int64),
+        ("button_timer", np.int64),
+        ("circles", np.float64, (MAX_GREMLINS, 2)),
+        ("gremlin_yaws", np.float64, (MAX_GREMLINS,)),
+        ("embodied", np.int64),
+        ("acceleration", np.float64, (3,)),  # of the robot, in the world's frame, m/s^2
+        ("touching", np.uint8, (MAX_BODIES,)),  # 0 or 1; Numba knows no arrays of truth values in records
+        ("measured", np.float64, (2,)),  # as distances, now
+        ("terms", np.float64, (MAX_TERMS,)),
+        ("goal_met", np.bool_),
+        ("broken", np.bool_),
+    ],
+    align=True,
+)
+
+OUTCOME = np.dtype(
+    [
+        ("numbers", np.float64, (2 + MAX_TERMS,)),  # reward, cost, the indicator of each cost term
+        ("flags", np.uint8, (len(FLAGS),)),  # 0 or 1
+    ],
+    align=True,
+)
+
+_tasks = array_at(TASK)
+_worlds = array_at(WORLD)
+_outcomes = array_at(OUTCOME)
+_doubles = array_at(np.float64)
+_integers = array_at(np.int32)
+_floats = array_at(np.float32)
+_bytes = array_at(np.uint8)
+_addresses = array_at(np.int64)
+
+
+@compiled
+def field(data: int, offset: int, size: int) -> Any:
+    """An array of ``mjData``, [size]."""
+    return _doubles(_addresses(data + offset, 1)[0], size)
+
+
+@compiled
+def robot_place(task: Any, data: int) -> Any:
+    """The robot's position, metres, [3]."""
+    return field(data, task.xpos, 3 * task.nbody)[3 * task.robot : 3 * task.robot + 3]
+
+
+@compiled
+def robot_rotation(task: Any, data: int) -> Any:
+    """R by rows, [9]."""
+    return field(data, task.xmat, 9 * task.nbody)[9 * task.robot : 9 * task.robot + 9]
+
+
+@compiled
+def turned(rotation: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """R^T (x, y, z): a vector of the world in the robot's frame; R is given by rows, [9]."""
+    return (
+        rotation[0] * x + rotation[3] * y + rotation[6] * z,
+        rotation[1] * x + rotation[4] * y + rotation[7] * z,
+        rotation[2] * x + rotation[5] * y + rotation[8] * z,
+    )
+
+
+@compiled
+def write_rotation(quaternion: Any, out: Any) -> None:
+    """Write the rotation matrix, by rows [9], of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    out[0], out[1], out[2] = w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+    out[3], out[4], out[5] = 2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)
+    out[6], out[7], out[8] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z
+
+
+@compiled
+def show(x: float, y: float, lidar_range: float, bins: Any) -> None:
+    """Let one object be seen by the pseudo-lidar: bin b shows the most that any object has there.
+
+    The circle around the robot is divided into sectors. An object at distance d reads max(0, 1 - d / range)
+    in its own sector; in the next one that times how far through its own sector it is, and in the one before
+    that times the rest ("aliasing").
+
+    Args:
+        x: the object's place in the robot's frame, metres.
+        y: likewise.
+        lidar_range: metres.
+        bins: readings so far, [sectors].
+    """
+    reading = 1.0 - math.hypot(x, y) / lidar_range
+    if not reading > 0.0:
+        return
+    sectors = len(bins)
+    sector = math.atan2(y, x) * (sectors / (2.0 * math.pi))
+    if sector < 0.0:
+        sector += sectors
+    own = int(sector)
+    through = sector - own
+    own %= sectors
+    after, before = (own + 1) % sectors, (own - 1) % sectors
+    bins[own] = max(bins[own], reading)
+    bins[after] = max(bins[after], through * reading)
+    bins[before] = max(bins[before], (1.0 - through) * reading)
+
+
+@compiled
+def look(task: Any, world: Any, data: int) -> None:
+    """Find where everything is and what the robot touches; MuJoCo has computed everything at this state."""
+    qpos = field(data, task.qpos, task.nq)
+    for vase in range(task.stop[VASES] - task.start[VASES]):
+        address = task.vase_qpos + 7 * vase
+        world.points[task.start[VASES] + vase, 0] = qpos[address]
+        world.points[task.start[VASES] + vase, 1] = qpos[address + 1]
+    for box in range(task.start[BOX], task.stop[BOX]):
+        world.points[box, 0], world.points[box, 1] = qpos[task.box_qpos], qpos[task.box_qpos + 1]
+    if task.start[GREMLINS] < task.stop[GREMLINS]:
+        place_gremlins(task, world, qpos)
+    qacc = field(data, task.qacc, task.nv)
+    world.acceleration[0], world.acceleration[1] = qacc[0], qacc[1]
+    world.acceleration[2] = qacc[2] if task.is_car else 0.0
+    for body in range(task.nbody):
+        world.touching[body] = 0
+    size = task.contact_size // 4
+    contacts = _integers(data + task.ncon, 1)[0]
+    geoms = _integers(_addresses(data + task.contact, 1)[0], contacts * size)
+    for contact in range(contacts):
+        place = contact * size + task.contact_geom // 4
+        one, other = task.root[geoms[place]], task.root[geoms[place + 1]]
+        if one == task.robot:
+            world.touching[other] = 1
+        elif other == task.robot:
+            world.touching[one] = 1
+    world.touching[0] = 0  # the floor
+    world.touching[task.robot] = 0
+    world.broken = False
+    for warning in task.warnings:
+        if _integers(data + warning, 1)[0] > 0:
+            world.broken = True
+
+
+@compiled
+def course_step(task: Any, world: Any) -> int:
+    """The t of f(t); somebody may go on after the end of an episode."""
+    at: int = min(world.steps, task.course_steps - 1)
+    return at
+
+
+@compiled
+def place_gremlins(task: Any, world: Any, qpos: Any) -> None:
+    """Gremlins are f(t) away from the middle of their circle; the one that is a body is where that is."""
+    course, at = _doubles(task.course_positions, 3 * task.course_steps), 3 * course_step(task, world)
+    for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
+        point = world.points[task.start[GREMLINS] + gremlin]
+        if gremlin == world.embodied:
+            point[0], point[1] = qpos[task.gremlin_qpos], qpos[task.gremlin_qpos + 1]
+        else:
+            point[0] = world.circles[gremlin, 0] + course[at]
+            point[1] = world.circles[gremlin, 1] + course[at + 1]
+
+
+@compiled
+def measure(task: Any, world: Any, data: int) -> None:
+    """The distances that the reward is made of, metres.
+
+    Goal and Button: from the robot to the goal, seen from above. Push: from the robot to the box and from the
+    box to the goal, in space.
+    """
+    robot = robot_place(task, data)
+    goal = world.points[task.start[GOAL]]
+    if not task.is_push:
+        world.measured[0] = math.hypot(goal[0] - robot[0], goal[1] - robot[1])
+        return
+    box = field(data, task.qpos, task.nq)[task.box_qpos : task.box_qpos + 3]
+    to_box = math.hypot(box[0] - robot[0], box[1] - robot[1])
+    to_goal = math.hypot(goal[0] - box[0], goal[1] - box[1])
+    world.measured[0] = math.hypot(to_box, box[2] - robot[2])
+    world.measured[1] = math.hypot(to_goal, box[2] - task.goal_height)
+
+
+@compiled
+def touches(task: Any, world: Any, kind: int) -> bool:
+    """Whether the robot touches any object of a kind."""
+    for body in range(task.first_body[kind], task.last_body[kind]):  # noqa: SIM110  # not for Numba
+        if world.touching[body]:
+            return True
+    return False
+
+
+@compiled
+def presses_wrongly(task: Any, world: Any) -> bool:
+    """Whether the robot touches a button that is not the goal, while buttons are felt."""
+    if world.button_timer > 0:
+        return False
+    for button in range(task.last_body[BUTTONS] - task.first_body[BUTTONS]):
+        if button != world.goal_button and world.touching[task.first_body[BUTTONS] + button]:
+            return True
+    return False
+
+
+@compiled
+def over_a_hazard(task: Any, world: Any, data: int) -> bool:
+    """Whether the robot's middle is less than a hazard's size from its middle, seen from above."""
+    robot = robot_place(task, data)
+    for hazard in range(task.start[HAZARDS], task.stop[HAZARDS]):
+        place = world.points[hazard]
+        if math.hypot(place[0] - robot[0], place[1] - robot[1]) < task.hazard_size:
+            return True
+    return False
+
+
+@compiled
+def moves_a_vase(task: Any, data: int) -> bool:
+    """Whether any vase moves; what sleeps has no velocity."""
+    qvel = field(data, task.qvel, task.nv)
+    for vase in range(task.stop[VASES] - task.start[VASES]):
+        address = task.vase_qvel + 6 * vase
+        x, y, z = qvel[address], qvel[address + 1], qvel[address + 2]
+        if x * x + y * y + z * z >= task.vase_speed * task.vase_speed:
+            return True
+    return False
+
+
+@compiled
+def judge(task: Any, world: Any, data: int) -> None:
+    """The distances, the cost terms, and whether the goal is reached."""
+    measure(task, world, data)
+    for column in range(task.num_terms):
+        term = task.terms[column]  # the order is that of TERMS
+        if term == 0:
+            costs = over_a_hazard(task, world, data)
+        elif term == 1:
+            costs = touches(task, world, VASES)
+        elif term == 2:
+            costs = moves_a_vase(task, data)
+        elif term == 3:
+            costs = touches(task, world, PILLARS)
+        elif term == 4:
+            costs = presses_wrongly(task, world)
+        else:
+            costs = touches(task, world, GREMLINS)
+        world.terms[column] = 1.0 if costs else 0.0
+    if task.is_button:
+        world.goal_met = world.touching[task.first_body[BUTTONS] + world.goal_button]
+    else:
+        world.goal_met = world.measured[1 if task.is_push else 0] <= task.goal_size
+
+
+@compiled
+def observe(task: Any, world: Any, data: int, index: int) -> None:
+    """Everything that the robot perceives, by its lidar and by its sensors."""
+    seen = _floats(task.observations + 4 * task.observed * index, task.observed)
+    size = task.lidar_bins
+    rotation, robot = robot_rotation(task, data), robot_place(task, data)
+    for kind in range(len(task.lidar)):
+        if task.lidar[kind] < 0:
+            continue
+        bins = seen[task.lidar[kind] : task.lidar[kind] + size]
+        for sector in range(size):
+            bins[sector] = 0.0
+        if kind == BUTTONS and world.button_timer > 0:
+            continue
+        for place in range(task.start[kind], task.stop[kind]):
+            point = world.points[place]
+            x, y, _ = turned(rotation, point[0] - robot[0], point[1] - robot[1], -robot[2])
+            show(x, y, task.lidar_range, bins)
+    feel(task, world, data, seen)
+
+
+@compiled
+def feel(task: Any, world: Any, data: int, seen: Any) -> None:
+    """Write what the sensors read into an observation.
+
+    Accelerometer R^T (a + (0, 0, g)), velocimeter R^T v, magnetometer R^T m; gyro and the rear ball's spin
+    are angular velocities in the robot's frame, as MuJoCo has them; the ball's rotation is a matrix.
+    """
+    rotation, qvel, acceleration = (
+        robot_rotation(task, data),
+        field(data, task.qvel, task.nv),
+        world.acceleration,
+    )
+    upwards = acceleration[2] + task.gravity
+    _write(seen, task.sensors[ACCELEROMETER], turned(rotation, acceleration[0], acceleration[1], upwards))
+    rising = qvel[2] if task.is_car else 0.0
+    _write(seen, task.sensors[VELOCIMETER], turned(rotation, qvel[0], qvel[1], rising))
+    _write(seen, task.sensors[MAGNETOMETER], turned(rotation, 0.0, task.magnetic_field, 0.0))
+    if not task.is_car:
+        _write(seen, task.sensors[GYRO], (0.0, 0.0, qvel[2]))
+        return
+    _write(seen, task.sensors[GYRO], (qvel[3], qvel[4], qvel[5]))
+    _write(seen, task.sensors[SPIN], (qvel[8], qvel[9], qvel[10]))
+    ball = task.sensors[BALL]
+    write_rotation(field(data, task.qpos, task.nq)[9:13], seen[ball : ball + 9])
+
+
+@compiled
+def _write(seen: Any, place: int, numbers: tuple[float, float, float]) -> None:
+    for axis in range(3):
+        seen[place + axis] = numbers[axis]
+
+
+@compiled
+def nearest_gremlin(task: Any, world: Any, data: int) -> int:
+    """The gremlin that the robot may meet next, or NO_GREMLIN."""
+    robot = robot_place(task, data)
+    nearest, least = NO_GREMLIN, math.inf
+    for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
+        place = world.points[task.start[GREMLINS] + gremlin]
+        apart = math.hypot(place[0] - robot[0], place[1] - robot[1])
+        if apart < least:
+            nearest, least = gremlin, apart
+    return nearest if least <= task.gremlin_alert else NO_GREMLIN
+
+
+@compiled
+def replaceable(task: Any, world: Any, data: int) -> bool:
+    """Whether the gremlin that is a body, if one is, could as well be none."""
+    if world.embodied < 0:
+        return True
+    if world.touching[task.first_body[GREMLINS]]:
+        return False
+    course = _doubles(task.course_positions, 3 * task.course_steps)[3 * course_step(task, world) :]
+    circle = world.circles[world.embodied]
+    place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
+    x, y = place[0] - course[0] - circle[0], place[1] - course[1] - circle[1]
+    z = place[2] - course[2]
+    near: bool = x * x + y * y + z * z < task.gremlin_on_course * task.gremlin_on_course
+    return near
+
+
+@compiled
+def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
+    """Make this gremlin the body, or none: the body then hovers, untied, where nothing is."""
+    world.embodied = gremlin
+    place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
+    velocity = field(data, task.qvel, task.nv)[task.gremlin_qvel :]
+    lift = field(data, task.qfrc_applied, task.nv)[task.gremlin_qvel :]
+    _bytes(_addresses(data + task.eq_active, 1)[0], 1)[0] = gremlin >= 0
+    if gremlin < 0:
+        for axis in range(3):
+            place[axis] = task.gremlin_idle_place[axis]
+        for axis in range(6):
+            velocity[axis] = 0.0
+        lift[2] = task.gremlin_weight
+        return
+    lift[2] = 0.0
+    positions = _doubles(task.course_positions, 3 * task.course_steps)
+    velocities = _doubles(task.course_velocities, 6 * task.course_steps)
+    at = course_step(task, world)
+    for axis in range(3):
+        place[axis] = positions[3 * at + axis]
+    for axis in range(6):
+        velocity[axis] = velocities[6 * at + axis]
+    place[0] += world.circles[gremlin, 0]
+    place[1] += world.circles[gremlin, 1]
+    half = world.gremlin_yaws[gremlin] / 2.0
+    lead = field(data, task.mocap_quat, 4 * task.nmocap)[4 * task.gremlin_lead :]
+    for quaternion in (place[3:], lead):
+        quaternion[0], quaternion[3] = math.cos(half), math.sin(half)
+        quaternion[1] = quaternion[2] = 0.0
+
+
+@compiled
+def lead_gremlin(task: Any, world: Any, data: int, substep: int) -> None:
+    """Move what the body is tied to: 0.35 (sin t, cos t) from the middle of its circle."""
+    lead = field(data, task.mocap_pos, 3 * task.nmocap)[3 * task.gremlin_lead :]
+    time = task.timestep * (world.steps * task.substeps + substep)
+    lead[0] = world.circles[world.embodied, 0] + task.gremlin_travel * math.sin(time)
+    lead[1] = world.circles[world.embodied, 1] + task.gremlin_travel * math.cos(time)
+
+
+@compiled
+def act(task: Any, world: Any, data: int) -> bool:
+    """Set the controls; False if anything else was set, too."""
+    control = field(data, task.ctrl, 2)
+    control[0], control[1] = world.action[0], world.action[1]
+    if task.start[GREMLINS] < task.stop[GREMLINS]:
+        wanted = nearest_gremlin(task, world, data)
+        if wanted != world.embodied and replaceable(task, world, data):
+            embody(task, world, data, wanted)
+            return False
+    return True
+
+
+@compiled
+def same(one: Any, other: Any) -> bool:
+    """Whether two states are equal."""
+    for place in range(len(one)):  # noqa: SIM110  # not for Numba
+        if one[place] != other[place]:
+            return False
+    return True
+
+
+@compiled
+def report(task: Any, world: Any, index: int) -> None:
+    """Write what this step brought; the reward is the progress in metres, within bounds."""
+    outcome = _outcomes(task.outcomes, task.number)[index]
+    progress = world.distances[0] - world.measured[0]
+    if task.is_push:
+        progress += world.distances[1] - world.measured[1]
+    cost = 0.0
+    for column in range(task.num_terms):
+        outcome.numbers[2 + column] = world.terms[column]
+        cost = max(cost, world.terms[column])
+    outcome.numbers[0] = min(max(progress, -task.reward_bound), task.reward_bound)
+    outcome.numbers[1] = cost
+    outcome.flags[0] = world.goal_met
+    outcome.flags[1] = world.broken
+    outcome.flags[2] = world.broken  # what else ends an episode is not known here
+    outcome.flags[3] = world.steps >= task.horizon
+
+
+@compiled
+def begin(task: Any, world: Any, model: int, data: int, index: int) -> bool:
+    """Do as the action says; whether everything else is as the last step left it."""
+    left = task.rows + 8 * task.row * 2 * index
+    found = left + 8 * task.row
+    mj_getState(model, data, found, task.row_fields)
+    untouched = same(_doubles(left, task.row), _doubles(found, task.row))
+    return act(task, world, data) and untouched
+
+
+@compiled
+def simulate(task: Any, world: Any, model: int, data: int, index: int) -> None:
+    """A step's physics steps.
+
+    Where the last step left off, MuJoCo has computed already what follows from coordinates and velocities:
+    the first physics step then does not compute it again, which changes nothing.
+    """
+    untouched = begin(task, world, model, data, index)
+    leads = world.embodied >= 0
+    for substep in range(task.substeps):
+        if leads:
+            lead_gremlin(task, world, data, substep)
+        if substep == 0 and untouched and not leads:
+            mj_step2(model, data)
+        else:
+            mj_step(model, data)
+
+
+@compiled
+def end(task: Any, world: Any, model: int, data: int, index: int) -> None:
+    """Compute everything that follows from the state after the physics steps, and what the step brought."""
+    mj_forward(model, data)
+    mj_getState(model, data, task.rows + 8 * task.row * 2 * index, task.row_fields)
+    world.steps += 1
+    look(task, world, data)
+    judge(task, world, data)
+    report(task, world, index)
+    for part in range(2):
+        world.distances[part] = world.measured[part]
+    world.button_timer = max(world.button_timer - 1, 0)
+    observe(task, world, data, index)
+
+
+@compiled_for_batch
+def step(model: int, data: int, index: int, argument: int) -> None:
+    """One environment step of one world; the action is in its record."""
+    task = _tasks(argument, 1)[0]
+    world = _worlds(task.worlds, task.number)[index]
+    simulate(task, world, model, data, index)
+    end(task, world, model, data, index)
+
+
+@compiled_for_batch
+def review(_: int, data: int, index: int, argument: int) -> None:
+    """Find what is to be found in one world as it is: after a reset, or with a new goal."""
+    task = _tasks(argument, 1)[0]
+    world = _worlds(task.worlds, task.number)[index]
+    look(task, world, data)
+    judge(task, world, data)
+    observe(task, world, data, index)
+
+
+@compiled_for_batch
+def perceive(_: int, data: int, index: int, argument: int) -> None:
+    """Observe one world, whose objects and accelerations are as somebody has written them."""
+    task = _tasks(argument, 1)[0]
+    observe(task, _worlds(task.worlds, task.number)[index], data, index)
+
+
+@compiled_for_python
+def acceptable(argument: int) -> bool:
+    """Whether every action is within [-1, 1], and a number."""
+    task = _tasks(argument, 1)[0]
+    for world in _worlds(task.worlds, task.number):
+        for action in world.action:
+            if not -1.0 <= action <= 1.0:
+                return False
+    return True

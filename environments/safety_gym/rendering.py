@@ -1,0 +1,193 @@
+"""Pictures of the Safety Gym tasks, drawn off-screen: robot, objects, goals, hazards and lidar.
+
+Goals and hazards are no part of the physics' model; they are added to the picture, and so are the lidar's
+readings: one ring of 16 spheres above the robot for each kind of object, brighter where something is near.
+
+Source of colours and places of the spheres: openai/safety-gym ``engine.py``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.safety_gym.batch import SafetyWorlds
+from recrl.environments.safety_gym.gremlins import gremlin_course
+from recrl.environments.safety_gym.scene import rotation_matrices, scene_xml, upright
+from recrl.environments.safety_gym.tasks import GOAL_HEIGHT, LIDAR_BINS
+from recrl.environments.simulation.camera import Frame, make_context
+
+Colour = tuple[float, float, float]
+
+COLOURS: dict[str, Colour] = {
+    "robot": (0.8, 0.1, 0.15),
+    "goal": (0.0, 1.0, 0.0),
+    "box": (1.0, 1.0, 0.0),
+    "buttons": (1.0, 0.5, 0.0),
+    "hazards": (0.0, 0.0, 1.0),
+    "vases": (0.0, 1.0, 1.0),
+    "pillars": (0.5, 0.5, 1.0),
+    "gremlins": (0.5, 0.0, 1.0),
+}
+SHADE = 0.25
+"""Opacity of goals and hazards, which one can drive through."""
+HAZARD_HEIGHT = 0.02
+LIDAR_RADIUS, LIDAR_HEIGHT, LIDAR_RISE, LIDAR_SPHERE = 0.15, 0.5, 0.06, 0.025
+FAINTEST = 0.1
+MAX_GEOMS = 1000
+CAMERA_DISTANCE, CAMERA_ELEVATION, CAMERA_AZIMUTH = 6.5, -50.0, 90.0
+
+# Without a graphics card, smoothed edges and finer spheres are four fifths of the time of a picture.
+_ROOM = """
+<visual>
+  <headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5" specular="0 0 0"/>
+  <global offwidth="1920" offheight="1080"/>
+  <quality offsamples="0" numslices="20" numstacks="10"/>
+</visual>
+<asset>
+  <texture type="skybox" builtin="gradient" rgb1="0.5 0.6 0.9" rgb2="0.1 0.1 0.4" width="64" height="64"/>
+  <texture name="tiles" type="2d" builtin="checker" rgb1="0.7 0.7 0.7" rgb2="0.8 0.8 0.8"
+           width="64" height="64"/>
+  <material name="tiled" texture="tiles" texrepeat="10 10"/>
+</asset>
+"""
+
+
+class SafetyRenderer:
+    """Draws single worlds of a task.
+
+    Args:
+        worlds: whose worlds are drawn.
+        width: of a picture, pixels, at most 1,920.
+        height: of a picture, pixels, at most 1,080.
+
+    Raises:
+        RenderingUnavailableError: there is neither EGL nor OSMesa, or MUJOCO_GL names one that is missing.
+    """
+
+    def __init__(self, worlds: SafetyWorlds, width: int = 480, height: int = 360) -> None:
+        self._worlds = worlds
+        self._model = _coloured_model(worlds)
+        self._data = mujoco.MjData(self._model)
+        self._context = make_context(width, height)
+        self._drawing = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawing)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=MAX_GEOMS)
+        self._look = mujoco.MjvOption()
+        self._area = mujoco.MjrRect(0, 0, width, height)
+        self._camera = mujoco.MjvCamera()
+        self._camera.distance = CAMERA_DISTANCE
+        self._camera.elevation, self._camera.azimuth = CAMERA_ELEVATION, CAMERA_AZIMUTH
+
+    def frame(self, index: int) -> Frame:
+        """World ``index`` as it is now, [height, width, 3]."""
+        worlds = self._worlds
+        row = worlds.simulations.rows[index]
+        mujoco.mj_setState(self._model, self._data, row, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        mujoco.mjv_updateScene(
+            self._model,
+            self._data,
+            self._look,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        self._add_areas(index)
+        self._add_gremlins(index)
+        self._add_lidar(index)
+        picture = np.empty((self._area.height, self._area.width, 3), np.uint8)
+        self._context.make_current()
+        mujoco.mjr_render(self._area, self._scene, self._drawing)
+        mujoco.mjr_readPixels(picture, None, self._area, self._drawing)
+        return np.flipud(picture).copy()  # OpenGL counts rows from below
+
+    def close(self) -> None:
+        """Free what the graphics driver holds."""
+        self._drawing.free()
+        self._context.free()
+
+    def _add_areas(self, index: int) -> None:
+        worlds, task = self._worlds, self._worlds.task
+        if task.target.number:
+            size = task.target.size
+            for place in worlds.points[index, worlds.group["goal"]]:
+                self._add_cylinder((*place, GOAL_HEIGHT), size, size / 2, COLOURS["goal"])
+        else:
+            button = worlds.points[index, worlds.group["goal"].start]
+            self._add_cylinder((*button, 0.01), 2 * task.buttons.size, 0.01, COLOURS["goal"])
+        if "hazards" in worlds.group:
+            for place in worlds.points[index, worlds.group["hazards"]]:
+                self._add_cylinder((*place, HAZARD_HEIGHT), task.hazards.size, 0.01, COLOURS["hazards"])
+
+    def _add_gremlins(self, index: int) -> None:
+        """The gremlins that are no bodies just now."""
+        worlds, task = self._worlds, self._worlds.task
+        if not task.gremlins.number:
+            return
+        height = float(gremlin_course(task).positions[worlds.steps[index], 2])
+        for gremlin, place in enumerate(worlds.points[index, worlds.group["gremlins"]]):
+            if gremlin != worlds.embodied[index]:
+                turn = rotation_matrices(upright(worlds.gremlin_yaws[index, gremlin]))
+                self._add(
+                    mujoco.mjtGeom.mjGEOM_BOX,
+                    np.full(3, task.gremlins.size),
+                    np.array((*place, height)),
+                    (*COLOURS["gremlins"], 1.0),
+                    turn,
+                )
+
+    def _add_lidar(self, index: int) -> None:
+        worlds = self._worlds
+        observation = worlds.observations()[index]
+        body = self._data.body("robot")
+        rotation = body.xmat.reshape(3, 3)
+        angles = 2.0 * np.pi * (np.arange(LIDAR_BINS) + 0.5) / LIDAR_BINS
+        for ring, kind in enumerate(worlds.task.lidars):
+            height = LIDAR_HEIGHT + LIDAR_RISE * ring
+            for angle, reading in zip(angles, observation[worlds.task.where(f"{kind}_lidar")], strict=True):
+                place = (LIDAR_RADIUS * np.cos(angle), LIDAR_RADIUS * np.sin(angle), height)
+                self._add(
+                    mujoco.mjtGeom.mjGEOM_SPHERE,
+                    np.full(3, LIDAR_SPHERE),
+                    body.xpos + rotation @ place,
+                    (*COLOURS[kind], min(1.0, float(reading) + FAINTEST)),
+                )
+
+    def _add_cylinder(
+        self, place: tuple[float, ...], radius: float, half_height: float, colour: Colour
+    ) -> None:
+        size = np.array((radius, half_height, 0.0))
+        self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, np.array(place), (*colour, SHADE))
+
+    def _add(
+        self,
+        shape: Any,
+        size: Floats,
+        place: Floats,
+        rgba: tuple[float, ...],
+        rotation: Floats | None = None,
+    ) -> None:
+        scene = self._scene
+        turn = np.eye(3) if rotation is None else rotation
+        mujoco.mjv_initGeom(
+            scene.geoms[scene.ngeom], shape, size, place, turn.reshape(9), np.array(rgba, np.float32)
+        )
+        scene.ngeom += 1
+
+
+def _coloured_model(worlds: SafetyWorlds) -> mujoco.MjModel:
+    """The task's model with colours and a floor to look at; its state is that of the plain one."""
+    xml = scene_xml(worlds.task).replace("<option", f"{_ROOM}<option", 1)
+    model = mujoco.MjModel.from_xml_string(xml.replace('name="floor"', 'name="floor" material="tiled"', 1))
+    for geom in range(model.ngeom):
+        body = model.body(model.body_rootid[model.geom_bodyid[geom]]).name
+        for kind, colour in COLOURS.items():
+            if body and body.startswith(kind.rstrip("s")):
+                model.geom_rgba[geom] = (*colour, 1.0)
+    return model

@@ -1,0 +1,305 @@
+"""Many MuJoCo simulations of one model, stepped together, that can be saved and restored exactly.
+
+They are one batch of MuJoCo's (``mjbatch.h``, MuJoCo 4) through its C interface, on MuJoCo's own threads.
+MuJoCo's Python class ``mujoco.batch.Batch`` lacks two things: it cannot run a compiled function on each
+simulation, and it offers no way to put sleeping bodies back to sleep, which is no part of a state row. Here
+``load`` does, so that a simulation with sleeping bodies continues to the last bit.
+
+A batch with several threads cannot follow its process through a fork: the child has none of the threads.
+
+Notation: B simulations; n numbers in a state row.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.simulation.machine_code import mujoco_library
+
+Integers = npt.NDArray[np.int32]
+Ids = Sequence[int] | npt.NDArray[np.intp] | None
+
+_BatchFunction = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
+_NUM_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
+BAD_STATES = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]
+_EVERYTHING, _NOTHING = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_NONE)
+ROW = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class _Config(ctypes.Structure):
+    """``mjBatchConfig``."""
+
+    _fields_ = (("nthread", ctypes.c_int), ("persistent", ctypes.c_bool))
+
+
+@functools.cache
+def _library() -> Any:
+    """MuJoCo's shared library, with the types of the functions that are used here."""
+    library = mujoco_library()
+    pointer, integer = ctypes.c_void_p, ctypes.c_int
+    signatures: dict[str, tuple[Any, tuple[Any, ...]]] = {
+        "mjb_makeBatch": (
+            pointer,
+            (pointer, integer, ctypes.POINTER(_Config), ctypes.c_char_p, integer),
+        ),
+        "mjb_deleteBatch": (None, (pointer,)),
+        "mjb_nstate": (integer, (pointer,)),
+        "mjb_state": (pointer, (pointer,)),
+        "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
+        "mjb_warning": (pointer, (pointer,)),
+        "mjb_status": (pointer, (pointer,)),
+        "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
+        "mjb_forward": (integer, (pointer, pointer, integer, integer)),
+        "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
+        "mjb_error": (ctypes.c_char_p, (pointer, integer)),
+        "mjb_getData": (None, (pointer, integer, pointer)),
+        "mjb_apply": (integer, (pointer, pointer, integer, pointer, pointer, integer)),
+        "mj_updateSleep": (None, (pointer, pointer)),
+        "mj_copyData": (pointer, (pointer, pointer, pointer)),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
+
+
+class PhysicsError(RuntimeError):
+    """MuJoCo refused to go on."""
+
+
+class _Batch:
+    """MuJoCo's batch; freed when neither it nor a view of its memory is in use.
+
+    Attributes:
+        address: of the ``mjBatch``.
+        process: which made it.
+    """
+
+    def __init__(self, model: mujoco.MjModel, number: int, num_threads: int) -> None:
+        config = _Config(nthread=num_threads, persistent=True)
+        reason = ctypes.create_string_buffer(1000)
+        address = _library().mjb_makeBatch(model._address, number, ctypes.byref(config), reason, len(reason))
+        if not address:
+            raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
+        self.address = int(address)
+        self.process = os.getpid()
+        weakref.finalize(self, _delete, self.address, self.process, num_threads)
+
+    def view(self, address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
+        """The batch's memory at an address as an array, which keeps the batch alive."""
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        memory = (ctypes.c_char * size).from_address(address)
+        memory.batch = self
+        return np.frombuffer(memory, dtype).reshape(shape)
+
+
+class Simulations:
+    """B simulations of one model.
+
+    Args:
+        model: what is simulated; it is copied.
+        number: B.
+        num_threads: threads to step on, the caller's included. Results do not depend on it.
+
+    Attributes:
+        model: as given.
+        number: B.
+        rows: MuJoCo's integration states, a live view, [B, n]; writing to a row sets that simulation's
+            state for its next call.
+        stopped: simulations that MuJoCo could not compute since their last reset, [B].
+        any_stopped: whether there are any.
+    """
+
+    def __init__(self, model: mujoco.MjModel, number: int, *, num_threads: int = 1) -> None:
+        if number < 1:
+            raise ValueError(f"there must be at least one simulation, got {number}")
+        self.model = model
+        self.number = number
+        self._num_threads = num_threads
+        self._library = _library()
+        self._batch = _Batch(model, number, num_threads)
+        self._data = mujoco.MjData(model)
+        address = self._batch.address
+        size = self._library.mjb_nstate(address)
+        view = self._batch.view
+        self.rows: Floats = view(self._library.mjb_state(address), np.float64, (number, size))
+        self._warnings = view(self._library.mjb_warning(address), np.int32, (number, _NUM_WARNINGS, 2))
+        self._status = view(self._library.mjb_status(address), np.int32, (number,))
+        self.stopped = np.zeros(number, np.bool_)
+        self.any_stopped = False
+
+    def state(self, component: mujoco.mjtState, shape: tuple[int, ...]) -> Floats:
+        """A part of ``rows`` as a live view, [B, *shape]."""
+        size, batch = ctypes.c_int(), self._batch.address
+        address = self._library.mjb_stateComponent(batch, int(component), ctypes.byref(size))
+        start = (address - self._library.mjb_state(batch)) // self.rows.itemsize
+        view: Floats = self.rows[:, start : start + size.value].reshape(self.number, *shape)
+        return view
+
+    def apply(self, function: Any, argument: int, ids: Ids = None) -> None:
+        """Run a compiled function on simulations; it may step them.
+
+        Args:
+            function: from ``machine_code.compiled_for_batch``.
+            argument: an address, which the function is given.
+            ids: which simulations, each once; None for all.
+
+        Raises:
+            ValueError: there is no such simulation, or one is named twice.
+            PhysicsError: the process is a fork of the one that made the simulations, which had threads.
+        """
+        self._call(self._library.mjb_apply, ids, function.address, argument, 1)
+
+    def step(self, substeps: int, ids: Ids = None) -> None:
+        """Advance simulations, then compute everything, accelerations included, at the new state.
+
+        Args:
+            substeps: physics steps.
+            ids: which simulations; None for all.
+        """
+        self._call(self._library.mjb_step, ids, substeps, _EVERYTHING)
+
+    def reset(self, ids: Ids) -> None:
+        """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
+        self._check(self._library.mjb_reset, ids, None, _NOTHING)
+        self.stopped[self._chosen(ids)] = False
+        self.any_stopped = bool(self.stopped.any())
+
+    def forward(self, ids: Ids) -> None:
+        """Compute everything that follows from the rows of some simulations."""
+        self._check(self._library.mjb_forward, ids, _EVERYTHING)
+
+    def broken(self) -> npt.NDArray[np.bool_]:
+        """Whether a simulation has diverged since its last reset, [B].
+
+        MuJoCo then warns and silently starts again from the model's defaults, or, where it cannot compute a
+        step at all, leaves the simulation where it was.
+        """
+        return np.asarray(self._warnings[:, BAD_STATES, 1].any(axis=1) | self.stopped)
+
+    def any_broken(self) -> bool:
+        """Whether any simulation has diverged since its last reset: cheaper than ``broken``."""
+        return self.any_stopped or bool(self._warnings[:, BAD_STATES, 1].any())
+
+    def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
+        """A copy of one simulation, for drawing or for any function of MuJoCo; a new one, or ``into``."""
+        data = mujoco.MjData(self.model) if into is None else into
+        self._library.mjb_getData(self._batch.address, index, data._address)
+        return data
+
+    def save(self) -> dict[str, Any]:
+        """Everything that the future of these simulations depends on."""
+        asleep = [self.data(index, self._data).tree_asleep.copy() for index in range(self.number)]
+        return {
+            "rows": self.rows.copy(),
+            "asleep": np.array(asleep, np.int32),
+            "warnings": self._warnings[:, :, 1].copy(),
+            "stopped": self.stopped.copy(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``save`` was called.
+
+        What MuJoCo remembers of a sleeping body follows from its position: it is computed with everything
+        awake, and then those that slept are put back to sleep.
+        """
+        rows = np.asarray(state["rows"], np.float64)
+        if rows.shape != self.rows.shape:
+            raise ValueError(f"saved physics must have shape {self.rows.shape}, got {rows.shape}")
+        self.reset(None)
+        for index in range(self.number):
+            restored = self._restored(rows[index], state["asleep"][index])
+
+            def put_back(model: int, data: int, *_: Any, source: int = restored._address) -> None:
+                self._library.mj_copyData(data, model, source)
+
+            function = ctypes.cast(_BatchFunction(put_back), ctypes.c_void_p)
+            self._check(self._library.mjb_apply, [index], function, None, 1)
+        self._warnings[:, :, 1] = state["warnings"]
+        self.stopped[...] = state["stopped"]
+        self.any_stopped = bool(self.stopped.any())
+
+    def _restored(self, row: Floats, asleep: Integers) -> mujoco.MjData:
+        data = mujoco.MjData(self.model)
+        mujoco.mj_setState(self.model, data, row, ROW)
+        mujoco.mj_forward(self.model, data)
+        data.tree_asleep[:] = asleep
+        self._library.mj_updateSleep(self.model._address, data._address)
+        # The forward pass leaves its own guess for the next solution; the row has the one that was saved.
+        data.qacc_warmstart[:] = self._warm_start(row)
+        return data
+
+    def _warm_start(self, row: Floats) -> Floats:
+        warm_start = np.empty(self.model.nv)
+        component = mujoco.mjtState.mjSTATE_WARMSTART.value
+        mujoco.mj_extractState(self.model, row, ROW, warm_start, component)
+        return warm_start
+
+    def _call(self, function: Any, ids: Ids, *arguments: Any) -> None:
+        """Call a function of MuJoCo on simulations, and note which of them it could not compute."""
+        chosen = None if ids is None else self._chosen(ids)
+        failed = True
+        try:
+            failed = self._run(function, chosen, *arguments)
+        finally:  # a signal may come before the number of failures is known
+            if failed:
+                self.stopped[self._chosen(ids)] |= self._status[self._chosen(ids)] != 0
+                self.any_stopped = bool(self.stopped.any())
+
+    def _check(self, function: Any, ids: Ids, *arguments: Any) -> None:
+        """Call a function of MuJoCo on simulations; raise an error if it could not compute one of them."""
+        chosen = self._chosen(ids)
+        if self._run(function, chosen, *arguments):
+            index = int(chosen[self._status[chosen] != 0][0])
+            message = self._library.mjb_error(self._batch.address, index).decode()
+            raise PhysicsError(f"MuJoCo stopped in simulation {index}: {message}")
+
+    def _run(self, function: Any, chosen: Integers | None, *arguments: Any) -> bool:
+        """Call a function of MuJoCo on simulations; whether it could not compute some."""
+        if self._num_threads > 1 and os.getpid() != self._batch.process:
+            raise PhysicsError(
+                f"simulations with num_threads = {self._num_threads} stay in the process that made them, and "
+                "this is a fork of it: make them anew here, or with num_threads = 1"
+            )
+        if chosen is None:
+            return bool(function(self._batch.address, None, 0, *arguments))
+        if not chosen.size:
+            return False
+        return bool(function(self._batch.address, chosen.ctypes.data, chosen.size, *arguments))
+
+    def _chosen(self, ids: Ids) -> Integers:
+        if ids is None:
+            return np.arange(self.number, dtype=np.int32)
+        chosen = np.asarray(ids)
+        ordered = np.unique(chosen)  # MuJoCo asks for that
+        if chosen.size and (
+            chosen.dtype.kind not in "iu"
+            or ordered[0] < 0
+            or ordered[-1] >= self.number
+            or len(ordered) < len(chosen)
+        ):
+            raise ValueError(
+                f"simulations must be different whole numbers from 0 to {self.number - 1}, "
+                f"got {chosen.tolist()}"
+            )
+        return ordered.astype(np.int32)
+
+
+def _delete(address: int, process: int, num_threads: int) -> None:
+    """Free a batch; what a fork has inherited stays, as MuJoCo would wait for threads that are not there."""
+    if num_threads == 1 or process == os.getpid():
+        _library().mjb_deleteBatch(address)

@@ -1,0 +1,261 @@
+"""Safety-Gymnasium's velocity tasks: B robots of one task, stepped together.
+
+Observation: float32. The robot's coordinates but the first one or two, which say where it is, then its
+    velocities (Hopper, Walker2d: clipped to +-10). Humanoid, too: of each of 14 bodies the inertia (10
+    numbers), the velocity (6), then the actuators' forces on the 23 degrees of freedom, then of each body
+    the contact force (6); Gymnasium's Ant observes no contact forces.
+Action: the controls, within [-1, 1]; Humanoid: within [-0.4, 0.4].
+Reward: w_v vx - w_a |a|^2 + what being healthy earns, with the task's weights. vx is the distance along x
+    over the step, divided by its seconds: of the first coordinate; Ant: of the torso; Humanoid: of the
+    centre of mass.
+Cost: 1 in a step in which the velocity exceeds the task's threshold, else 0. The velocity is vx; Ant and
+    Humanoid: sqrt(vx^2 + vy^2).
+Termination: when the robot has fallen (``VelocityTask.healthy``; HalfCheetah and Swimmer never do), or when
+    the physics breaks down (reward and cost 0). Truncated after 1,000 steps.
+Source: Gymnasium's MuJoCo environments of version 4 with the thresholds of safety-gymnasium 1.0.0, version 1.
+
+As in Gymnasium, positions and velocities of bodies (Ant's torso; Humanoid's centre of mass, inertias,
+velocities, forces) are those of the last moment at which MuJoCo computed them, up to one physics step old.
+
+Notation: B robots, nq coordinates, nv velocities.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.simulation.mujoco_batch import Simulations
+from recrl.environments.velocity.model import make_model
+from recrl.environments.velocity.physics import advance, derive, physics_record
+from recrl.environments.velocity.tasks import HORIZON, Booleans, VelocityTask
+
+Observations = npt.NDArray[np.float32]
+TORSO = 1
+"""The torso's body; body 0 is the floor."""
+
+
+class Outcome(NamedTuple):
+    """What one step brought.
+
+    Attributes:
+        rewards: [B].
+        costs: 0 or 1, [B].
+        velocities: those that are compared with the threshold, m/s, [B].
+        terminated: [B].
+        truncated: [B].
+        broken: the physics broke down in this step, [B]; None if it did so nowhere.
+        finished: robots whose episode is over.
+    """
+
+    rewards: Floats
+    costs: Floats
+    velocities: Floats
+    terminated: Booleans
+    truncated: Booleans
+    broken: Booleans | None
+    finished: npt.NDArray[np.intp]
+
+
+class VelocityWorlds:
+    """B robots of one task. Whoever uses them restarts those whose episode is over.
+
+    Args:
+        task: which task.
+        number: B, at least 1.
+        horizon: steps after which an episode is truncated, at most 1,000.
+        num_threads: threads of the physics; results do not depend on it.
+
+    Attributes:
+        task, number, horizon: as given.
+        model: the physics' model.
+        simulations: the physics.
+        generators: one generator for each robot.
+        seconds: of the robot's time in a step.
+        bound: of the actions, which are within plus or minus this.
+        observed: numbers in an observation.
+        qpos, qvel: coordinates and velocities, live views, [B, nq] and [B, nv].
+        bodies: what the task needs of the bodies, by MuJoCo's name, as MuJoCo computed it last, [B, ...].
+        address: of the record ``PHYSICS`` that compiled functions are given.
+        places: where each robot was measured last, metres, [B, axes].
+        steps: taken in this episode, [B].
+    """
+
+    def __init__(
+        self, task: VelocityTask, number: int, *, horizon: int = HORIZON, num_threads: int = 1
+    ) -> None:
+        self.task, self.number, self.horizon, self._num_threads = task, number, horizon, num_threads
+        self.model = model = make_model(task)
+        self.simulations = Simulations(model, number, num_threads=num_threads)
+        self.generators: list[np.random.Generator] = []
+        self.seconds = float(model.opt.timestep) * task.frame_skip
+        self.bound = float(np.float32(model.actuator_ctrlrange[0, 1]))
+        state = mujoco.mjtState
+        self.qpos = self.simulations.state(state.mjSTATE_QPOS, (model.nq,))
+        self.qvel = self.simulations.state(state.mjSTATE_QVEL, (model.nv,))
+        self._controls = self.simulations.state(state.mjSTATE_CTRL, (model.nu,))
+        self._fresh = self.simulations.rows[0].copy()
+        self._actions = np.zeros((number, model.nu))
+        self.bodies = self._copies_of_bodies()
+        self._physics = physics_record(task.frame_skip, self.bodies, forces=task.observes_bodies)
+        self.address = int(self._physics.ctypes.data)
+        self.observed = sum(part.shape[1] for part in self._observed_parts())
+        self.places = np.zeros((number, task.axes))
+        self.steps = np.zeros(number, np.int64)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = self.state_dict() if self.generators else None
+        return _rebuilt, (self.task, self.number, self.horizon, self._num_threads, state)
+
+    def seed(self, seed: int | None) -> None:
+        """Give each robot a generator; robot i has the same one whatever B is."""
+        streams = np.random.SeedSequence(seed).spawn(self.number)
+        self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
+
+    def restart(self, ids: npt.NDArray[np.intp]) -> None:
+        """Begin new episodes of some robots."""
+        if self.simulations.broken()[ids].any():
+            self.simulations.reset(ids)
+        self.simulations.rows[ids] = self._fresh
+        for index in ids:
+            self._place_at_random(index)
+        if self.bodies:
+            self.simulations.apply(derive, self.address, ids)
+        if self.task.observes_bodies:
+            self.bodies["cfrc_ext"][ids] = 0.0  # of before
+        self.places[ids] = self.measured()[ids]
+        self.steps[ids] = 0
+
+    def order(self, actions: npt.NDArray[Any]) -> bool:
+        """Say what to do in the next step; False if an action, [B, nu], is no number within the bounds."""
+        self._actions[...] = actions
+        return bool(np.abs(self._actions).max() <= self.bound)  # False with NaN
+
+    def advance(self) -> Outcome:
+        """Take one step with every robot, as ordered."""
+        self._controls[...] = self._actions
+        self.simulations.apply(advance, self.address)
+        places = self.measured()
+        passed = (places - self.places) / self.seconds
+        self.places = places
+        self.steps += 1
+        rewards, velocities, costs = self.judge(passed, self._actions)
+        terminated = self.fallen()
+        broken = self.simulations.broken() if self.simulations.any_broken() else None
+        if broken is not None:
+            rewards[broken] = costs[broken] = 0.0
+            terminated |= broken
+        truncated = (self.steps >= self.horizon) & ~terminated
+        finished = np.flatnonzero(terminated | truncated)
+        return Outcome(rewards, costs, velocities, terminated, truncated, broken, finished)
+
+    def judge(self, passed: Floats, actions: Floats) -> tuple[Floats, Floats, Floats]:
+        """What a step brings.
+
+        Args:
+            passed: velocities along each axis, m/s, [B, axes].
+            actions: [B, nu].
+
+        Returns:
+            rewards, the velocities that are compared with the threshold, m/s, and costs, [B] each.
+        """
+        task, forward = self.task, passed[:, 0]
+        effort = np.einsum("bi,bi->b", actions, actions)
+        rewards = task.forward_weight * forward - task.control_weight * effort + task.healthy_reward
+        velocities = forward if task.axes == 1 else np.hypot(forward, passed[:, 1])
+        return rewards, velocities, (velocities > task.threshold).astype(np.float64)
+
+    def fallen(self) -> Booleans:
+        """Whether each robot has fallen, where it is now, [B]."""
+        if self.task.healthy is None:
+            return np.zeros(self.number, np.bool_)
+        return np.asarray(~self.task.healthy(self.qpos, self.qvel))
+
+    def observations(self) -> Observations:
+        """What is observed now, [B, observed]."""
+        seen, start = np.empty((self.number, self.observed), np.float32), 0
+        for part in self._observed_parts():
+            seen[:, start : start + part.shape[1]] = part
+            start += part.shape[1]
+        return seen
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future depends on: physics, where the robots were measured, counters, generators."""
+        return {
+            "physics": self.simulations.save(),
+            "places": self.places.copy(),
+            "steps": self.steps.copy(),
+            "generators": [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        if len(state["generators"]) != self.number:
+            raise ValueError(
+                f"{self.task.name}: the saved state is of {len(state['generators'])} environments, "
+                f"these are {self.number}"
+            )
+        self.simulations.load(state["physics"])
+        self.places = np.array(state["places"], np.float64)
+        self.steps[...] = state["steps"]
+        self.seed(0)
+        for generator, saved in zip(self.generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+
+    def _place_at_random(self, index: int) -> None:
+        task, generator, model = self.task, self.generators[index], self.model
+        noise = generator.uniform(-task.position_noise, task.position_noise, model.nq)
+        self.qpos[index] = model.qpos0 + noise
+        if task.normal_velocities:
+            self.qvel[index] = task.velocity_noise * generator.standard_normal(model.nv)
+        else:
+            self.qvel[index] = generator.uniform(-task.velocity_noise, task.velocity_noise, model.nv)
+
+    def _copies_of_bodies(self) -> dict[str, Floats]:
+        """Memory for what the task needs of the bodies, by MuJoCo's name, [B, ...]."""
+        bodies, shapes = self.model.nbody, dict[str, tuple[int, ...]]()
+        if self.task.measured == "torso":
+            shapes["xpos"] = bodies, 3
+        if self.task.measured == "mass":
+            shapes["xipos"] = bodies, 3
+        if self.task.observes_bodies:
+            shapes |= {"cinert": (bodies, 10), "cvel": (bodies, 6)}
+            shapes |= {"qfrc_actuator": (self.model.nv,), "cfrc_ext": (bodies, 6)}
+        return {name: np.zeros((self.number, *shape)) for name, shape in shapes.items()}
+
+    def measured(self) -> Floats:
+        """Where each robot is now, or was when MuJoCo computed it last, metres, [B, axes]."""
+        axes = self.task.axes
+        match self.task.measured:
+            case "root":
+                return self.qpos[:, :axes].copy()
+            case "torso":
+                return self.bodies["xpos"][:, TORSO, :axes].copy()
+            case "mass":
+                mass = self.model.body_mass
+                return np.asarray((mass / mass.sum()) @ self.bodies["xipos"][:, :, :axes])
+
+    def _observed_parts(self) -> list[Floats]:
+        """An observation's parts in their order, [B, ...]."""
+        bound = self.task.velocity_bound
+        velocities = self.qvel if bound == np.inf else np.clip(self.qvel, -bound, bound)
+        parts = [self.qpos[:, self.task.hidden :], velocities]
+        if self.task.observes_bodies:
+            names = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
+            parts += [self.bodies[name].reshape(self.number, -1) for name in names]
+        return parts
+
+
+def _rebuilt(
+    task: VelocityTask, number: int, horizon: int, num_threads: int, state: dict[str, Any] | None
+) -> VelocityWorlds:
+    """A copy of pickled robots."""
+    worlds = VelocityWorlds(task, number, horizon=horizon, num_threads=num_threads)
+    if state is not None:
+        worlds.load_state_dict(state)
+    return worlds

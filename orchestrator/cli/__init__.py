@@ -1,0 +1,1 @@
+"""The command line ``recrl-sweep``: arguments, commands, and what a terminal shows."""

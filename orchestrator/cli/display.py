@@ -1,0 +1,253 @@
+"""How plans and progress look on a terminal; words and tables only, nothing is decided here."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from recrl.orchestrator.background import beside
+from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.grid.plan import Estimate, Plan, Work
+from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, standing_of
+
+TERMINAL_SECONDS = 1.0
+LINE_SECONDS = 10.0
+LOG_SECONDS = 0.5
+SHOWN_RUNNING = 8
+
+_STYLES = {
+    "complete": "green",
+    "running": "cyan",
+    "failed": "bold red",
+    "damaged": "bold red",
+    "repair": "yellow",
+    "rerun": "yellow",
+    "interrupted": "yellow",
+    "retry": "yellow",
+    "resume": "yellow",
+}
+
+
+def plan_table(plan: Plan) -> Table:
+    """Every trial and what a launch would do with it."""
+    table = _table("trial", "seed", "work", "done", "id")
+    for trial in plan.trials:
+        done = 0 if trial.work in (Work.REPAIR, Work.DAMAGED) else trial.record.env_steps
+        fraction = 1.0 if trial.work is Work.COMPLETE else done / trial.spec.total_steps
+        table.add_row(
+            f"{trial.spec.task.label} {trial.spec.agent.label} {trial.spec.method.label}",
+            str(trial.spec.seed),
+            _styled(trial.work),
+            f"{min(1.0, fraction):.0%}",
+            trial.spec.trial_id,
+        )
+    return table
+
+
+def plan_sentence(plan: Plan) -> str:
+    """``20 trials: 12 new, 3 to resume, 5 complete``."""
+    words = {
+        Work.NEW: "new",
+        Work.RESUME: "to resume",
+        Work.RETRY: "to try again",
+        Work.REPAIR: "damaged, to go on from what is whole",
+        Work.RERUN: "to run again on the present code",
+        Work.COMPLETE: "complete",
+        Work.FAILED: "failed",
+        Work.DAMAGED: "damaged",
+    }
+    parts = [f"{number} {words[work]}" for work, number in plan.counts.items() if number]
+    return f"{_counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
+
+
+def estimate_sentence(estimate: Estimate, where: str) -> str:
+    """``about 4 min with 2 trials at once on this machine, about 1.9 GB of memory``."""
+    if not estimate.concurrent:
+        return "nothing to do"
+    memory = f"about {estimate.gigabytes:.1f} GB of memory"
+    at_once = f"{_counted(estimate.concurrent, 'trial')} at once {where}"
+    if estimate.wall_seconds is None:
+        names = ", ".join(dict.fromkeys(estimate.unknown))
+        return f"time unknown until a first trial has run ({names}); {at_once}, {memory}"
+    return f"about {duration(estimate.wall_seconds)} with {at_once}, {memory}"
+
+
+def status_table(progress: SweepProgress) -> Table:
+    """Every trial and where it stands."""
+    table = _table("trial", "seed", "standing", "done", "steps/s", "CPU", "tries", "id")
+    for trial in progress.trials:
+        running = trial.standing is Standing.RUNNING
+        table.add_row(
+            f"{trial.spec.task.label} {trial.spec.agent.label} {trial.spec.method.label}",
+            str(trial.spec.seed),
+            _styled(trial.standing),
+            f"{trial.fraction:.0%}",
+            f"{trial.record.steps_per_second:,.0f}" if running else "",
+            duration(trial.record.cpu_seconds) if trial.record.cpu_seconds else "",
+            str(trial.record.attempt) if trial.record.attempt else "",
+            trial.spec.trial_id,
+        )
+    return table
+
+
+def status_sentence(progress: SweepProgress) -> str:
+    """``12 of 20 complete, 2 running, 6 waiting, 0 failed; 61%; 22,400 steps/s; 1 min 43 s left``."""
+    counts = progress.counts
+    parts = [
+        f"{counts[Standing.COMPLETE]} of {len(progress.trials)} complete",
+        f"{counts[Standing.RUNNING]} running",
+        f"{counts[Standing.WAITING]} waiting",
+        f"{counts[Standing.FAILED]} failed",
+    ]
+    parts += [
+        f"{counts[standing]} {standing}"
+        for standing in (Standing.STOPPED, Standing.INTERRUPTED, Standing.DAMAGED)
+        if counts[standing]
+    ]
+    sentence = ", ".join(parts)
+    if progress.is_complete:
+        return sentence
+    sentence += f"; {progress.fraction:.0%}"
+    if progress.seconds_left is not None:
+        sentence += f"; {progress.steps_per_second:,.0f} steps/s; {duration(progress.seconds_left)} left"
+    return sentence
+
+
+def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress], str]) -> Iterator[str]:
+    """For every trial that broke off: which, why, and where its log and traceback are."""
+    for trial in trials:
+        broken = trial.standing in (Standing.FAILED, Standing.DAMAGED)
+        word = str(trial.standing) if broken else "waiting"
+        yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was left'}"
+        what = "its files" if trial.standing is Standing.DAMAGED else "log and traceback"
+        yield f"        {what}: {folder_of(trial)}"
+
+
+def damages_of_plan(plan: Plan) -> Iterator[str]:
+    """For every damaged trial: which, what is wrong, and what a launch does about it."""
+    for trial in plan.trials:
+        if trial.record.status is TrialState.DAMAGED:
+            yield f"damaged: {trial.spec.title}: {trial.record.error}"
+
+
+def lines_of(trial: TrialStore, *, follow: bool) -> Iterator[str]:
+    """The lines of a trial's log, without their ends.
+
+    Args:
+        trial: on disk.
+        follow: whether to wait for more as long as the trial runs.
+    """
+    offset, rest = 0, ""
+    while True:
+        runs = standing_of(trial.record(), now=time.time()) is Standing.RUNNING
+        with suppress(FileNotFoundError), trial.log_path.open("rb") as file:
+            file.seek(offset)
+            *lines, rest = (rest + file.read().decode(errors="replace")).split("\n")
+            offset = file.tell()
+            yield from lines
+        if not (follow and runs):
+            break
+        time.sleep(LOG_SECONDS)
+    if rest:
+        yield rest
+
+
+def duration(seconds: float) -> str:
+    """A time as people say it.
+
+    >>> duration(0.4), duration(103), duration(7260), duration(200_000)
+    ('1 s', '1 min 43 s', '2 h 1 min', '2 d 7 h')
+    """
+    whole = max(1, round(seconds))
+    for size, unit, smaller, smaller_unit in (
+        (86_400, "d", 3_600, "h"),
+        (3_600, "h", 60, "min"),
+        (60, "min", 1, "s"),
+    ):
+        if whole >= size:
+            rest = whole % size // smaller
+            return f"{whole // size} {unit} {rest} {smaller_unit}" if rest else f"{whole // size} {unit}"
+    return f"{whole} s"
+
+
+@contextmanager
+def live_progress(ask: Callable[[], SweepProgress], console: Console) -> Iterator[None]:
+    """Show the progress while the context lasts.
+
+    On a terminal in place, once a second; elsewhere a line every ten seconds, if anything has changed.
+
+    Args:
+        ask: reads the progress from the files.
+        console: where to show it.
+    """
+    show = _show_in_place if console.is_terminal else _show_lines
+    with beside(partial(show, ask, console), name="progress"):
+        yield
+
+
+def _show_in_place(ask: Callable[[], SweepProgress], console: Console, done: threading.Event) -> None:
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        while True:
+            began = time.monotonic()
+            live.update(_picture(ask()), refresh=True)
+            # reading the files of a very large sweep must not become the main work
+            if done.wait(max(TERMINAL_SECONDS, 20.0 * (time.monotonic() - began))):
+                return
+
+
+def _show_lines(ask: Callable[[], SweepProgress], console: Console, done: threading.Event) -> None:
+    last = ""
+    while not done.wait(LINE_SECONDS):
+        sentence = status_sentence(ask())
+        if sentence != last:
+            console.print(sentence, highlight=False, soft_wrap=True)
+        last = sentence
+
+
+def _picture(progress: SweepProgress) -> RenderableType:
+    rows: list[RenderableType] = [
+        Text(status_sentence(progress)),
+        ProgressBar(total=1.0, completed=progress.fraction, width=60),
+    ]
+    running = progress.standing(Standing.RUNNING)
+    table = Table.grid(padding=(0, 2))
+    for trial in running[:SHOWN_RUNNING]:
+        speed = f"{trial.record.steps_per_second:,.0f} steps/s" if trial.record.steps_per_second else ""
+        table.add_row("  " + trial.spec.title, f"{trial.fraction:.0%}", speed)
+    if len(running) > SHOWN_RUNNING:
+        table.add_row(f"  and {len(running) - SHOWN_RUNNING} more")
+    return Group(*rows, table)
+
+
+def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """A table of finished text."""
+    table = _table(*columns)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for column in columns:
+        right = column in ("seed", "done", "steps/s", "CPU", "tries")
+        table.add_column(column, justify="right" if right else "left", no_wrap=True)
+    return table
+
+
+def _styled(word: str) -> Text:
+    return Text(str(word), style=_STYLES.get(str(word), ""))
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

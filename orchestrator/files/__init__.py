@@ -1,0 +1,1 @@
+"""The files of a sweep: writing, reading, checking, and where their contents come from."""

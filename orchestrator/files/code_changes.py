@@ -1,0 +1,161 @@
+"""What code a trial ran, and whether that is the code that is installed now.
+
+A trial's results depend on recrl's tasks, agents and curricula and on how a trial is run, not on figures or
+commands: only the former are in the digest. Of a task, agent or curriculum that is the user's own, all Python
+files of its top-level package are in it, or its one module. Nothing is imported to find them.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.machinery
+import importlib.util
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from recrl.agents.registry import AGENTS
+from recrl.environments.registry import TASKS
+from recrl.orchestrator.errors import StorageError
+from recrl.orchestrator.files.own_package import folder_of
+from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.spec import TrialSpec
+from recrl.teachers.registry import TEACHERS
+
+OURS = "recrl"
+NAMED = 5  # trials in a sentence, at most
+FOLDERS = ("agents", "environments", "teachers")
+MODULES = ("trial/trial.py", "spec.py")  # of the orchestrator
+SUFFIXES = (".py", ".xml", ".txt")  # of what results depend on
+KINDS = (
+    ("task", "recrl.tasks", TASKS),
+    ("agent", "recrl.agents", AGENTS),
+    ("method", "recrl.teachers", TEACHERS),
+)
+
+
+def code_of(spec: TrialSpec) -> dict[str, str]:
+    """Digests of the code that a trial runs: recrl's, and one for each top-level package of the user's own.
+
+    A package that is not installed here is left out.
+    """
+    found = {OURS: _own_digest()}
+    for kind, group, ours in KINDS:
+        choice = getattr(spec, kind)
+        names = [] if choice.name in ours else [_module_of(choice.name, group)]
+        if isinstance(identity := choice.options.get("id"), str) and ":" in identity:
+            names.append(identity)  # of Gymnasium: ``module:name``
+        for name in filter(None, names):
+            package = name.partition(":")[0].partition(".")[0]
+            if digest := _package_digest(package):
+                found[package] = digest
+    return found
+
+
+def other_code(attempts: Iterable[Mapping[str, Any]], spec: TrialSpec) -> bool:
+    """Whether one of a trial's attempts ran other code than is installed now, as far as both are known.
+
+    Args:
+        attempts: of ``TrialStore.provenance``.
+        spec: the trial.
+    """
+    now = code_of(spec)
+    for attempt in attempts:
+        code = attempt.get("code", {})
+        if any(name in now and digest != now[name] for name, digest in code.items()):
+            return True
+    return False
+
+
+def has_other_code(trial: TrialStore, spec: TrialSpec) -> bool:
+    """``other_code`` for the trial's files; False where these do not say."""
+    try:
+        return other_code(trial.provenance(), spec)
+    except StorageError:
+        return False
+
+
+def other_code_sentence(complete: int, begun: int) -> str:
+    """What is said of trials that ran other code; empty for none.
+
+    Args:
+        complete: complete ones.
+        begun: those that are not.
+    """
+    parts = []
+    if complete:
+        parts.append(f"{complete} complete trial{'' if complete == 1 else 's'}")
+    if begun:
+        noun = f"one{'' if begun == 1 else 's'}" if complete else f"trial{'' if begun == 1 else 's'}"
+        parts.append(f"{begun} begun {noun}")
+    if not parts:
+        return ""
+    comes = "comes" if complete + begun == 1 else "come"
+    them = "it" if complete + begun == 1 else "them"
+    return (
+        f"{' and '.join(parts)} {comes} from other code than is installed now; launch --rerun-changed runs "
+        f"{them} again"
+    )
+
+
+def no_curriculum_sentence(titles: Sequence[str]) -> str:
+    """What is said of trials whose measured d_t is not above d_d; empty for none."""
+    if not titles:
+        return ""
+    named = ", ".join(titles[:NAMED])
+    more = f" and {len(titles) - NAMED} more" if len(titles) > NAMED else ""
+    return (
+        f"the measured d_t is not above d_d, so that the curriculum is none: {named}{more}; give a finite "
+        "train_limits above d_d"
+    )
+
+
+def _module_of(name: str, group: str) -> str:
+    """``module:attribute`` of a name that is not ours: itself, or what its entry point leads to."""
+    if ":" in name:
+        return name
+    return next((point.value for point in entry_points(group=group) if point.name == name), "")
+
+
+@functools.cache
+def _own_digest() -> str:
+    """That of what results depend on in recrl."""
+    files = {
+        f"{name}/{path.relative_to(folder_of(name))}": path
+        for name in FOLDERS
+        for path in folder_of(name).rglob("*")
+        if path.suffix in SUFFIXES
+    }
+    trial = {f"orchestrator/{module}": folder_of("orchestrator") / module for module in MODULES}
+    if missing := [str(path) for path in trial.values() if not path.is_file()]:
+        raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is not there")
+    return _digest({**files, **trial})
+
+
+def _package_digest(package: str) -> str:
+    """That of a top-level package or module; empty where it is not found."""
+    try:
+        spec = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        return ""
+    if spec is None:
+        return ""
+    folders = [Path(place) for place in spec.submodule_search_locations or ()]
+    files = {str(path.relative_to(folder)): path for folder in folders for path in folder.rglob("*.py")}
+    if not folders and spec.origin and spec.origin.endswith(tuple(importlib.machinery.SOURCE_SUFFIXES)):
+        files = {Path(spec.origin).name: Path(spec.origin)}
+    return _digest(files) if files else ""
+
+
+def _digest(files: Mapping[str, Path]) -> str:
+    digest = hashlib.sha256()
+    for name, path in sorted(files.items()):
+        try:
+            data = path.read_bytes()
+        except OSError:  # an editor's file that came and went
+            continue
+        digest.update(f"{name}\n".encode())
+        digest.update(hashlib.sha256(data).digest())
+    return digest.hexdigest()[:16]

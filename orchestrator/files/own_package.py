@@ -1,0 +1,68 @@
+"""recrl's own files as this process imports them: their digest, and a copy to send elsewhere."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import shutil
+from pathlib import Path
+
+DISTRIBUTION = "recrl"
+FOLDERS = ("agents", "analysis", "environments", "orchestrator", "teachers")
+METADATA = ("METADATA", "PKG-INFO", "entry_points.txt")  # an editable install has one of the first two
+
+
+def source_digest() -> str:
+    """Ten hex digits that differ whenever a Python file of recrl does: a version alone does not say it."""
+    digest = hashlib.sha256()
+    for path in _own_files():
+        digest.update(f"{path.name}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+    for name in FOLDERS:  # links in a source checkout: a walk from the parent would not enter them
+        folder = folder_of(name)
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:10]
+
+
+def copy_package(parent: Path) -> list[Path]:
+    """Copy recrl, without its dependencies.
+
+    Args:
+        parent: an empty folder that exists.
+
+    Returns:
+        The folders to put on a path, each inside a parent of its own: the package's, and its metadata's, by
+        which entry points and the version are found.
+    """
+    package = parent / "package" / DISTRIBUTION
+    package.mkdir(parents=True)
+    for path in _own_files():
+        shutil.copy(path, package)
+    for name in FOLDERS:
+        shutil.copytree(folder_of(name), package / name, ignore=shutil.ignore_patterns("__pycache__"))
+    distribution = importlib.metadata.distribution(DISTRIBUTION)
+    metadata = parent / "metadata" / f"{DISTRIBUTION}-{distribution.version}.dist-info"
+    metadata.mkdir(parents=True)
+    for name in METADATA:
+        text = distribution.read_text(name)
+        if text is not None:
+            (metadata / name.replace("PKG-INFO", "METADATA")).write_text(text)
+    return [package, metadata]
+
+
+def _own_files() -> list[Path]:
+    """Files of the package itself, beside the five folders."""
+    spec = importlib.util.find_spec(DISTRIBUTION)
+    assert spec is not None and spec.submodule_search_locations
+    return sorted(
+        path for path in Path(next(iter(spec.submodule_search_locations))).iterdir() if path.is_file()
+    )
+
+
+def folder_of(name: str) -> Path:
+    """Where one of recrl's packages is."""
+    spec = importlib.util.find_spec(f"{DISTRIBUTION}.{name}")
+    assert spec is not None and spec.submodule_search_locations
+    return Path(next(iter(spec.submodule_search_locations)))

@@ -1,0 +1,234 @@
+"""What a person writes in a grid file, as pydantic models; what it means is in ``grid``.
+
+Symbols: ``train_limits`` is d_t, ``deploy_limits`` is d_d, T ``rollout_steps``. Limits are undiscounted costs
+per episode.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, model_validator
+
+from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.untrusted import PlainText, ShortText
+from recrl.orchestrator.validation import shown
+
+MAX_SEEDS = 10_000
+MAX_STEPS = 10**12
+
+
+def _not_a_truth_value(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError(f"must be a number, got {shown(value)}")
+    return value
+
+
+def _read_limits(value: Any) -> tuple[float, ...]:
+    """One number for every cost, or a list with one number a cost."""
+    values = value if isinstance(value, list) else [value]
+    if not values:
+        raise ValueError("must be a number or a list of numbers, got []")
+    for limit in values:
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
+            raise ValueError(f"must be numbers of at least 0 (cost per episode), got {shown(limit)}")
+    return tuple(float(limit) for limit in values)
+
+
+def _read_train_limits(value: Any) -> tuple[float, ...]:
+    """As ``_read_limits``; ``auto`` is infinite: the teacher measures its start."""
+    if isinstance(value, str):
+        if value != "auto":
+            raise ValueError(f"must be 'auto', a number or a list of numbers, got {shown(value)}")
+        return (math.inf,)
+    return _read_limits(value)
+
+
+def _read_deploy_limits(value: Any) -> tuple[float, ...]:
+    limits = _read_limits(value)
+    if not all(math.isfinite(limit) for limit in limits):
+        raise ValueError("must be finite, got infinity")
+    return limits
+
+
+def _read_seeds(value: Any) -> tuple[int, ...]:
+    """``5`` is 0, 1, 2, 3, 4; a list is itself."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        if not 1 <= value <= MAX_SEEDS:
+            raise ValueError(f"must be a number of seeds from 1 to {MAX_SEEDS}, or a list, got {value}")
+        return tuple(range(value))
+    if not isinstance(value, list) or not 1 <= len(value) <= MAX_SEEDS:
+        raise ValueError(f"must be a number of seeds or a list of seeds, got {shown(value)}")
+    for index, seed in enumerate(value):
+        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise ValueError(f"must be whole numbers from 0 to 2^63 - 1, got {shown(seed)}")
+        if seed in value[:index]:
+            raise ValueError(f"must differ, got {seed} twice")
+    return tuple(value)
+
+
+def _read_custom(value: Any) -> dict[str, float]:
+    """Amounts by the names that a cluster's nodes were given; Ray's own names have settings of their own."""
+    if not isinstance(value, dict):
+        raise ValueError(f"must be a mapping of names to amounts, got {shown(value)}")
+    for name, amount in value.items():
+        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.:-]{0,63}", name):
+            raise ValueError(f"must have names of letters, digits and _ . : - only, got {shown(name)}")
+        if name.lower() in ("cpu", "gpu", "memory", "object_store_memory"):
+            raise ValueError(f"must not name {name}; see cpus_per_trial and gpus_per_trial")
+        if isinstance(amount, bool) or not isinstance(amount, int | float) or not 0.0 < amount <= 1e6:
+            raise ValueError(f"must be amounts above 0 and at most 1e6, got {shown(amount)} of {name}")
+    return {name: float(amount) for name, amount in value.items()}
+
+
+def _listed(value: Any) -> Any:
+    return value if isinstance(value, list) else [value]
+
+
+def _read_name(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", value):
+        raise ValueError(
+            f"must be a name for a folder: letters, digits and . _ - only, at most 64, got {shown(value)}"
+        )
+    return value
+
+
+SweepName = Annotated[str, PlainValidator(_read_name)]
+Whole = Annotated[int, BeforeValidator(_not_a_truth_value)]
+Number = Annotated[float, BeforeValidator(_not_a_truth_value), Field(allow_inf_nan=False)]
+TrainLimits = Annotated[tuple[float, ...], PlainValidator(_read_train_limits)]
+DeployLimits = Annotated[tuple[float, ...], PlainValidator(_read_deploy_limits)]
+Seeds = Annotated[tuple[int, ...], PlainValidator(_read_seeds)]
+CustomResources = Annotated[dict[str, float], PlainValidator(_read_custom)]
+
+
+class _Written(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Entry(_Written):
+    """A student or a method: its name, or a mapping."""
+
+    name: ShortText = Field(description="Registry name, entry point or package.module:attribute.")
+    label: PlainText = Field(
+        default="", max_length=60, description="What tables and figures call it; the name by default."
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="Its settings, checked by its own config class."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"name": value}
+        if not isinstance(value, dict):
+            raise ValueError(f"must be a name or a mapping with a name, got {shown(value)}")
+        return value
+
+
+class Limits(_Written):
+    """The limits of a task's costs: one number for every cost, or a list with one number a cost."""
+
+    train_limits: TrainLimits | None = Field(
+        default=None, description="d_t; 'auto', the default, lets the teacher measure its start."
+    )
+    deploy_limits: DeployLimits | None = Field(default=None, description="d_d.")
+
+
+class TaskEntry(Entry, Limits):
+    """A task, and its limits where they are not the grid's."""
+
+
+class Run(_Written):
+    """How long and how wide every trial runs."""
+
+    total_steps: Whole = Field(
+        ge=1, le=MAX_STEPS, description="Environment steps of both phases, over all environments."
+    )
+    deploy_fraction: Number = Field(
+        default=0.05, ge=0.0, le=0.9, description="Share of the steps in deployment (paper, section 5: 5%)."
+    )
+    num_envs: Whole = Field(
+        default=64,
+        ge=1,
+        le=4096,
+        description="Environments stepped together; many, so that an update sees many episodes (ours).",
+    )
+    rollout_steps: Whole | None = Field(
+        default=None,
+        ge=1,
+        le=10_000_000,
+        description="T, steps of each environment between two policy updates; by default 64, or the task's "
+        "horizon where that is shorter. Episodes go on from one update to the next (ours).",
+    )
+    evaluation_episodes: Whole = Field(
+        default=100, ge=0, le=1_000_000, description="Episodes of each frozen-policy evaluation (ours)."
+    )
+    videos: Literal["none", "first-seed", "all"] = Field(
+        default="none",
+        description="Which complete trials a launch films, an episode each; no result depends on it.",
+    )
+
+
+class Resources(_Written):
+    """What a trial occupies; no result depends on it."""
+
+    cpus_per_trial: Number = Field(default=1.0, gt=0.0, le=1024.0, description="Cores a running trial holds.")
+    gpus_per_trial: Number = Field(default=0.0, ge=0.0, le=64.0, description="GPUs a running trial holds.")
+    custom_per_trial: CustomResources = Field(
+        default_factory=dict,
+        description="What else a running trial holds, by the names that a cluster's nodes were started with "
+        "(ray start --resources); a launch on one machine has none.",
+    )
+    max_concurrent: Whole | None = Field(
+        default=None, ge=1, le=10_000, description="Trials at once, at most; by default as many as fit."
+    )
+    teacher: Literal["service", "inline"] = Field(
+        default="service",
+        description="Where teachers think: in one service for the sweep, or in each trial's own process "
+        "(for hundreds of trials at once whose updates take less than a second).",
+    )
+    silence_seconds: Number = Field(
+        default=300.0,
+        ge=5.0,
+        le=1e7,
+        description="A trial that uses no processor for so long hangs (five times so long before its process "
+        "first speaks of it): it is started again from its last checkpoint. Wall seconds (ours).",
+    )
+
+
+class Exclusion(_Written):
+    """Trials to leave out: those that match everything given here; labels, and seeds."""
+
+    task: Annotated[list[str], BeforeValidator(_listed)] | None = None
+    agent: Annotated[list[str], BeforeValidator(_listed)] | None = None
+    method: Annotated[list[str], BeforeValidator(_listed)] | None = None
+    seed: Annotated[list[Whole], BeforeValidator(_listed)] | None = None
+
+    def matches(self, spec: TrialSpec) -> bool:
+        """Whether the trial is to be left out."""
+        return all(
+            wanted is None or value in wanted
+            for wanted, value in (
+                (self.task, spec.task.label),
+                (self.agent, spec.agent.label),
+                (self.method, spec.method.label),
+                (self.seed, spec.seed),
+            )
+        )
+
+
+class GridFile(Limits):
+    """A grid file's content; its limits are those of tasks that give none."""
+
+    name: SweepName = Field(description="The sweep's name, and that of its folder.")
+    tasks: list[TaskEntry] = Field(min_length=1)
+    agents: list[Entry] = Field(min_length=1)
+    methods: list[Entry] = Field(min_length=1)
+    seeds: Seeds = Field(description="A number of seeds, 5 for 0 to 4, or a list of seeds.")
+    run: Run
+    resources: Resources = Resources()
+    exclude: list[Exclusion] = []

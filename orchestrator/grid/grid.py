@@ -1,0 +1,420 @@
+"""The grid file: which trials a sweep is made of, checked whole before anything starts.
+
+    name: rivergrid
+    tasks:
+      - {name: rivergrid-1a, deploy_limits: 5}
+      - {name: rivergrid-1b, deploy_limits: 1}
+    agents: [ppo-lag, cpo]
+    methods: [none, linear, {name: dynamic, options: {window: 5}}]
+    seeds: 5
+    run: {total_steps: 960000}
+
+A grid is a product: every task x student x method x seed, less what ``exclude`` names. ``read_grid`` reports
+every mistake at once, each with its line; ``GridSpec.trials`` is pure, ordered and free of duplicates. Seeds
+are the outermost loop, so that every method gets its first seed before any gets its second.
+
+Symbols: ``train_limits`` is d_t, ``deploy_limits`` is d_d, k the number of a task's costs, B the training
+budget, T ``rollout_steps``. Limits are undiscounted costs per episode.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from recrl.agents.registry import agent_config
+from recrl.environments.cmdp import CMDPSpec, CostLimits
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
+from recrl.environments.registry import make_vector, task_options
+from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
+from recrl.orchestrator.grid.file_models import (
+    Entry,
+    Exclusion,
+    GridFile,
+    Limits,
+    Resources,
+    Run,
+    SweepName,
+    TaskEntry,
+)
+from recrl.orchestrator.located_yaml import Place, Problem, parse
+from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.validation import nearest, sentences, shown
+from recrl.teachers.registry import teacher_config
+
+MAX_TRIALS = 100_000
+ROLLOUT_STEPS = 64  # by default: short rollouts of many environments make many updates
+# d_t: infinite, so that the teacher measures its start. Nobody but the user can say d_d.
+DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
+
+Model = TypeVar("Model", bound=BaseModel)
+# How a registry validates the options of something it knows by name, defaults filled in.
+OptionsOf = Callable[[str, Mapping[str, Any]], BaseModel]
+
+
+@dataclass(frozen=True)
+class TaskCell:
+    """A task with everything about it resolved.
+
+    Attributes:
+        task: the CMDP.
+        train_limits: d_t, [k].
+        deploy_limits: d_d, [k].
+        rollout_steps: T.
+    """
+
+    task: Choice
+    train_limits: CostLimits
+    deploy_limits: CostLimits
+    rollout_steps: int
+
+
+@dataclass(frozen=True)
+class GridSpec:
+    """A checked grid, every default filled in.
+
+    Attributes:
+        name: the sweep's name.
+        tasks: the CMDPs with their limits.
+        agents: the students.
+        methods: the teachers.
+        seeds: at least one, all different.
+        run: how long and how wide every trial runs.
+        resources: what a trial occupies.
+        exclude: what to leave out of the product.
+        text: the file as it was given.
+    """
+
+    name: str
+    tasks: tuple[TaskCell, ...]
+    agents: tuple[Choice, ...]
+    methods: tuple[Choice, ...]
+    seeds: tuple[int, ...]
+    run: Run
+    resources: Resources
+    exclude: tuple[Exclusion, ...]
+    text: bytes
+
+    def trials(self) -> tuple[TrialSpec, ...]:
+        """The trials, in the order in which they are to start."""
+        cells = product(self.seeds, self.tasks, self.agents, self.methods)
+        specs = (self._trial(*cell) for cell in cells)
+        return tuple(spec for spec in specs if not any(rule.matches(spec) for rule in self.exclude))
+
+    def _trial(self, seed: int, cell: TaskCell, agent: Choice, method: Choice) -> TrialSpec:
+        deploy_steps = round(self.run.total_steps * self.run.deploy_fraction)
+        return TrialSpec(
+            task=cell.task,
+            agent=agent,
+            method=method,
+            train_limits=cell.train_limits,
+            deploy_limits=cell.deploy_limits,
+            train_steps=self.run.total_steps - deploy_steps,
+            deploy_steps=deploy_steps,
+            num_envs=self.run.num_envs,
+            rollout_steps=cell.rollout_steps,
+            evaluation_episodes=self.run.evaluation_episodes,
+            seed=seed,
+        )
+
+
+def read_grid(path: Path) -> GridSpec:
+    """The grid in a file, checked whole.
+
+    Raises:
+        GridError: the file is missing or wrong; one located sentence for every mistake in it.
+        UncalledError: no mistake was found, but something was not checked, as this process follows no
+            import paths.
+    """
+    return parse_grid(_read(path), source=str(path))
+
+
+def parse_grid(data: bytes, *, source: str) -> GridSpec:
+    """The grid in ``data``.
+
+    Args:
+        data: a YAML document.
+        source: the file's name, for the sentences.
+
+    Raises:
+        GridError: one located sentence for every mistake.
+        UncalledError: see ``read_grid``.
+    """
+    check = _Check(data)
+    grid = check.grid()
+    if check.problems:
+        ordered = sorted(set(check.problems), key=lambda problem: (problem.line, str(problem.place)))
+        raise GridError([f"{source}:{problem}" for problem in ordered])
+    if grid is None:
+        raise UncalledError(source, check.uncalled)
+    return grid
+
+
+def read_name(path: Path) -> str:
+    """The name of the sweep that a grid file describes; nothing else of the file is checked, nothing called.
+
+    Raises:
+        GridError: the file is missing, no mapping, or its name is wrong.
+    """
+    document = parse(_read(path))
+    value = document.value
+    if not isinstance(value, dict):
+        problems = document.problems or (Problem(1, (), "a grid must be a mapping of settings"),)
+        raise GridError([f"{path}:{problem}" for problem in problems])
+    try:
+        return TypeAdapter(SweepName).validate_python(value.get("name"))
+    except ValidationError as error:
+        problem = Problem(document.line(("name",)), ("name",), next(sentences(error, None))[1])
+        raise GridError([f"{path}:{problem}"]) from error
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise GridError([f"{path}: {missing(path)}"]) from error
+    except (OSError, ValueError) as error:
+        raise GridError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from error
+
+
+class NotJsonError(Exception):
+    """Options that JSON has no words for."""
+
+
+class _Check:
+    """One pass over a grid file that goes on after a mistake, as far as what follows still makes sense.
+
+    The whole file is held against its schema; then each entry that has the right form is held against the
+    registries and the other entries, whatever is wrong elsewhere.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._document = parse(data)
+        self.problems = list(self._document.problems)
+        self.uncalled: list[str] = []
+        raw = self._document.value
+        self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
+
+    def grid(self) -> GridSpec | None:
+        """The grid, or None where there are problems."""
+        if not isinstance(self._document.value, dict):
+            if not self.problems:
+                self._add((), f"a grid must be a mapping of settings, got {shown(self._document.value)}")
+            return None
+        file = self._validated(GridFile, self._raw)
+        tasks = self._tasks()
+        agents = self._choices("agents", Entry, agent_config)
+        methods = self._choices("methods", Entry, teacher_config)
+        if file is None or self.problems or self.uncalled:
+            return None
+        grid = GridSpec(
+            name=file.name,
+            tasks=tuple(tasks),
+            agents=tuple(agents.values()),
+            methods=tuple(methods.values()),
+            seeds=file.seeds,
+            run=file.run,
+            resources=file.resources,
+            exclude=tuple(file.exclude),
+            text=self._data,
+        )
+        self._check_whole(grid)
+        return None if self.problems else grid
+
+    def _check_whole(self, grid: GridSpec) -> None:
+        """Check what concerns the product of all parts."""
+        size = len(grid.tasks) * len(grid.agents) * len(grid.methods) * len(grid.seeds)
+        if size > MAX_TRIALS:
+            self._add((), f"a grid must have at most {MAX_TRIALS} trials, got {size}")
+            return
+        known: dict[str, list[Any]] = {
+            "task": [cell.task.label for cell in grid.tasks],
+            "agent": [agent.label for agent in grid.agents],
+            "method": [method.label for method in grid.methods],
+            "seed": list(grid.seeds),
+        }
+        for index, rule in enumerate(grid.exclude):
+            wanted = rule.model_dump(exclude_none=True)
+            if not wanted:
+                self._add(("exclude", index), f"must name at least one of {', '.join(known)}")
+            for key, values in wanted.items():
+                for value in (value for value in values if value not in known[key]):
+                    hint = nearest(str(value), [str(name) for name in known[key]])
+                    self._add(("exclude", index, key), f"this grid has no {key} {shown(value)}{hint}")
+        if not self.problems and not grid.trials():
+            self._add(("exclude",), "leaves no trial at all")
+
+    def _tasks(self) -> list[TaskCell]:
+        """The tasks whose limits and rollouts are right."""
+        run = _valid(Run, self._raw.get("run"))
+        cells = []
+        for index, task in self._choices("tasks", TaskEntry, task_options).items():
+            cmdp = self._cmdp(index, task)
+            if cmdp is None:
+                continue
+            limits = self._both_limits(index, task.label, cmdp)
+            rollout_steps = self._rollout_steps(run, task.label, cmdp)
+            if limits is not None and rollout_steps is not None:
+                cells.append(TaskCell(task, *limits, rollout_steps))
+        return cells
+
+    def _choices(self, section: str, model: type[Entry], options_of: OptionsOf) -> dict[int, Choice]:
+        """The entries of a section that name something known and set it right, by their index."""
+        choices: dict[int, Choice] = {}
+        for index, value in enumerate(_items(self._raw.get(section))):
+            entry = _valid(model, value)
+            if entry is None:
+                continue
+            options = self._options((section, index), entry, options_of)
+            if options is None:
+                continue
+            choice = Choice(entry.name, options, entry.label)
+            self._check_differs((section, index), choice, choices)
+            choices[index] = choice
+        return choices
+
+    def _options(self, place: Place, entry: Entry, options_of: OptionsOf) -> dict[str, Any] | None:
+        """The entry's options with defaults filled in, as JSON values."""
+        name_place = (*place, "name") if (*place, "name") in self._document.lines else place
+        try:
+            options = options_of(entry.name, entry.options).model_dump(mode="json")
+            _require_json(options)
+        except ValidationError as error:
+            for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
+                self._add((*place, "options", *inner), sentence)
+        except UnknownNameError as error:
+            self._add(name_place, str(error))
+        except UntrustedNameError as error:
+            self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
+        except NotJsonError as error:
+            self._add((*place, "options"), f"must be finite JSON values ({error})")
+        except USERS_ERRORS as error:
+            self._add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
+        else:
+            return options
+        return None
+
+    def _check_differs(self, place: Place, choice: Choice, earlier: Mapping[int, Choice]) -> None:
+        """Check that no earlier entry has the same label, or is the same under another label."""
+        for index, other in earlier.items():
+            if other.label == choice.label:
+                self._add(
+                    place, f"is called {choice.label!r}, as is {place[0]}.{index}; give it another label"
+                )
+                return
+            if (other.name, other.options) == (choice.name, choice.options) and place[0] != "tasks":
+                self._add(place, f"is the same as {place[0]}.{index}, under another label")
+                return
+
+    def _cmdp(self, index: int, task: Choice) -> CMDPSpec | None:
+        """What the task fixes, found by building one environment of it."""
+        try:
+            envs = make_vector(task.name, 1, options=task.options)
+        except USERS_ERRORS as error:
+            self._add(("tasks", index), f"{task.name} cannot be built: {described(error)}")
+            return None
+        cmdp = envs.cmdp
+        envs.close()
+        return cmdp
+
+    def _both_limits(self, index: int, label: str, cmdp: CMDPSpec) -> tuple[CostLimits, CostLimits] | None:
+        """The task's d_t and d_d."""
+        train_limits, place = self._limits(index, "train_limits", label, cmdp)
+        deploy_limits, _ = self._limits(index, "deploy_limits", label, cmdp)
+        if train_limits is None or deploy_limits is None:
+            return None
+        if any(train < deploy for train, deploy in zip(train_limits, deploy_limits, strict=True)):
+            self._add(
+                place,
+                f"must be at least the deploy_limits of {label} (d_t >= d_d), "
+                f"got {_numbers(train_limits)} under {_numbers(deploy_limits)}",
+            )
+            return None
+        return train_limits, deploy_limits
+
+    def _limits(self, index: int, key: str, label: str, cmdp: CMDPSpec) -> tuple[CostLimits | None, Place]:
+        """One kind of a task's limits, its own or the grid's, and where they are written."""
+        place: Place = ("tasks", index, key)
+        entry = _valid(TaskEntry, self._raw["tasks"][index])
+        values = getattr(entry, key)
+        if values is None:
+            place = (key,)
+            shared = _valid(Limits, {key: self._raw.get(key)})
+            if shared is None:  # the schema has reported it
+                return None, place
+            values = getattr(shared, key) or DEFAULT_LIMITS[key]
+        if values is None:
+            self._add(("tasks", index), f"{key} is required, here or for all tasks")
+            return None, place
+        if len(values) not in (1, cmdp.num_costs):
+            costs = f"{cmdp.num_costs} cost{'s' * (cmdp.num_costs > 1)} ({', '.join(cmdp.cost_names)})"
+            self._add(place, f"{label} has {costs}, got {len(values)} limits")
+            return None, place
+        return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
+
+    def _rollout_steps(self, run: Run | None, label: str, cmdp: CMDPSpec) -> int | None:
+        """T: as given, or its default."""
+        if run is None:
+            return None
+        default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
+        steps, num_envs = run.rollout_steps or default, run.num_envs
+        if run.total_steps < num_envs * steps:
+            self._add(
+                ("run", "total_steps"),
+                f"must be at least one update of {label}, "
+                f"{num_envs} environments x {steps} steps = {num_envs * steps}, got {run.total_steps}",
+            )
+        else:
+            return steps
+        return None
+
+    def _validated(self, model: type[Model], value: Any) -> Model | None:
+        """The value as ``model``; every mistake is added."""
+        try:
+            return model.model_validate(value)
+        except ValidationError as error:
+            for place, sentence in sentences(error, model):
+                self._add(place, sentence)
+        return None
+
+    def _add(self, place: Place, sentence: str) -> None:
+        self.problems.append(Problem(self._document.line(place), place, sentence))
+
+
+def _valid(model: type[Model], value: Any) -> Model | None:
+    """The value as ``model``, or None where it is wrong: that has been reported elsewhere."""
+    try:
+        return model.model_validate(value)
+    except ValidationError:
+        return None
+
+
+def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:
+    """The class of the options of ``name``, where it can be built without any."""
+    try:
+        return type(options_of(name, {}))
+    except (ValidationError, *USERS_ERRORS):
+        return None
+
+
+def _require_json(options: Mapping[str, Any]) -> None:
+    try:
+        json.dumps(options, allow_nan=False)
+    except ValueError as error:
+        raise NotJsonError(str(error)) from error
+
+
+def _items(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _numbers(limits: CostLimits) -> str:
+    return ", ".join(f"{limit:g}" for limit in limits)

@@ -1,0 +1,244 @@
+"""A grid held against what is on disk: what a launch would do, and about what it would take.
+
+The plan is all that decides which trials run: a launch carries it out, ``recrl-sweep plan`` prints it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.files.code_changes import has_other_code
+from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.validation import nearest
+
+# Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the mirror;
+# rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers come on top.
+GIGABYTES_PER_TRIAL = 0.35
+GIGABYTES_AROUND = 1.2
+
+SELECTABLE = ("task", "agent", "method", "seed")
+
+
+class Work(StrEnum):
+    """What a launch would do with a trial."""
+
+    NEW = "new"
+    RESUME = "resume"
+    RETRY = "retry"
+    REPAIR = "repair"  # damaged; goes on from what is whole
+    RERUN = "rerun"  # from the beginning, because its code has changed
+    COMPLETE = "complete"
+    FAILED = "failed"
+    DAMAGED = "damaged"
+
+    @property
+    def is_to_do(self) -> bool:
+        """Whether a launch would work on the trial."""
+        return self in (Work.NEW, Work.RESUME, Work.RETRY, Work.REPAIR, Work.RERUN)
+
+
+@dataclass(frozen=True)
+class PlannedTrial:
+    """One trial of the grid and what is on disk of it.
+
+    Attributes:
+        spec: the trial.
+        work: what a launch would do with it.
+        record: what its files say.
+        has_other_code: whether an attempt at it ran other code than is installed now.
+    """
+
+    spec: TrialSpec
+    work: Work
+    record: TrialRecord
+    has_other_code: bool = False
+
+    @property
+    def steps_left(self) -> int:
+        """Environment steps that a launch would still take, at most."""
+        done = self.record.env_steps if self.work in (Work.RESUME, Work.RETRY) else 0
+        return max(0, self.spec.total_steps - done) if self.work.is_to_do else 0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a launch would do.
+
+    Attributes:
+        trials: the chosen trials of the grid, in their order.
+        orphans: trials on disk that the grid does not contain any more; nobody touches them.
+    """
+
+    trials: tuple[PlannedTrial, ...]
+    orphans: tuple[TrialStore, ...]
+
+    @property
+    def to_do(self) -> tuple[TrialSpec, ...]:
+        """The trials to run, in their order."""
+        return tuple(trial.spec for trial in self.trials if trial.work.is_to_do)
+
+    def doing(self, work: Work) -> tuple[PlannedTrial, ...]:
+        """The trials with this kind of work."""
+        return tuple(trial for trial in self.trials if trial.work is work)
+
+    @property
+    def other_code(self) -> tuple[PlannedTrial, ...]:
+        """The trials that ran other code than is installed now, and are not run again from the beginning."""
+        return tuple(it for it in self.trials if it.has_other_code and it.work is not Work.RERUN)
+
+    @property
+    def counts(self) -> Mapping[Work, int]:
+        """How many trials there are of each kind of work."""
+        found = Counter(trial.work for trial in self.trials)
+        return {work: found[work] for work in Work}
+
+    @property
+    def steps_left(self) -> int:
+        """Environment steps to take, over all trials."""
+        return sum(trial.steps_left for trial in self.trials)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """About what a plan takes.
+
+    Attributes:
+        cpu_seconds: CPU time of the trials, or None where no trial of some task and student has run yet.
+        wall_seconds: with ``concurrent`` trials at once, or None.
+        concurrent: trials at once.
+        gigabytes: main memory while they run.
+        unknown: the tasks and students without a measured speed, as ``task agent``.
+    """
+
+    cpu_seconds: float | None
+    wall_seconds: float | None
+    concurrent: int
+    gigabytes: float
+    unknown: tuple[str, ...]
+
+
+def make_plan(
+    specs: Sequence[TrialSpec],
+    store: SweepStore,
+    *,
+    only: Mapping[str, Sequence[str]] | None = None,
+    retry_failed: bool = False,
+    rerun_damaged: bool = False,
+    rerun_changed: bool = False,
+) -> Plan:
+    """Hold the grid's trials against the files.
+
+    Args:
+        specs: the trials of the grid, all of them.
+        store: where the sweep is, or will be.
+        only: the trials to plan for, as ``select`` reads it; all by default.
+        retry_failed: whether failed trials are to be tried again.
+        rerun_damaged: whether damaged trials that were complete or failed are to be run again; others are.
+            Then every file is read and held against its digest.
+        rerun_changed: whether trials that ran other code than is installed now are to be run again.
+
+    Raises:
+        RecrlError: ``only`` names what no trial of the grid has.
+    """
+    wanted = {spec.folder_name for spec in specs}
+    trials = []
+    for spec in select(specs, only or {}):
+        trial = store.trial(spec)
+        record = trial.verified_record() if rerun_damaged else trial.record()
+        work = _work(record, retry_failed=retry_failed, rerun_damaged=rerun_damaged)
+        changed = has_other_code(trial, spec)
+        if changed and rerun_changed and (work.is_to_do or work is Work.COMPLETE):
+            work = Work.RERUN
+        trials.append(PlannedTrial(spec, work, record, changed))
+    orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)
+    return Plan(tuple(trials), orphans)
+
+
+def estimate(plan: Plan, *, concurrent: int) -> Estimate:
+    """Time from the speed of the trials that have run so far, memory from what a trial's process takes.
+
+    A speed is measured in environment steps per CPU second, for each task and student with their options.
+
+    Args:
+        plan: what is to do.
+        concurrent: trials at once, at least 1.
+    """
+    steps: defaultdict[str, int] = defaultdict(int)
+    seconds: defaultdict[str, float] = defaultdict(float)
+    for trial in plan.trials:
+        if trial.record.cpu_seconds > 0.0:
+            steps[_kind(trial.spec)] += trial.record.env_steps
+            seconds[_kind(trial.spec)] += trial.record.cpu_seconds
+    cpu_seconds, unknown = 0.0, {}
+    for trial in plan.trials:
+        if not trial.steps_left:
+            continue
+        kind = _kind(trial.spec)
+        if steps[kind] > 0:
+            cpu_seconds += trial.steps_left * seconds[kind] / steps[kind]
+        else:
+            unknown[kind] = f"{trial.spec.task.label} {trial.spec.agent.label}"
+    running = min(concurrent, len(plan.to_do))
+    return Estimate(
+        cpu_seconds=None if unknown else cpu_seconds,
+        wall_seconds=None if unknown else cpu_seconds / max(1, running),
+        concurrent=running,
+        gigabytes=GIGABYTES_AROUND + running * GIGABYTES_PER_TRIAL if running else 0.0,
+        unknown=tuple(unknown.values()),
+    )
+
+
+def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: int | None = None) -> int:
+    """How many trials fit on so many cores, by default this machine's; at least 1."""
+    fitting = max(1, int((cores or os.cpu_count() or 1) / cpus_per_trial))
+    return min(fitting, max_concurrent or fitting)
+
+
+def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> tuple[TrialSpec, ...]:
+    """The trials that match everything wanted.
+
+    Args:
+        specs: the trials of the grid.
+        wanted: acceptable labels (or seeds, as text) for some of ``SELECTABLE``.
+
+    Raises:
+        RecrlError: a key or a value that no trial of the grid has.
+    """
+    for key, values in wanted.items():
+        if key not in SELECTABLE:
+            raise RecrlError(f"--only: trials are chosen by {', '.join(SELECTABLE)}, got {key!r}")
+        known = list(dict.fromkeys(_label(spec, key) for spec in specs))
+        for value in values:
+            if value not in known:
+                hint = nearest(value, known)
+                raise RecrlError(f"--only: no trial has {key} {value!r}{hint} (known: {', '.join(known)})")
+    return tuple(spec for spec in specs if all(_label(spec, key) in values for key, values in wanted.items()))
+
+
+def _work(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> Work:
+    match record.status:
+        case TrialState.COMPLETE:
+            return Work.COMPLETE
+        case TrialState.FAILED:
+            return Work.RETRY if retry_failed else Work.FAILED
+        case TrialState.DAMAGED:
+            left_alone = record.claims in (TrialState.COMPLETE, TrialState.FAILED)
+            return Work.DAMAGED if left_alone and not rerun_damaged else Work.REPAIR
+        case TrialState.WAITING | TrialState.RUNNING:
+            return Work.RESUME if record.attempt else Work.NEW
+
+
+def _kind(spec: TrialSpec) -> str:
+    """What trials of about equal speed share: the task and the student, options and width included."""
+    kind: tuple[Choice | int, ...] = (spec.task, spec.agent, spec.num_envs, spec.rollout_steps)
+    return repr(kind)
+
+
+def _label(spec: TrialSpec, key: str) -> str:
+    return str(spec.seed) if key == "seed" else str(getattr(spec, key).label)

@@ -1,0 +1,1 @@
+"""Trials on Ray: the executor, the cluster's nodes and services, and the teacher actor."""

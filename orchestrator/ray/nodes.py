@@ -1,0 +1,142 @@
+"""The nodes of a Ray cluster: how many trials they hold, and whether those of somebody else's can stand in.
+
+A trial's result is the same on every machine only if its code is, and it can be kept only where the results
+folder, or the object store in its place, is seen. Ray itself refuses nodes with another Python or Ray than
+its head's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from recrl.orchestrator.errors import ClusterError
+
+DISTRIBUTIONS = ("recrl", "ray", "torch", "numpy")
+ANSWER_SECONDS = 180.0  # a node may have to start its first process
+SIGHT = "what keeps it from the results"
+
+
+def trials_that_fit(wanted: Mapping[str, float]) -> int:
+    """How many trials the nodes that are there hold at once.
+
+    Args:
+        wanted: what one trial takes, by Ray's names of resources; at least 0 each.
+    """
+    asked = {name: amount for name, amount in wanted.items() if amount > 0.0}
+    return sum(
+        int(min(node["Resources"].get(name, 0.0) / asked[name] for name in asked) + 1e-9) for node in _nodes()
+    )
+
+
+def check_nodes(probe: str, uri: str = "") -> None:
+    """Hold every node that has cores against this machine, before any trial.
+
+    Args:
+        probe: a file that is there, in the sweep's folder; or the key of an object.
+        uri: of the object store that the sweep is kept in, if it is.
+
+    Raises:
+        ClusterError: one sentence that names every node that differs, and in what.
+    """
+    look = _look()
+    task = ray.remote(look)
+    asked = {}
+    for node in _nodes():
+        if node["Resources"].get("CPU", 0.0) > 0.0:
+            only = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            answer = task.options(num_cpus=0, scheduling_strategy=only).remote(DISTRIBUTIONS, probe, uri)
+            asked[answer] = node["NodeManagerAddress"]
+    if not asked:
+        return
+    ready, _ = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_SECONDS)
+    here = look(DISTRIBUTIONS, probe, uri)
+    place = uri or str(Path(probe).parent)
+    problems = []
+    for answer, address in asked.items():
+        if answer not in ready:
+            problems.append(f"{address} has not answered for {ANSWER_SECONDS:g} seconds")
+            continue
+        try:
+            there = ray.get(answer)
+            problems += differences(address, here, there, place)
+        except RayError as error:
+            cause = error.cause if isinstance(error, RayTaskError) else error
+            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {_first_line(cause)}")
+    if problems:
+        raise ClusterError(
+            f"not every node of the cluster can run these trials: {'; '.join(sorted(problems))}; "
+            "give all of them the same environment or image (docker/README.md), or leave them out"
+        )
+
+
+def differences(address: str, here: Mapping[str, str], there: Mapping[str, str], place: str) -> list[str]:
+    """What a node lacks or has otherwise, a sentence each.
+
+    Args:
+        address: the node's.
+        here: what this machine has, by name.
+        there: what the node has; under SIGHT what is wrong if it does not see the place.
+        place: that it must see, a folder or the address of an object store.
+    """
+    others = [
+        f"{name} {there.get(name) or 'missing'} (here {value})"
+        for name, value in here.items()
+        if name != SIGHT and there.get(name) != value
+    ]
+    found = [f"{address} has {', '.join(others)}"] if others else []
+    if there.get(SIGHT):
+        found.append(f"{address} does not see {place}{there[SIGHT]}")
+    return found
+
+
+def _nodes() -> list[dict[str, Any]]:
+    """The nodes that are there, as Ray describes them."""
+    described: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
+    return [node for node in described if node["Alive"]]
+
+
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).splitlines()), "")
+
+
+def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
+    """What is run on the nodes. A closure is sent by value: they may have another recrl, or none."""
+
+    def look(distributions: tuple[str, ...], probe: str, uri: str) -> dict[str, str]:
+        import importlib  # noqa: PLC0415
+        import importlib.metadata  # noqa: PLC0415
+        import platform  # noqa: PLC0415
+
+        found = {"Python": platform.python_version()}
+        for name in distributions:
+            try:  # torch's CPU and CUDA builds of one version differ behind the plus
+                found[name] = (importlib.metadata.version(name) or "").partition("+")[0]
+            except importlib.metadata.PackageNotFoundError:
+                found[name] = ""
+        try:
+            package = importlib.import_module("recrl.orchestrator.files.own_package")
+            found["recrl's source"] = package.source_digest()
+        except ImportError:
+            found["recrl's source"] = ""
+        try:
+            if uri:
+                package = importlib.import_module("recrl.orchestrator.remote.object_store")
+                seen = package.ObjectStore(uri).read(probe) is not None
+                found["what keeps it from the results"] = "" if seen else ", but another in its place"
+            else:  # a network file system may remember that a file is absent; opening it asks the server
+                with open(probe):
+                    found["what keeps it from the results"] = ""
+        except OSError:
+            shared = ", which must be on a file system that all nodes share"
+            found["what keeps it from the results"] = shared
+        except Exception as error:  # of a class that may be missing here
+            found["what keeps it from the results"] = f" ({error})"
+        return found
+
+    return look

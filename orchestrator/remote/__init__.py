@@ -1,0 +1,1 @@
+"""Sweeps whose files are kept in an object store."""

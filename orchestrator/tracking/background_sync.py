@@ -1,0 +1,122 @@
+"""The process that keeps MLflow up to date while a sweep runs, so that nobody else waits for MLflow.
+
+It reads the sweep's files and nothing else. It ends when its standard input closes: because it was told to
+stop, or because its parent died. Either way it makes a last pass, so that what a killed launch leaves in
+MLflow is true as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.redaction import RedactedStream
+from recrl.orchestrator.status import Standing, standing_of
+from recrl.orchestrator.tracking.mlflow_sync import ENVIRONMENT, SyncReport, Tracker, mirror_folder
+
+POLITENESS = 10  # added to the process's nice value: about a tenth of a core that a trial also wants
+LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is away
+ORPHAN_SECONDS = 15.0  # trials outlive a killed launch by some seconds; the last pass waits for them
+
+
+@dataclass
+class Mirror:
+    """The process that keeps MLflow up to date during a launch; it ends when its parent does."""
+
+    process: subprocess.Popen[bytes]
+
+    def stop(self, timeout: float) -> bool:
+        """Ask for a last pass and wait for it; whatever it does not manage, the next ``sync`` does.
+
+        Args:
+            timeout: seconds, at least 0; then the process is killed.
+
+        Returns:
+            Whether MLflow is up to date.
+        """
+        if self.process.stdin:
+            self.process.stdin.close()
+        try:
+            return self.process.wait(timeout) == 0
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            return False
+
+
+def start_mirror(store: SweepStore, uri: str, *, interval_seconds: float) -> Mirror:
+    """Keep MLflow up to date from a process of its own, until ``Mirror.stop`` or until this process dies.
+
+    Args:
+        store: the sweep.
+        uri: of ``tracking_uri``.
+        interval_seconds: between two passes, above 0; longer while MLflow is away.
+    """
+    folder = mirror_folder(store, uri)
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "recrl.orchestrator.tracking.background_sync", str(store.folder)]
+    with open(os.open(folder / "log.txt", os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600), "ab") as log:
+        process = subprocess.Popen(
+            [*command, "--interval", str(interval_seconds), "--parent", str(os.getpid())],
+            # In the environment and not among the arguments, which other users can see.
+            env={**ENVIRONMENT, **os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C is for the launch, which then says when to stop
+        )
+    return Mirror(process)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Mirror a sweep until standard input closes; the process of ``start_mirror``."""
+    parser = argparse.ArgumentParser(
+        prog="python -m recrl.orchestrator.tracking.background_sync", description=main.__doc__
+    )
+    parser.add_argument("folder", type=Path, help="the sweep's folder")
+    parser.add_argument("--interval", type=float, required=True, help="seconds between two passes")
+    parser.add_argument("--parent", type=int, required=True, help="the process to end with")
+    arguments = parser.parse_args(argv)
+    sys.stdout, sys.stderr = RedactedStream(sys.stdout), RedactedStream(sys.stderr)
+    os.nice(POLITENESS)
+    store = SweepStore(arguments.folder.parent, arguments.folder.name)
+    tracker = Tracker(store, os.environ["MLFLOW_TRACKING_URI"])
+    wait = 0.0  # a launch that had nothing to do is over already: one pass is enough
+    while not _is_over(arguments.parent, wait):
+        report = _pass(tracker, live=True)
+        longer = min(2 * max(wait, arguments.interval), LONGEST_WAIT_SECONDS)
+        wait = longer if report.problem else arguments.interval
+    end = time.monotonic() + ORPHAN_SECONDS
+    while _any_runs(store) and time.monotonic() < end:
+        time.sleep(0.5)
+    return 0 if _pass(tracker, live=False).is_up_to_date else 1
+
+
+def _pass(tracker: Tracker, *, live: bool) -> SyncReport:
+    report = tracker.bring_up_to_date(live=live)
+    if report.problem:
+        print(f"{time.strftime('%F %T')} {report.problem}", flush=True)
+    return report
+
+
+def _any_runs(store: SweepStore) -> bool:
+    records = (trial.record() for trial in store.trials())
+    return any(standing_of(record, now=time.time()) is Standing.RUNNING for record in records)
+
+
+def _is_over(parent: int, seconds: float) -> bool:
+    """Wait; whether standard input was closed or the parent died meanwhile."""
+    readable, _, _ = select.select([sys.stdin], [], [], seconds)
+    return bool(readable) or os.getppid() != parent
+
+
+if __name__ == "__main__":
+    sys.exit(main())

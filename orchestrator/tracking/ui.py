@@ -1,0 +1,102 @@
+"""MLflow's own pages about a sweep, served to this machine only."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+
+from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.tracking.mlflow_sync import is_server, last_report, mirror_folder, sync
+from recrl.orchestrator.tracking.points import charts_page
+
+# Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.
+SETTINGS = ("DO_NOT_TRACK=true", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false")
+
+
+def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
+    """The command that shows the sweep in a browser, on this machine only.
+
+    A database gets a server of one process; a server has its own pages.
+    """
+    if is_server(uri):
+        return [sys.executable, "-m", "webbrowser", "-t", ui_url(store, uri)]
+    stores = ["--artifacts-destination", str(store.mlflow_artifacts)]
+    if "@" not in uri and "?" not in uri:  # else it goes in the environment, which other users cannot see
+        stores += ["--backend-store-uri", uri]
+    address = ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    return ["env", *SETTINGS, sys.executable, "-m", "mlflow", "server", *stores, *address]
+
+
+def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
+    """The page of the sweep's charts, grouped by task, student and method."""
+    address = uri.rstrip("/") if is_server(uri) else f"http://127.0.0.1:{port}"
+    report = last_report(store, uri)
+    if report is None or not report.experiment_id:
+        return address
+    return f"{address}/#{charts_page(report.experiment_id)}"
+
+
+@dataclass
+class UI:
+    """MLflow's UI.
+
+    Attributes:
+        url: the page to open.
+        process: the server, or None if it was there already.
+    """
+
+    url: str
+    process: subprocess.Popen[bytes] | None
+
+    def close(self) -> None:
+        """End the server that was started."""
+        if self.process:
+            self.process.terminate()
+            self.process.wait()
+
+
+def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 120.0) -> UI:
+    """Start MLflow's server on this machine's own address and wait until it answers.
+
+    Args:
+        store: the sweep.
+        uri: of ``tracking_uri``; for a server's address nothing is started.
+        port: of 127.0.0.1.
+        timeout: seconds until it must answer.
+
+    Raises:
+        TrackingError: the port is taken, or the server does not start.
+    """
+    if not is_server(uri) and _answers(port):
+        raise TrackingError(f"port {port} of 127.0.0.1 is taken by another program; choose another port")
+    if last_report(store, uri) is None:
+        sync(store, uri)
+    url = ui_url(store, uri, port=port)
+    if is_server(uri):
+        return UI(url, None)
+    command = ui_command(store, uri, port=port)
+    log_path = mirror_folder(store, uri) / "ui.txt"
+    with open(os.open(log_path, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o600), "wb") as log:
+        environment = {**os.environ, "MLFLOW_BACKEND_STORE_URI": uri}
+        server = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+    end = time.monotonic() + timeout
+    while time.monotonic() < end and server.poll() is None:
+        if _answers(port):
+            return UI(url, server)
+        time.sleep(0.2)
+    UI(url, server).close()
+    raise TrackingError(
+        f"MLflow's server did not start; its output is in {log_path}, the command was {shlex.join(command)}"
+    )
+
+
+def _answers(port: int) -> bool:
+    """Whether a program takes connections on a port of this machine's own address."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -1,0 +1,1 @@
+"""One trial: its specification, the training loop, saved policies and videos."""

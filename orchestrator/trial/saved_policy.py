@@ -1,0 +1,205 @@
+"""Trials looked at afterwards: the policy of a checkpoint, evaluated and filmed.
+
+Reads a trial's newest intact checkpoint, of a complete trial or of one that still runs, and changes nothing
+that the trial wrote; what is found goes into two folders of their own beside it:
+
+    evaluations/update-<update>__seed-<seed>.csv                a row an episode, as in evaluation.csv
+    videos/update-<update>__seed-<seed>__<policy>.gif           one episode
+
+``seed-own`` stands for the seed of the trial's own evaluation: with it and the trial's number of episodes, a
+complete trial's ``evaluation.csv`` comes out again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from recrl.agents.agent import Agent
+from recrl.agents.evaluation import FrozenPolicy, Shot, film
+from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.plugins import UntrustedNameError
+from recrl.environments.registry import NotDrawnError, make_drawn, make_vector
+from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.files.row_files import write_rows
+from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows
+from recrl.orchestrator.trial.videos import VideoFormat, captioned, stride, write_video
+
+DEFAULT_PICTURES_PER_SECOND = 10.0
+
+
+class NoCheckpointError(RecrlError):
+    """The trial has left no intact checkpoint yet."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenTrial:
+    """The policy of a trial's newest intact checkpoint.
+
+    Attributes:
+        store: the trial's folder.
+        spec: what the trial is.
+        agent: the student; nobody updates it.
+        cmdp: what its task fixes.
+        update: policy updates it has learnt for.
+        env_steps: environment steps it has learnt from.
+    """
+
+    store: TrialStore
+    spec: TrialSpec
+    agent: Agent
+    cmdp: CMDPSpec
+    update: int
+    env_steps: int
+
+    @classmethod
+    def thaw(cls, store: TrialStore) -> FrozenTrial:
+        """The trial as its files have it.
+
+        Raises:
+            NoCheckpointError: there is no intact checkpoint.
+            RecrlError: the task or the student cannot be built, or the checkpoint does not fit them.
+        """
+        spec = store.spec
+        checkpoint = store.latest_checkpoint()
+        if checkpoint is None:
+            raise NoCheckpointError(f"{spec.title}: has no intact checkpoint yet")
+        try:
+            tree = checkpoint["trial"]
+            cmdp = make_vector(spec.task.name, 1, options=spec.task.options).cmdp
+            seed = TrialSeeds.of(spec).agent
+            agent = make_agent(spec.agent.name, cmdp, spec.agent.options, seed)
+            agent.load_state_dict(tree["agent"])
+            return cls(store, spec, agent, cmdp, tree["update"], tree["env_steps"])
+        except UntrustedNameError as error:
+            raise RecrlError(f"{spec.title}: {error}; if you trust it, add --trust") from error
+        except USERS_ERRORS as error:
+            raise RecrlError(
+                f"{spec.title}: its checkpoint cannot be used with the task and the student as they are "
+                f"installed: {described(error)}"
+            ) from error
+
+    def evaluate(
+        self, policies: Sequence[FrozenPolicy], *, num_episodes: int, seed: int | None
+    ) -> tuple[pd.DataFrame, Path]:
+        """Run the policy for whole episodes; a row each, and the file that holds them.
+
+        Args:
+            policies: how it chooses; at least one.
+            num_episodes: of each, at least 1.
+            seed: of the environments and the policy, at least 0; None for the trial's own.
+        """
+        try:
+            rows = evaluation_rows(
+                self.agent, self.spec, policies, num_episodes=num_episodes, seed=self._seed_sequence(seed)
+            )
+        except USERS_ERRORS as error:
+            raise RecrlError(f"{self.spec.title}: cannot be evaluated: {described(error)}") from error
+        path = self.store.evaluations_folder / f"{self._file_name(seed)}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_rows(path, rows)
+        return pd.DataFrame(rows), path
+
+    def film(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:
+        """Film one episode, with its return and costs below the pictures.
+
+        Args:
+            policy: how it chooses.
+            video_format: GIF or MP4.
+            seed: of the environment and the policy, at least 0; None for the trial's own.
+
+        Returns:
+            The video.
+
+        Raises:
+            RecrlError: the task has no pictures, or this machine cannot draw or encode them.
+        """
+        path = self.video_path(policy, video_format, seed=seed)
+        try:
+            environment = make_drawn(self.spec.task.name, options=self.spec.task.options)
+        except NotDrawnError as error:
+            raise RecrlError(f"{self.spec.title}: {error}") from error
+        except USERS_ERRORS as error:
+            raise RecrlError(f"{self.spec.title}: cannot be drawn: {described(error)}") from error
+        speed = float(environment.metadata.get("render_fps") or DEFAULT_PICTURES_PER_SECOND)
+        every = stride(video_format, pictures_per_second=speed, longest=self.cmdp.horizon)
+        shots = film(
+            self.agent,
+            environment,
+            policy,
+            num_costs=self.cmdp.num_costs,
+            seed=self._seed_sequence(seed),
+            every=every,
+        )
+        try:
+            pictures = (captioned(shot.picture, self._caption(shot)) for shot in shots)
+            write_video(path, pictures, pictures_per_second=speed / every)
+        except RuntimeError as error:  # no graphics library
+            raise RecrlError(f"{self.spec.title}: cannot be drawn: {error}") from error
+        finally:
+            environment.close()
+        return path
+
+    def video_path(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:
+        """Where ``film`` puts its video."""
+        return self.store.videos_folder / f"{self._file_name(seed)}__{policy}.{video_format}"
+
+    def _file_name(self, seed: int | None) -> str:
+        return f"update-{self.update:08d}__seed-{'own' if seed is None else seed}"
+
+    def _seed_sequence(self, seed: int | None) -> np.random.SeedSequence:
+        return TrialSeeds.of(self.spec).evaluation if seed is None else np.random.SeedSequence(seed)
+
+    def _caption(self, shot: Shot) -> str:
+        costs = ", ".join(
+            f"{name} {cost:g} of {limit:g}"
+            for name, cost, limit in zip(
+                self.cmdp.cost_names, shot.costs.tolist(), self.spec.deploy_limits, strict=True
+            )
+        )
+        return f"step {shot.step}   return {shot.episode_return:.1f}   {costs}"
+
+
+def summary(rows: pd.DataFrame, frozen: FrozenTrial) -> list[dict[str, Any]]:
+    """What an evaluation says, a row a policy, as finished text.
+
+    Means are given with their standard errors; ``within`` is the share of the episodes in which no cost
+    exceeded its d_d.
+    """
+    costs = [f"cost_{i}" for i in range(frozen.cmdp.num_costs)]
+    limits = frozen.spec.deploy_limits.array
+    table = []
+    for policy in FrozenPolicy:
+        episodes = rows[rows["policy"] == policy]
+        if episodes.empty:
+            continue
+        within = float((episodes[costs].to_numpy() <= limits).all(axis=1).mean())
+        table.append(
+            {
+                "trial": frozen.spec.title,
+                "update": f"{frozen.update} of {frozen.spec.num_updates}",
+                "policy": policy.value,
+                "episodes": str(len(episodes)),
+                "return": _mean_text(episodes["episode_return"]),
+                "costs": ", ".join(_mean_text(episodes[column]) for column in costs),
+                "d_d": ", ".join(f"{limit:g}" for limit in frozen.spec.deploy_limits),
+                "within": f"{within:.0%}",
+            }
+        )
+    return table
+
+
+def _mean_text(column: pd.Series[float]) -> str:
+    """``9.50 ± 0.02``, the mean and its standard error; the mean alone of a single value."""
+    values = column.to_numpy(np.float64)
+    if len(values) < 2:
+        return f"{values.mean():.2f}"
+    return f"{values.mean():.2f} ± {values.std(ddof=1) / np.sqrt(len(values)):.2f}"

@@ -1,0 +1,526 @@
+"""One trial, as a pure program: a student learns a task under a teacher's limits, and leaves files.
+
+Knows neither Ray nor MLflow: an executor runs it, a mirror shows it. All of a trial's state (agent,
+optimisers, multipliers, teacher, environments, generators, counters, partial episodes) is in one tree, so a
+trial killed anywhere and resumed gives the bytes of one that never stopped.
+
+The walk of an update: collect T x B environment steps; append the episodes that finished;
+``agent.update(rollout, episode costs, step)`` under the curriculum's step, then ``teacher.step(state,
+report)`` for the next one. When the budget B is spent the phase is deployment, the limits are d_d, the noise
+is 0 and the teacher is not asked any more; the agent goes on learning. At the end the policy is frozen and
+evaluated.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from io import TextIOWrapper
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded
+from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
+from recrl.agents.evaluation import FrozenPolicy, evaluate
+from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CurriculumStep, EpisodeStats, Floats, Phase
+from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
+from recrl.environments.registry import make_vector
+from recrl.environments.vector import CMDPVectorEnv
+from recrl.orchestrator.errors import (
+    USERS_ERRORS,
+    LostLeaseError,
+    RowError,
+    StorageError,
+    TeacherUnavailableError,
+    described,
+)
+from recrl.orchestrator.files.code_changes import code_of
+from recrl.orchestrator.files.provenance import collect as collect_provenance
+from recrl.orchestrator.files.store import TrialStore, TrialWriter
+from recrl.orchestrator.redaction import shown
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.trial.heartbeat import Heartbeat
+from recrl.orchestrator.trial.rollout_check import check_rollout
+from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import ProgressReport, Teacher
+
+COMMIT_SECONDS = 20.0
+HEARTBEAT_SECONDS = 2.0
+HARD_LANDING = 0.1
+"""By what share of d_d (of 1, where d_d is less) the last training limit may exceed it without an event."""
+
+logger = logging.getLogger("recrl.trial")
+
+
+@dataclass(frozen=True)
+class TrialSeeds:
+    """The independent sources of a trial's randomness, all from its one seed.
+
+    Attributes:
+        environment: of the environments it learns in.
+        agent: of the student's initial parameters.
+        exploration: of the actions it takes while it learns.
+        evaluation: of the frozen policy's environments and actions.
+    """
+
+    environment: np.random.SeedSequence
+    agent: np.random.SeedSequence
+    exploration: np.random.SeedSequence
+    evaluation: np.random.SeedSequence
+
+    @classmethod
+    def of(cls, spec: TrialSpec) -> Self:
+        """The sources of a trial; the same seed gives the same under every task, student and method."""
+        return cls(*np.random.SeedSequence(spec.seed).spawn(4))
+
+
+class Trial:
+    """A trial in memory, advanced one policy update at a time.
+
+    Attributes:
+        spec: what the trial is.
+        update: policy updates done.
+        env_steps: environment steps taken, over all environments.
+    """
+
+    def __init__(self, spec: TrialSpec, writer: TrialWriter, teacher: Teacher) -> None:
+        """Start the trial, or continue it exactly where its newest intact checkpoint was taken."""
+        self.spec = spec
+        self._writer = writer
+        self._teacher = teacher
+        seeds = TrialSeeds.of(spec)
+        self._evaluation_seed = seeds.evaluation
+        self._generator = np.random.default_rng(seeds.exploration)
+        self._environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
+        self._cmdp = self._environments.cmdp
+        self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, seeds.agent)
+        self._collector = Collector(self._environments, num_steps=spec.rollout_steps, staggered=True)
+        tree = writer.restore()
+        if tree is None:
+            self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
+            self._step, self._teacher_state = teacher.start()
+            self.update = self.env_steps = self._episodes = 0
+            logger.info("started: %s", spec.title)
+        else:
+            self._load(tree)
+            logger.info("resumed after update %d, %d environment steps", self.update, self.env_steps)
+
+    @property
+    def phase(self) -> Phase:
+        """The phase of the next update."""
+        return Phase.TRAINING if self.env_steps < self.spec.train_steps else Phase.DEPLOYMENT
+
+    @property
+    def learned(self) -> bool:
+        """Whether every update is done; what is left is the evaluation."""
+        return self.update >= self.spec.num_updates
+
+    def advance(self) -> None:
+        """Do one policy update: collect, record, learn, ask the teacher."""
+        phase, step = self.phase, self._step
+        clock = time.process_time()
+        rollout, finished = self._collector.collect(self._agent, self._generator)
+        check_rollout(rollout, self.spec.task.label)
+        collect_seconds, clock = time.process_time() - clock, time.process_time()
+        episodes = self._number(finished, phase, step)
+        self.env_steps += self.spec.steps_per_update
+        costs = episode_costs(finished, self._cmdp.num_costs)
+        metrics = self._agent.update(rollout, costs, step)
+        self.update += 1
+        for episode in episodes:
+            self._writer.append_episode(episode)
+        row = {
+            "update": self.update,
+            "phase": phase,
+            "end_step": self.env_steps,
+            "episodes": len(episodes),
+            "episode_return": _mean([episode.episode_return for episode in episodes]),
+            "noise": step.policy_noise,
+            "time": round(time.time(), 3),
+            "collect_seconds": round(collect_seconds, 6),
+            "update_seconds": round(time.process_time() - clock, 6),
+            **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
+            **{f"limit_{i}": limit for i, limit in enumerate(step.limits)},
+            **_temperature(step),
+        }
+        self._writer.append_update({**row, **self._own_metrics(metrics, row)})
+        self._next_step(episodes, rollout.observations)
+
+    def save(self) -> None:
+        """Commit everything up to the last update, with a checkpoint."""
+        self._writer.commit(
+            self._state_dict(),
+            update=self.update,
+            env_steps=self.env_steps,
+            start_limits=self._step.to_json()["start_limits"],
+        )
+
+    def evaluate(self) -> None:
+        """Freeze the policy; write its evaluations, stochastic and deterministic, and its table.
+
+        Environments and generators are fresh and seeded from the trial's seed: nothing of training is
+        touched, and every method of a seed is evaluated on the same environment stream.
+        """
+        spec = self.spec
+        rows = evaluation_rows(
+            self._agent,
+            spec,
+            tuple(FrozenPolicy),
+            num_episodes=spec.evaluation_episodes,
+            seed=self._evaluation_seed,
+        )
+        if rows:
+            self._writer.write_evaluation(rows)
+        if table := policy_table(self._agent, self._environments):
+            self._writer.write_policy(table)
+
+    def _number(
+        self, finished: Sequence[FinishedEpisode], phase: Phase, step: CurriculumStep
+    ) -> tuple[EpisodeStats, ...]:
+        """The finished episodes of a rollout, with their place in the trial."""
+        episodes = tuple(
+            EpisodeStats(
+                index=self._episodes + offset,
+                phase=phase,
+                end_step=self.env_steps + (episode.step + 1) * self.spec.num_envs,
+                length=episode.length,
+                episode_return=episode.episode_return,
+                costs=episode.costs,
+                limits=step.limits,
+                noise=step.policy_noise,
+            )
+            for offset, episode in enumerate(finished)
+        )
+        self._episodes += len(episodes)
+        return episodes
+
+    def _next_step(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
+        """Ask the teacher, or enter deployment; add the policy noise that the next step asks for."""
+        if self.phase is Phase.DEPLOYMENT:
+            self._warn_of_hard_landing()
+            self._step = self._step.in_deployment(self.spec.deploy_limits)
+            return
+        before = self._step
+        report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
+        self._step, self._teacher_state = self._teacher.step(self._teacher_state, report)
+        if self._step.start_limits is not None and self._step.start_limits != before.start_limits:
+            limits = self._step.start_limits.to_json()
+            self._event("start limits measured", limits=limits)
+            if self.spec.is_no_curriculum(limits):
+                self._event("the curriculum is none", limits=limits)
+        if self._step.policy_noise > 0.0:
+            flat = observations.reshape(-1, observations.shape[-1])
+            done = self._agent.add_noise(self._step.policy_noise, flat)
+            self._event("policy noise", policy_noise=self._step.policy_noise, **done)
+        if self._step.rewards_entropy and not isinstance(self._agent, EntropyRewarded):
+            raise TypeError(
+                f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "
+                "not support; choose another of the two"
+            )
+
+    def _warn_of_hard_landing(self) -> None:
+        """Record an event if deployment begins with limits that the agent was never near."""
+        before, after = self._step.limits, self.spec.deploy_limits
+        if any(
+            late > (1.0 + HARD_LANDING) * max(final, 1.0) for late, final in zip(before, after, strict=True)
+        ):
+            self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
+
+    def _own_metrics(self, metrics: Mapping[str, float], row: Mapping[str, Any]) -> Mapping[str, float]:
+        """The agent's metrics, none of which may be called like a column of every trial."""
+        if taken := sorted(metrics.keys() & row.keys()):
+            raise RowError(
+                f"agent {self.spec.agent.label}: its metrics must have other names than the columns that "
+                f"every trial has, got {', '.join(taken)}"
+            )
+        return metrics
+
+    def _event(self, name: str, **details: Any) -> None:
+        event = {"update": self.update, "end_step": self.env_steps, "event": name, **details}
+        self._writer.append_event(event)
+        logger.info("%s", event)
+
+    def _state_dict(self) -> dict[str, Any]:
+        return {
+            "update": self.update,
+            "env_steps": self.env_steps,
+            "episodes": self._episodes,
+            "curriculum_step": self._step.to_json(),
+            "teacher": dict(self._teacher_state),
+            "agent": self._agent.state_dict(),
+            "environments": self._environments.state_dict(),
+            "collector": self._collector.state_dict(),
+            "generator": self._generator.bit_generator.state,
+        }
+
+    def _load(self, tree: dict[str, Any]) -> None:
+        self.update = tree["update"]
+        self.env_steps = tree["env_steps"]
+        self._episodes = tree["episodes"]
+        self._step = CurriculumStep.from_json(tree["curriculum_step"])
+        self._teacher_state = tree["teacher"]
+        self._agent.load_state_dict(tree["agent"])
+        self._environments.load_state_dict(tree["environments"])
+        self._collector.load_state_dict(tree["collector"])
+        self._generator.bit_generator.state = tree["generator"]
+
+
+def evaluation_rows(
+    agent: Agent,
+    spec: TrialSpec,
+    policies: Sequence[FrozenPolicy],
+    *,
+    num_episodes: int,
+    seed: np.random.SeedSequence,
+) -> list[dict[str, Any]]:
+    """Evaluate a frozen policy on fresh environments of a trial; a row of ``evaluation.csv`` an episode.
+
+    Args:
+        agent: whose policy acts; it is not changed.
+        spec: the trial.
+        policies: how it chooses; each is evaluated on the same environment stream.
+        num_episodes: of each, at least 0.
+        seed: of the environments and of the policy's randomness.
+    """
+    rows = []
+    for policy in policies:
+        environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
+        episodes = evaluate(agent, environments, policy, num_episodes=num_episodes, seed=seed)
+        rows += [
+            {
+                "policy": policy,
+                "index": index,
+                "length": episode.length,
+                "episode_return": episode.episode_return,
+                **{f"cost_{i}": cost for i, cost in enumerate(episode.costs)},
+            }
+            for index, episode in enumerate(episodes)
+        ]
+    return rows
+
+
+def policy_table(agent: Agent, environments: CMDPVectorEnv) -> list[dict[str, float]]:
+    """pi(a | s), a row a state, ``action_j`` the probability of action j.
+
+    Empty where there is no such table: the task is not finite, or the agent does not tell.
+    """
+    if not isinstance(environments, FiniteVectorEnv) or not isinstance(agent, DiscretePolicy):
+        return []
+    probabilities = agent.action_probabilities(environments.observations)
+    return [{f"action_{j}": float(share) for j, share in enumerate(row)} for row in probabilities]
+
+
+def run_trial(
+    spec: TrialSpec,
+    writer: TrialWriter,
+    teacher: Teacher,
+    *,
+    should_stop: Callable[[], bool],
+    commit_seconds: float = COMMIT_SECONDS,
+) -> TrialState:
+    """Run a trial to its end, or until ``should_stop``, from wherever its files say it stands.
+
+    Args:
+        spec: the trial.
+        writer: the lease on its folder (``TrialStore.begin``).
+        teacher: who sets the limits; inline or a proxy of a remote one.
+        should_stop: asked after every update; once true, the trial is saved and left waiting.
+        commit_seconds: wall seconds between checkpoints; has no influence on results.
+
+    Returns:
+        COMPLETE, or WAITING if it was stopped.
+
+    Raises:
+        LostLeaseError: another attempt took the trial over.
+        StorageError: the disk is full or gone; the last commit stands.
+        Exception: whatever the task, the student or the teacher raised, with a note of where; the last
+            commit stands.
+    """
+    life = _Life(writer)
+    with Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS) as heartbeat:  # to get ready may take minutes
+        trial = life.of(Trial(spec, writer, teacher))
+        committed = time.monotonic()
+        while not trial.learned and not should_stop():
+            with _located(f"in update {trial.update + 1}", writer):
+                trial.advance()
+            heartbeat.check()
+            if time.monotonic() - committed >= commit_seconds:
+                trial.save()
+                committed = time.monotonic()
+        if trial.learned:
+            with _located("in the evaluation", writer):
+                trial.evaluate()
+        trial.save()
+    if not trial.learned:
+        writer.close(TrialState.WAITING)
+        logger.info("stopped after update %d; it can be resumed", trial.update)
+        return TrialState.WAITING
+    writer.close(TrialState.COMPLETE)
+    logger.info("complete: %d updates, %d environment steps", trial.update, trial.env_steps)
+    return TrialState.COMPLETE
+
+
+class _Life:
+    """What a trial's heartbeat says: how far it is, and how fast over its last updates, however long."""
+
+    def __init__(self, writer: TrialWriter) -> None:
+        self._writer = writer
+        self._trial: Trial | None = None
+        self._speed = 0.0
+
+    def of(self, trial: Trial) -> Trial:
+        """The trial, now that it is made; until then the heartbeat says where it stood before."""
+        self._steps, self._since = trial.env_steps, time.monotonic()
+        self._trial = trial
+        return trial
+
+    def beat(self) -> None:
+        """Say it."""
+        if self._trial is None:
+            before = self._writer.record
+            self._writer.heartbeat(
+                update=before.update, env_steps=before.env_steps, steps_per_second=self._speed
+            )
+            return
+        now, done = time.monotonic(), self._trial.env_steps
+        if done > self._steps:
+            self._speed = (done - self._steps) / (now - self._since)
+            self._steps, self._since = done, now
+        self._writer.heartbeat(update=self._trial.update, env_steps=done, steps_per_second=self._speed)
+
+
+@contextmanager
+def _located(where: str, writer: TrialWriter) -> Iterator[None]:
+    """Note on whatever is raised where that was, and what is left of the trial."""
+    try:
+        yield
+    except USERS_ERRORS as error:
+        update = writer.store.saved_update
+        saved = (
+            f"the last good checkpoint is that of update {update}" if update else "no checkpoint before it"
+        )
+        error.add_note(f"{where}; {saved}")
+        raise
+
+
+def run_recorded(
+    spec: TrialSpec,
+    store: TrialStore,
+    *,
+    should_stop: Callable[[], bool],
+    teacher: Teacher | None = None,
+    commit_seconds: float = COMMIT_SECONDS,
+) -> TrialState:
+    """``run_trial``, with everything about the run recorded in the trial's folder.
+
+    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``, and nothing is
+    raised here: one trial's failure must not stop the others. A full disk is no failure of the trial's own:
+    it waits, and the same launch goes on from its last commit once there is room.
+
+    Returns:
+        How the trial stands now.
+
+    Raises:
+        TeacherUnavailableError: the teacher's process is gone; the trial waits to be resumed.
+    """
+    torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
+    provenance = {
+        **collect_provenance(),
+        "code": code_of(spec),
+    }  # waits for git, in silence: so before the trial begins
+    try:
+        writer = store.begin(spec)
+    except StorageError as error:
+        logger.warning("%s", error)
+        return TrialState.WAITING
+    with _log_to(store):
+        try:
+            writer.add_provenance(provenance)
+            return run_trial(
+                spec,
+                writer,
+                teacher or make_teacher(spec.teacher),
+                should_stop=should_stop,
+                commit_seconds=commit_seconds,
+            )
+        except LostLeaseError as error:
+            logger.warning("%s", error)
+        except TeacherUnavailableError:
+            _close(writer, TrialState.WAITING)
+            raise
+        except StorageError as error:
+            logger.error("%s", error)
+            return _close(writer, TrialState.WAITING, error=str(error))
+        except USERS_ERRORS as error:
+            logger.exception("failed after update %d", writer.record.update)
+            notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
+            text = shown(f"{described(error)}{notes}")
+            return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))
+        return store.record().status
+
+
+def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:
+    """End an attempt that broke off; what keeps its files from saying so must not hide why it did."""
+    try:
+        writer.close(status, error=error, traceback=traceback)
+    except (LostLeaseError, StorageError) as also:
+        logger.warning("%s", also)
+    return status
+
+
+@contextmanager
+def _log_to(store: TrialStore) -> Iterator[None]:
+    """Send the log of this process's trial to its folder."""
+    handler = _Log(store.log_path, encoding="utf-8", delay=True)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    root = logging.getLogger("recrl")
+    level = root.level
+    root.setLevel(logging.INFO)
+    root.addHandler(handler)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        root.setLevel(level)
+        with suppress(OSError):
+            handler.close()
+
+
+class _Log(logging.FileHandler):
+    """A log that loses lines rather than end a trial: on a full disk nothing is said about the log.
+
+    A link in its place is not followed: it might lead to another file of the user's.
+    """
+
+    def _open(self) -> TextIOWrapper:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
+        return open(os.open(self.baseFilename, flags, 0o644), "a", encoding=self.encoding)
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as text, without secrets and control characters."""
+        return shown(super().format(record))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):
+            super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
+        pass
+
+
+def _temperature(step: CurriculumStep) -> dict[str, float]:
+    """The column of the entropy coefficient; none where the curriculum never rewards entropy."""
+    return {} if step.entropy_coefficient is None else {"temperature": step.entropy_coefficient}
+
+
+def _mean(values: Sequence[float] | Floats) -> float:
+    """The mean, or NaN of nothing."""
+    return float(np.mean(values)) if len(values) else float("nan")

@@ -1,0 +1,1 @@
+"""Relaxed Exploration Constrained Reinforcement Learning: curricula, agents, tasks and sweeps."""

@@ -1,0 +1,106 @@
+"""CPO's own rules: when it steps, how far, and what the line search accepts."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete, Space
+
+from recrl.agents.algorithm_configs import CPOConfig
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
+from recrl.agents.experience import ActiveConstraints, Constraints, Experience
+from recrl.agents.learning.actor_critic import improve_and_measure
+from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.networks import NetworkForm, orthogonal
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.trust_region.cpo_dual import StepCase
+from recrl.environments.cmdp import Floats
+
+NUM_SAMPLES, DELTA = 400, 0.01
+LENGTH = 10.0
+SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
+
+
+def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floats]:
+    """A policy, what it did, and advantages: the reward likes what the first cost dislikes."""
+    generator = np.random.default_rng(0)
+    policy = StochasticPolicy(
+        3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
+    )
+    observations = generator.normal(size=(NUM_SAMPLES, 3)).astype(np.float32)
+    actions = policy.sample(observations, generator)
+    liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
+    advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
+    return policy, LearningBatch.deduplicate(observations, actions, compact=True), advantages
+
+
+def improve(
+    space: Space[object], gaps: list[float], limits: list[float] | None = None
+) -> tuple[dict[str, float], Floats, Floats]:
+    """The metrics, and the policy's parameters before and after."""
+    policy, batch, advantages = sampled(space)
+    before = policy.parameters.to_numpy()
+    constraints = Constraints(
+        np.array(limits or [10.0, 10.0]),
+        np.array(gaps),
+        np.zeros(2),
+        math.nan if math.isnan(gaps[0]) else LENGTH,
+    )
+    rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
+    experience = Experience.of(policy, batch, advantages, constraints)
+    metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
+    old = StochasticPolicy(3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0))
+    rows = batch.unique_observations
+    moved = old.distribution(rows).divergence(policy.distribution(rows))  # type: ignore[arg-type]
+    metrics["kl"] = float(torch.dot(batch.observation_weights, moved))
+    return metrics, before.astype(np.float64), policy.parameters.to_numpy().astype(np.float64)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize(
+    ("gaps", "case"),
+    [
+        ([-9.0, -9.0], StepCase.UNCONSTRAINED),
+        ([-0.1, -9.0], StepCase.CONSTRAINED),
+        ([0.1, -9.0], StepCase.CONSTRAINED),
+        ([9.0, -9.0], StepCase.RECOVERY),
+    ],
+)
+def test_the_step_stays_in_the_trust_region_and_serves_its_case(
+    space: Space[object], gaps: list[float], case: StepCase
+) -> None:
+    metrics, before, after = improve(space, gaps)
+    assert StepCase(int(metrics["case"])) is case
+    assert metrics["policy_steps"] == 1.0
+    assert 0.0 < metrics["kl"] <= DELTA
+    assert np.linalg.norm(after - before) == pytest.approx(metrics["step_norm"], rel=1e-3)
+    assert metrics["surrogate_cost_0"] <= max(-gaps[0] / LENGTH, 0.0) + 1e-6
+    if gaps[0] < 0.0:
+        assert metrics["surrogate_reward"] >= 0.0
+    else:
+        assert metrics["surrogate_cost_0"] < 0.0
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_no_limit_gives_the_unconstrained_step(space: Space[object]) -> None:
+    unlimited, _, after = improve(space, [-math.inf, -math.inf], [math.inf, math.inf])
+    slack, _, expected = improve(space, [-100.0, -100.0])
+    np.testing.assert_allclose(after, expected, atol=1e-6)
+    assert unlimited["multiplier_0"] == slack["multiplier_0"] == 0.0
+
+
+def test_without_a_finished_episode_the_policy_stays() -> None:
+    metrics, before, after = improve(SPACES[0], [math.nan, math.nan])
+    np.testing.assert_array_equal(after, before)
+    assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
+    assert math.isnan(metrics["case"])
+
+
+def test_violations_enter_in_cost_per_step() -> None:
+    constraints = Constraints(
+        np.array([25.0, math.inf, 1.0]), np.array([50.0, -math.inf, -0.5]), np.zeros(3), 1000.0
+    )
+    active = ActiveConstraints.of(constraints)
+    assert active.index.tolist() == [0, 2]
+    assert active.violations.tolist() == pytest.approx([0.05, -0.0005])

@@ -1,0 +1,122 @@
+"""Multiplier rules against hand-computed steps and against PyTorch."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from recrl.agents.constraints.multiplier_rules import (
+    STARTS,
+    pid,
+    projected_ascent,
+    relative_gaps,
+    softplus_adam,
+    start_pid,
+    start_projected_ascent,
+    start_softplus_adam,
+)
+
+UNLIMITED = -math.inf
+NO_LIMIT_AND_2 = np.array([math.inf, 2.0])
+
+
+def test_projected_ascent_climbs_with_the_gap_and_stops_at_zero_and_at_the_maximum() -> None:
+    state = start_projected_ascent(3, 1.0)
+    state = projected_ascent(state, np.array([2.0, -30.0, 50.0]), step_size=0.1, maximum=5.0)
+    assert state["multipliers"].tolist() == pytest.approx([1.2, 0.0, 5.0])
+
+
+def test_projected_ascent_does_not_wind_down_while_a_constraint_is_slack() -> None:
+    state = start_projected_ascent(1, 0.0)
+    for _ in range(100):
+        state = projected_ascent(state, np.array([-10.0]), step_size=0.1, maximum=10.0)
+    assert projected_ascent(state, np.array([1.0]), step_size=0.1, maximum=10.0)["multipliers"] == [0.1]
+
+
+def test_softplus_adam_begins_where_it_is_told() -> None:
+    state = start_softplus_adam(1, 1.0)
+    assert np.logaddexp(0.0, state["theta"]) == pytest.approx([1.0])
+
+
+def test_softplus_adam_equals_pytorch() -> None:
+    gaps = np.random.default_rng(0).normal(3.0, 5.0, size=(50, 2))
+    state = start_softplus_adam(2, 1.0)
+    theta = torch.tensor(state["theta"], requires_grad=True)
+    optimiser = torch.optim.Adam([theta], lr=0.05)
+    for gap in gaps:
+        state = softplus_adam(state, gap, learning_rate=0.05)
+        optimiser.zero_grad()
+        (-(theta * torch.from_numpy(gap)).sum()).backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+    expected = torch.nn.functional.softplus(theta).detach().numpy()
+    np.testing.assert_allclose(state["multipliers"], expected, rtol=1e-10)
+
+
+def test_pid_adds_its_three_terms() -> None:
+    gains: dict[str, Any] = {"proportional": 0.1, "integral": 0.01, "derivative": 1.0, "maximum": 100.0}
+    gains["largest"] = 20.0
+    state = pid(start_pid(1, 0.0), np.array([10.0]), **gains)
+    assert state["multipliers"] == pytest.approx([1.1])  # 0.1 * 10 + 0.01 * 10; nothing to differ from yet
+    state = pid(state, np.array([12.0]), **gains)
+    assert state["multipliers"] == pytest.approx([1.2 + 0.22 + 2.0])
+    state = pid(state, np.array([11.0]), **gains)
+    assert state["multipliers"] == pytest.approx([1.1 + 0.33])  # a falling gap is not differentiated
+
+
+def test_pid_does_not_wind_up() -> None:
+    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 2.0}
+    state, gains["largest"] = start_pid(2, 0.0), 10.0
+    for _ in range(1000):
+        state = pid(state, np.array([10.0, -10.0]), **gains)
+    assert state["integral"].tolist() == [2.0, 0.0]
+    state = pid(state, np.array([-10.0, 10.0]), **gains)
+    assert state["multipliers"].tolist() == [1.0, 1.0]
+
+
+def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates() -> None:
+    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
+    state, gains["largest"] = start_pid(2, 1.0), np.array([5.0, 2.0])
+    state = pid(state, np.array([60.0, 1.0]), **gains)
+    assert state["integral"].tolist() == pytest.approx([1.5, 1.1])
+    state = pid(state, np.array([-5.0, -2.0]), **gains)
+    assert state["integral"].tolist() == pytest.approx([1.0, 0.9])
+
+
+def test_a_gap_counts_by_its_limit_and_by_how_well_it_is_known() -> None:
+    gaps = relative_gaps(
+        np.array([50.0, 50.0, 2.0, -25.0, -math.inf, 3.0, 0.0]),
+        np.array([25.0, 25.0, 0.0, 25.0, math.inf, 0.0, 0.0]),
+        np.array([0.0, 60.0, 4.0, 0.0, 1.0, 0.0, 0.0]),
+    )
+    assert gaps.tolist() == pytest.approx([2.0, 50.0 / 65.0, 0.5, -1.0, -math.inf, 10.0, 0.0])
+
+
+def test_a_relative_gap_has_no_unit() -> None:
+    values = np.array([30.0, -10.0]), np.array([25.0, 25.0]), np.array([7.0, 0.0])
+    larger = (1024.0 * each for each in values)
+    assert relative_gaps(*larger).tolist() == relative_gaps(*values).tolist()
+
+
+@pytest.mark.parametrize("rule", STARTS)
+def test_no_limit_means_no_multiplier_and_leaves_no_trace(rule: str) -> None:
+    steps = {
+        "projected": lambda state, gaps: projected_ascent(state, gaps, step_size=0.1, maximum=10.0),
+        "softplus-adam": lambda state, gaps: softplus_adam(state, gaps, learning_rate=0.1),
+        "pid": lambda state, gaps: pid(
+            state,
+            gaps,
+            largest=2.0,
+            proportional=0.1,
+            integral=0.1,
+            derivative=0.1,
+            maximum=10.0,
+        ),
+    }
+    start = STARTS[rule](2, 1.0)
+    state = steps[rule](start, np.array([UNLIMITED, 2.0]))
+    assert state["multipliers"][0] == 0.0
+    assert state["multipliers"][1] > 1.0
+    for key in set(state) - {"multipliers", "last_gap"}:
+        assert state[key][0] == start[key][0]

@@ -1,0 +1,207 @@
+"""PCPO's projection against hand-computed steps and an independent solver; CRPO's choice; TRPO-Lagrangian."""
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete, Space
+from scipy.optimize import nnls
+
+from recrl.agents.algorithm_configs import CRPOConfig, PCPOConfig, TRPOLagConfig
+from recrl.agents.algorithms.crpo import (
+    ConstraintRectifiedPolicyOptimisation,
+    most_violated,
+    step_down,
+    step_up,
+)
+from recrl.agents.algorithms.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
+from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
+from recrl.agents.experience import Constraints, Experience
+from recrl.agents.learning.actor_critic import PolicyRule, improve_and_measure
+from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.networks import NetworkForm, orthogonal
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, projection_weights
+from recrl.environments.cmdp import Floats
+
+DELTA = 0.01
+SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
+EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+
+
+def step(gradient: Floats, costs: Floats, violations: list[float]) -> Floats:
+    """PCPO's step with H = I and a trust region of radius 1."""
+    problem = StepProblem(
+        float(gradient @ gradient), costs @ gradient, costs @ costs.T, np.array(violations), 0.5
+    )
+    solution = projected_step(problem)
+    return -(solution.gradient_weight * gradient + solution.constraint_weights @ costs)
+
+
+@pytest.mark.parametrize(
+    ("violation", "expected"),
+    [
+        (-2.0, [1.0, 0.0]),  # the reward's step holds the constraint
+        (-0.25, [0.25, 0.0]),  # it is moved back to where the constraint begins
+        (0.5, [-0.5, 0.0]),
+        (3.0, [-1.0, 0.0]),  # too far: to the edge of the trust region
+    ],
+)
+def test_the_step_is_the_one_computed_by_hand(violation: float, expected: list[float]) -> None:
+    assert step(-EAST, EAST[None], [violation]) == pytest.approx(np.array(expected), abs=1e-12)
+
+
+def test_the_projection_leaves_what_no_constraint_concerns() -> None:
+    found = step(-EAST - NORTH, EAST[None], [0.0])
+    assert found == pytest.approx([0.0, math.sqrt(0.5)])
+
+
+def test_the_published_weight_of_one_constraint() -> None:
+    assert projection_weights(np.array([[4.0]]), np.array([2.0])) == pytest.approx([0.5])
+    assert projection_weights(np.array([[4.0]]), np.array([-2.0])) == pytest.approx([0.0])
+
+
+def test_constraints_that_contradict_one_another_mend_the_worst() -> None:
+    costs = np.stack([NORTH, -NORTH])
+    assert projection_weights(costs @ costs.T, np.array([0.1, 0.4])) is None
+    found = step(-EAST, costs, [0.1, 0.4])
+    assert found[1] > 0.0
+    assert float(np.linalg.norm(found)) == pytest.approx(1.0)
+
+
+def test_a_cost_that_no_step_can_change_is_left_out() -> None:
+    assert step(-EAST, np.zeros((1, 2)), [3.0]) == pytest.approx(EAST)
+    assert step(np.zeros(2), np.zeros((1, 2)), [3.0]) == pytest.approx([0.0, 0.0])
+
+
+@pytest.mark.parametrize("num_costs", [1, 2, 3, 4, 8])
+def test_the_projection_is_the_independent_solvers(num_costs: int) -> None:
+    """With S = B B^T, nu minimises |B^T nu - z|^2 over nu >= 0, where B z = e: non-negative least squares."""
+    generator = np.random.default_rng(num_costs)
+    binding = Counter[int]()
+    for _ in range(250 if num_costs < 8 else 25):
+        costs = generator.normal(size=(num_costs, 9))
+        excesses = generator.normal(-0.2, 1.0, size=num_costs)
+        found = projection_weights(costs @ costs.T, excesses)
+        assert found is not None
+        expected, _ = nnls(costs.T, np.linalg.lstsq(costs, excesses)[0])
+        assert found == pytest.approx(expected, abs=1e-9)
+        binding[int(np.count_nonzero(found))] += 1
+    assert set(binding) >= set(range(min(num_costs, 4) + 1)) - ({0} if num_costs == 8 else set())
+
+
+@pytest.mark.parametrize("num_costs", [1, 2, 4])
+def test_every_projected_step_stays_in_the_trust_region(num_costs: int) -> None:
+    generator = np.random.default_rng(num_costs)
+    cases = Counter[StepCase]()
+    for _ in range(200):
+        gradient, costs = generator.normal(size=6), generator.normal(size=(num_costs, 6))
+        violations = generator.normal(-0.3, 1.0, size=num_costs)
+        problem = StepProblem(float(gradient @ gradient), costs @ gradient, costs @ costs.T, violations, 0.5)
+        solution = projected_step(problem)
+        x = -(solution.gradient_weight * gradient + solution.constraint_weights @ costs)
+        cases[solution.case] += 1
+        assert float(x @ x) <= 1.0 + 1e-9
+        unscaled = solution.gradient_weight == pytest.approx(1.0 / math.sqrt(problem.squared_gradient))
+        assert not unscaled or np.all(problem.after(solution) <= 1e-9)
+    assert set(cases) == {StepCase.UNCONSTRAINED, StepCase.CONSTRAINED}
+
+
+def rule_of(name: str, num_costs: int) -> PolicyRule:
+    if name == "pcpo":
+        return ProjectionBasedConstrainedPolicyOptimisation(PCPOConfig(target_kl=DELTA))
+    if name == "crpo":
+        return ConstraintRectifiedPolicyOptimisation(CRPOConfig(target_kl=DELTA))
+    return TRPOLagrangian(TRPOLagConfig(target_kl=DELTA), num_costs)
+
+
+def improved(
+    name: str, space: Space[object], gaps: list[float], limits: list[float]
+) -> tuple[dict[str, float], Floats]:
+    """The metrics of one update, and how the policy's parameters have changed."""
+    generator = np.random.default_rng(0)
+    policy = StochasticPolicy(
+        3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
+    )
+    observations = generator.normal(size=(400, 3)).astype(np.float32)
+    actions = policy.sample(observations, generator)
+    liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
+    advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
+    batch = LearningBatch.deduplicate(observations, actions, compact=True)
+    before, old = policy.parameters.to_numpy(), policy.distribution(batch.unique_observations)
+    length = math.nan if math.isnan(gaps[0]) else 10.0
+    constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    metrics = improve_and_measure(rule_of(name, 2), policy, experience, np.random.default_rng(0))
+    moved = old.divergence(policy.distribution(batch.unique_observations))  # type: ignore[arg-type]
+    metrics["kl"] = float(torch.dot(batch.observation_weights, moved))
+    return metrics, (policy.parameters.to_numpy() - before).astype(np.float64)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("name", ["pcpo", "crpo", "trpo-lag"])
+def test_the_step_serves_the_constraints_within_the_trust_region(name: str, space: Space[object]) -> None:
+    violated, change = improved(name, space, [30.0, -9.0], [1.0, 10.0])
+    assert violated["surrogate_cost_0"] < 0.0
+    assert violated["policy_steps"] == 1.0
+    assert 0.0 < violated["kl"] <= DELTA
+    assert float(np.linalg.norm(change)) == pytest.approx(violated["step_norm"], rel=1e-3)
+    free, _ = improved(name, space, [-math.inf, -math.inf], [math.inf, math.inf])
+    assert free["surrogate_reward"] > 0.0
+    assert free["multiplier_0"] == free["multiplier_1"] == 0.0
+
+
+@pytest.mark.parametrize("name", ["pcpo", "crpo"])
+def test_without_a_finished_episode_a_student_without_multipliers_stays(name: str) -> None:
+    metrics, change = improved(name, SPACES[0], [math.nan, math.nan], [1.0, 1.0])
+    assert not change.any()
+    assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
+    assert math.isnan(metrics["multiplier_0"])
+
+
+def test_without_a_finished_episode_the_multipliers_stay_and_the_policy_goes_on() -> None:
+    metrics, change = improved("trpo-lag", SPACES[0], [math.nan, math.nan], [1.0, 1.0])
+    assert change.any()
+    assert metrics["multiplier_0"] == 0.0
+
+
+def crpo_sizes(gradient: list[float], violation: float, kl_price: float) -> tuple[float, float]:
+    """How long CRPO's steps up the reward and down the cost are, with H = I, b = (1, 0), and radius 1."""
+    g, costs = np.array(gradient), EAST[None]
+    problem = StepProblem(float(g @ g), -costs @ g, costs @ costs.T, np.array([violation]), 0.5)
+    config = CRPOConfig(kl_price=kl_price)
+    return step_up(problem, config).gradient_weight, step_down(problem, 0, config).constraint_weights[0]
+
+
+def test_crpos_steps_end_at_the_limit_where_nothing_is_left_to_gain() -> None:
+    assert crpo_sizes([1.0, 0.0], -0.05, 1.0)[0] == pytest.approx(0.05)
+    assert crpo_sizes([1.0, 0.0], 0.1, 1.0)[1] == pytest.approx(0.1)
+
+
+def test_crpos_steps_go_beyond_the_limit_for_what_is_left_to_gain() -> None:
+    # p = 1 - 0.6^2, beta = 0.8 / 2; the reward's step raises the cost by 0.6.
+    assert crpo_sizes([0.6, 0.8], -0.06, 1.0)[0] == pytest.approx(0.06 / 0.6 + 0.4)
+    assert crpo_sizes([0.6, 0.8], 0.1, 1.0)[1] == pytest.approx(0.1 + 0.4 * 0.6)
+
+
+def test_crpos_steps_are_as_long_as_the_trust_region_far_from_limits_and_without_a_price() -> None:
+    assert crpo_sizes([0.6, 0.8], -9.0, 1.0)[0] == pytest.approx(1.0)
+    assert crpo_sizes([0.6, 0.8], 9.0, 1.0)[1] == pytest.approx(1.0)
+    assert crpo_sizes([1.0, 0.0], 0.01, 0.0) == pytest.approx((1.0, 1.0))
+    assert crpo_sizes([-1.0, 0.0], 0.01, 0.0) == pytest.approx((1.0, 1.0))
+
+
+def test_crpo_rests_where_nothing_can_be_changed() -> None:
+    nothing = StepProblem(0.0, np.zeros(1), np.zeros((1, 1)), np.array([0.1]), 0.5)
+    assert step_up(nothing, CRPOConfig()).gradient_weight == 0.0
+    assert step_down(nothing, 0, CRPOConfig()).constraint_weights.tolist() == [0.0]
+
+
+def test_crpo_mends_what_is_most_violated_in_its_own_spread() -> None:
+    ones = np.ones(3)
+    assert most_violated(np.array([-1.0, 0.0, -math.inf]), ones, 0.0) is None
+    assert most_violated(np.array([0.4, 0.2, -math.inf]), ones, 0.5) is None
+    assert most_violated(np.array([1.0, 2.0, -math.inf]), ones, 0.5) == 1
+    assert most_violated(np.array([1.0, 2.0, -math.inf]), np.array([1.0, 4.0, 1.0]), 0.5) == 0

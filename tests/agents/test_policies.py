@@ -1,0 +1,235 @@
+"""Policies: their distributions, sampling, noise, and the trust region's metric."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete, Space
+from torch import Tensor
+
+from recrl.agents.learning.distributions import Categorical, Gaussian, mean_divergence
+from recrl.agents.learning.networks import NetworkForm, orthogonal
+from recrl.agents.learning.noise import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
+
+FORM = NetworkForm((5, 4), orthogonal)
+THREE_ACTIONS = Discrete(3)
+TWO_COMPONENTS = Box(np.array([-1.0, -2.0], np.float32), np.array([1.0, 2.0], np.float32))
+SPACES = [THREE_ACTIONS, TWO_COMPONENTS]
+
+
+@pytest.fixture
+def double_precision() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def policy_for(space: Space[object], last_scale: float = 1.0) -> StochasticPolicy:
+    return StochasticPolicy(3, space, FORM, last_scale, torch.Generator().manual_seed(0))
+
+
+def random_rows(count: int = 6) -> Tensor:
+    return torch.randn(count, 3, generator=torch.Generator().manual_seed(5))
+
+
+def test_categorical_quantities_are_those_computed_by_hand() -> None:
+    half = Categorical(torch.log(torch.tensor([[0.5, 0.5]])))
+    skewed = Categorical(torch.log(torch.tensor([[0.25, 0.75]])))
+    assert half.entropy().item() == pytest.approx(np.log(2.0))
+    assert half.divergence(skewed).item() == pytest.approx(0.5 * np.log(2.0) + 0.5 * np.log(2.0 / 3.0))
+    assert skewed.log_prob(torch.tensor([1, 0]), torch.tensor([0, 0])).exp().tolist() == pytest.approx(
+        [0.75, 0.25]
+    )
+    # diag(p) - p p^T times (1, 0)
+    assert skewed.fisher(torch.tensor([[1.0, 0.0]]))[0].tolist() == pytest.approx([0.1875, -0.1875])
+
+
+def test_gaussian_quantities_are_those_computed_by_hand() -> None:
+    narrow = Gaussian(torch.tensor([[0.0, 0.0]]), torch.zeros(2))
+    wide = Gaussian(torch.tensor([[1.0, 0.0]]), torch.log(torch.tensor([2.0, 1.0])))
+    assert narrow.entropy().item() == pytest.approx(np.log(2.0 * np.pi * np.e))
+    # summed over the components: log 2 + (1 + 1) / 8 - 1 / 2, and nothing for the second
+    assert narrow.divergence(wide).item() == pytest.approx(np.log(2.0) + 0.25 - 0.5)
+    assert narrow.log_prob(torch.tensor([[1.0, 2.0]]), None).item() == pytest.approx(
+        -2.5 - np.log(2.0 * np.pi)
+    )
+    assert wide.fisher(torch.tensor([[1.0, 1.0]]))[0].tolist() == pytest.approx([0.25, 1.0])
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_numpy_and_pytorch_evaluate_one_policy(space: Space[object]) -> None:
+    policy, rows = policy_for(space), random_rows()
+    distribution = policy.distribution(rows)
+    outputs = torch.from_numpy(policy.outputs(rows.numpy()))
+    if isinstance(distribution, Categorical):
+        torch.testing.assert_close(torch.log_softmax(outputs, dim=1), distribution.log_probs)
+    else:
+        torch.testing.assert_close(outputs, distribution.mean)
+
+
+def test_sampled_actions_have_the_policys_probabilities() -> None:
+    policy = policy_for(THREE_ACTIONS, last_scale=3.0)
+    observation = random_rows(1)
+    actions = policy.sample(observation.repeat(40_000, 1).numpy(), np.random.default_rng(0))
+    distribution = policy.distribution(observation)
+    assert isinstance(distribution, Categorical)
+    expected = distribution.log_probs.exp()[0].numpy()
+    assert actions.dtype == np.int64
+    np.testing.assert_allclose(np.bincount(actions, minlength=3) / len(actions), expected, atol=0.01)
+
+
+def test_sampled_gaussian_actions_have_the_policys_moments() -> None:
+    policy = policy_for(TWO_COMPONENTS)
+    observation = random_rows(1)
+    actions = policy.sample(observation.repeat(40_000, 1).numpy(), np.random.default_rng(0))
+    assert actions.dtype == np.float32
+    np.testing.assert_allclose(actions.mean(axis=0), policy.mode(observation.numpy())[0], atol=0.02)
+    np.testing.assert_allclose(actions.std(axis=0), np.exp(-0.5), rtol=0.02)
+
+
+def test_a_sure_policy_never_does_anything_else() -> None:
+    policy = policy_for(THREE_ACTIONS)
+    policy.stack.biases[-1].copy_(torch.tensor([[[0.0, 500.0, 0.0]]]))
+    actions = policy.sample(random_rows(1000).numpy(), np.random.default_rng(0))
+    assert set(actions.tolist()) == {1}
+
+
+def test_the_mode_is_the_most_likely_action() -> None:
+    policy, rows = policy_for(THREE_ACTIONS), random_rows()
+    distribution = policy.distribution(rows)
+    assert isinstance(distribution, Categorical)
+    assert policy.mode(rows.numpy()).tolist() == distribution.log_probs.argmax(dim=1).tolist()
+
+
+def divergence_of(policy: StochasticPolicy, flat: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """The mean KL from the policy to the one with the parameters ``flat``, evaluated independently."""
+    tensors = policy.parameters.pieces(flat)
+    hidden = rows
+    for layer in range(3):
+        hidden = hidden @ tensors[layer][0, :-1] + tensors[layer][0, -1]
+        if layer < 2:
+            hidden = torch.tanh(hidden)
+    new = (
+        Categorical(torch.log_softmax(hidden, dim=1)) if len(tensors) == 3 else Gaussian(hidden, tensors[-1])
+    )
+    return mean_divergence(policy.distribution(rows), new, weights)
+
+
+@pytest.mark.usefixtures("double_precision")
+@pytest.mark.parametrize("space", SPACES)
+def test_the_fisher_metric_is_the_hessian_of_the_divergence(space: Space[object]) -> None:
+    policy, rows = policy_for(space), random_rows()
+    weights = torch.arange(1.0, 7.0) / 21.0
+    hessian = torch.autograd.functional.hessian(  # type: ignore[no-untyped-call]
+        lambda flat: divergence_of(policy, flat, rows, weights), policy.parameters.values.clone()
+    )
+    vector = torch.randn(len(hessian), generator=torch.Generator().manual_seed(1))
+    metric = FisherMetric(policy, rows, weights, damping=0.1)
+    torch.testing.assert_close(metric(vector), hessian @ vector + 0.1 * vector)
+
+
+@pytest.mark.usefixtures("double_precision")
+@pytest.mark.parametrize("space", SPACES)
+def test_the_gradient_of_a_loss_agrees_with_finite_differences(space: Space[object]) -> None:
+    policy, rows = policy_for(space), random_rows()
+    target = policy_for(space)
+    target.parameters.values.add_(0.3)
+    weights = torch.full((6,), 1.0 / 6.0)
+    goal = target.distribution(rows)
+    now = policy.evaluate(rows)
+    gradient = now.gradient(mean_divergence(now.distribution, goal, weights)).clone()
+    for index in range(0, len(gradient), 5):
+        values = []
+        for change in (1e-6, -1e-6):
+            policy.parameters.values[index] += change
+            values.append(float(mean_divergence(policy.distribution(rows), goal, weights)))
+            policy.parameters.values[index] -= change
+        assert gradient[index].item() == pytest.approx((values[0] - values[1]) / 2e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.3, 1.0])
+def test_noise_makes_a_policy_as_random_as_its_mixture_with_a_uniform_one(noise: float) -> None:
+    logits = np.array([[0.0, 30.0, 1.0], [5.0, 0.0, -4.0]])
+    weights = np.array([0.25, 0.75])
+    mass = off_greedy_mass(logits, weights)
+    wanted = (1.0 - noise) * mass + noise * 2.0 / 3.0
+    scale = matching_scale(logits, weights, noise)
+    assert off_greedy_mass(scale * logits, weights) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_off_greedy_mass_is_that_computed_by_hand() -> None:
+    logits = np.log(np.array([[0.5, 0.25, 0.25], [0.1, 0.8, 0.1]]))
+    assert off_greedy_mass(logits, np.array([0.3, 0.7])) == pytest.approx(0.3 * 0.5 + 0.7 * 0.2)
+
+
+def test_observations_that_repeat_count_as_often_as_they_do() -> None:
+    rows = random_rows().numpy()
+    repeated = np.concatenate([rows[[0] * 30], rows[[1] * 10]])
+    one, other = policy_for(THREE_ACTIONS, last_scale=5.0), policy_for(THREE_ACTIONS, last_scale=5.0)
+    masses = [off_greedy_mass(one.outputs(row[None]).astype(np.float64), np.ones(1)) for row in rows[:2]]
+    metrics = one.add_noise(0.3, repeated, "match-mixture")
+    assert metrics["randomness_before"] == pytest.approx(0.75 * masses[0] + 0.25 * masses[1])
+    jittered = repeated + np.random.default_rng(0).normal(0.0, 1e-7, repeated.shape).astype(np.float32)
+    assert other.add_noise(0.3, jittered, "match-mixture") == pytest.approx(metrics, rel=1e-4)
+
+
+def test_noise_never_sharpens_a_policy() -> None:
+    assert matching_scale(np.zeros((4, 3)), np.full(4, 0.25), 0.3) == pytest.approx(1.0)
+    wide = np.log(np.array([10.0]))
+    assert matching_log_std(wide, np.ones(1), 0.5) == pytest.approx(wide)
+
+
+def test_gaussian_noise_gives_the_variance_of_the_mixture() -> None:
+    found = matching_log_std(np.log(np.array([0.1, 0.1])), np.array([1.0, 2.0]), 0.3)
+    assert np.exp(2.0 * found) == pytest.approx([0.7 * 0.01 + 0.3 / 3.0, 0.7 * 0.01 + 0.3 * 4.0 / 3.0])
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("form", ["match-mixture", "temperature"])
+def test_noise_makes_a_policy_more_random(space: Space[object], form: str) -> None:
+    policy, rows = policy_for(space, last_scale=5.0), random_rows()
+    if space is TWO_COMPONENTS:
+        policy.log_std.fill_(-3.0)
+    before = float(policy.distribution(rows).entropy().mean())
+    metrics = policy.add_noise(0.3, rows.numpy(), form)
+    assert set(metrics) == {"noise_scale", "randomness_before", "randomness_after"}
+    assert metrics["randomness_after"] > metrics["randomness_before"]
+    assert float(policy.distribution(rows).entropy().mean()) > before
+
+
+def test_an_unbounded_action_is_noised_as_if_its_half_range_were_one() -> None:
+    policy = policy_for(Box(-np.inf, np.inf, (1,)))
+    policy.log_std.fill_(-5.0)
+    policy.add_noise(1.0, random_rows().numpy(), "match-mixture")
+    assert policy.log_std.exp().item() == pytest.approx(3.0**-0.5)
+
+
+def test_probabilities_are_the_distributions() -> None:
+    policy, rows = policy_for(THREE_ACTIONS), random_rows()
+    expected = torch.stack(
+        [policy.distribution(rows).log_prob(torch.full((6,), action), None).exp() for action in range(3)], 1
+    )
+    np.testing.assert_allclose(policy.probabilities(rows.numpy()), expected, rtol=1e-5)
+
+
+def test_continuous_actions_have_no_probabilities() -> None:
+    with pytest.raises(ValueError, match="continuous actions have densities, not probabilities"):
+        policy_for(TWO_COMPONENTS).probabilities(random_rows().numpy())
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_what_is_asked_for_again_is_not_computed_again_and_a_policy_that_moved_is(
+    space: Space[object],
+) -> None:
+    policy, rows = policy_for(space), random_rows()
+    before = policy.distribution(rows)
+    assert policy.distribution(rows) is before
+    policy.parameters.values.add_(0.1)
+    after = policy.distribution(rows)
+    assert float(mean_divergence(before, after, torch.full((6,), 1.0 / 6.0))) > 0.0
+    # neither for equal parameters nor for equal rows that are others is anything taken over
+    torch.testing.assert_close(policy.distribution(rows.clone()).entropy(), after.entropy())
+    policy.parameters.values.sub_(0.1)
+    torch.testing.assert_close(policy.distribution(rows).entropy(), before.entropy())

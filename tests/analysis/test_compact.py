@@ -1,0 +1,117 @@
+"""A finished sweep in one file: what comes back, and what it leaves out."""
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from recrl.analysis import report
+from recrl.analysis.data import export, sweep_data
+from recrl.analysis.data.sweep_data import Sweep, drawn_columns
+from recrl.analysis.figures import styles
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.files.store import SweepStore
+
+
+@pytest.fixture(scope="module")
+def restored(finished: Sweep, tmp_path_factory: pytest.TempPathFactory) -> Sweep:
+    return export.load(export.save(finished, tmp_path_factory.mktemp("compact") / "sweep.zip"))
+
+
+@pytest.mark.parametrize("name", ["trials", "phases", "evaluations", "events", "policies"])
+def test_outcomes_are_exact(restored: Sweep, finished: Sweep, name: str) -> None:
+    pd.testing.assert_frame_equal(getattr(restored, name), getattr(finished, name), check_exact=True)
+
+
+def test_updates_are_rounded_and_only_what_is_drawn(restored: Sweep, finished: Sweep) -> None:
+    expected = finished.updates[drawn_columns(map(str, finished.updates))]
+    assert list(restored.updates[expected.columns]) == list(expected)
+    pd.testing.assert_frame_equal(restored.updates[expected.columns], expected, rtol=1e-5)
+    assert (
+        restored.updates["episode_return"].map(lambda value: len(f"{abs(value):.12g}".strip("0."))).max() <= 8
+    )
+
+
+def test_settings_and_provenance_come_back(restored: Sweep, finished: Sweep) -> None:
+    assert restored.facts == finished.facts
+    assert (restored.name, restored.grid, restored.notes) == (finished.name, finished.grid, finished.notes)
+
+
+def test_saving_again_gives_equal_bytes(restored: Sweep, finished: Sweep, tmp_path: Path) -> None:
+    first, second = export.save(finished, tmp_path / "1.zip"), export.save(restored, tmp_path / "2.zip")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image).astype(int)
+
+
+def test_figures_and_tables_are_drawn_from_it(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=2, tasks=["a"], agents=["cpo"], methods=["none", "step"], failed=["a cpo step seed 1"]
+    )
+    sweep = sweep_data.load(store)
+    small = export.load(export.save(sweep, tmp_path / "sweep.zip"))
+    for stem in ("learning-curves_cpo", "curricula"):
+        pictures = [report.drawings(it)[stem]() for it in (sweep, small)]
+        one, other = (
+            pixels(styles.save_png(picture, tmp_path / f"{number}.png"))
+            for number, picture in enumerate(pictures)
+            if picture is not None
+        )
+        assert np.abs(one - other).max() <= 4, stem  # a rounded curve has other soft edges
+    written, _ = report.write_tables(sweep, tmp_path / "files")
+    report.write_tables(small, tmp_path / "compact")
+    for path in written:
+        if path.name != "bounds.csv":  # sums over rounded updates
+            assert path.read_bytes() == (tmp_path / "compact" / path.name).read_bytes(), path.name
+
+
+def test_what_is_no_compact_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "none.zip"
+    with pytest.raises(RecrlError, match=r"none\.zip: there is no such file in /"):
+        export.load(path)
+    for suffix in ("yaml", "zip", "csv"):
+        (tmp_path / f"some.{suffix}").touch()
+    with pytest.raises(RecrlError, match=r"did you mean 'some\.zip'\?"):
+        export.load(tmp_path / "sone.zip")
+    with pytest.raises(RecrlError, match="cannot be read as a sweep's compact file"):
+        export.load(tmp_path)
+    path.write_text("nothing")
+    with pytest.raises(RecrlError, match="File is not a zip file"):
+        export.load(path)
+
+
+def test_a_file_that_would_fill_the_memory_is_refused(
+    finished: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = export.save(finished, tmp_path / "sweep.zip")
+    monkeypatch.setattr(export, "MAX_BYTES", 10_000)
+    with pytest.raises(RecrlError, match=r"file \(it unpacks to \d+ bytes, at most 10000 are taken\)"):
+        export.load(path)
+    with pytest.raises(RecrlError, match=r"a compact file may unpack to 10000 bytes, this one has \d+"):
+        export.save(finished, path)
+
+
+@pytest.mark.parametrize("told", ["[]", '{"format": 3}', "null"])
+def test_a_file_of_another_format_is_named(finished: Sweep, tmp_path: Path, told: str) -> None:
+    path = export.save(finished, tmp_path / "sweep.zip")
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, member in (members | {"sweep.json": told.encode()}).items():
+            archive.writestr(name, member)
+    with pytest.raises(RecrlError, match=r"sweep\.zip: its format must be 2 or 1, got (3|None)"):
+        export.load(path)
+
+
+def test_significant_digits() -> None:
+    values = np.array([123456.7, 1.2345678e-9, -0.1, np.inf])
+    assert export._significant(values).tolist() == [123457.0, 1.23457e-9, -0.1, np.inf]

@@ -1,0 +1,162 @@
+"""What training cost beside what theory allows: sums by hand, and a trial that the bound holds for."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from recrl.analysis.data import sweep_data
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.figures.cumulative_cost import cumulative_bounds
+from recrl.analysis.statistics import cumulative_cost
+from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.trial.trial import run_recorded
+from recrl.teachers.bounds import undiscounted_excess
+
+RIVER = TrialSpec(
+    task=Choice("rivergrid-1a", {"horizon": 20}),
+    agent=Choice("cpo", {"hidden_sizes": [8], "target_kl": 1e-7, "discount": 0.9}),
+    method=Choice("linear"),
+    train_limits=CostLimits((18.0,)),
+    deploy_limits=CostLimits((15.0,)),
+    train_steps=800,
+    deploy_steps=80,
+    num_envs=4,
+    rollout_steps=20,
+    evaluation_episodes=0,
+    seed=0,
+)
+
+
+@pytest.fixture(scope="module")
+def river_grid(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
+    store = SweepStore(tmp_path_factory.mktemp("runs"), "river")
+    trial = store.trial(RIVER)
+    assert run_recorded(RIVER, trial, should_stop=lambda: False) is TrialState.COMPLETE
+    store.write_info({"name": store.name})
+    return store
+
+
+def test_measured_cost_lies_under_the_bound_on_river_grid(river_grid: SweepStore) -> None:
+    (row,) = cumulative_cost.cumulative_costs(sweep_data.load(river_grid)).to_dict("records")
+    assert row["policies"] == 10
+    assert 10 < row["cost_sum"] < row["bound"] < row["ceiling_sum"] == 10 * 20
+    updates = river_grid.trials()[0].updates().iloc[:10]
+    excesses = [undiscounted_excess(kl, 20.0, horizon=20) for kl in updates["kl"][:9]]
+    assert row["bound"] == pytest.approx(
+        20.0 + sum(min(20.0, d + excess) for d, excess in zip(updates["limit_0"][:9], excesses, strict=True))
+    )
+    assert row["discounted_excess_sum"] == pytest.approx(
+        sum(
+            math.sqrt(2 * kl) * 0.9 * min(eps, 10.0) / 0.1**2
+            for kl, eps in zip(updates["kl"][:9], updates["cost_advantage_max_0"][:9], strict=True)
+        )
+    )
+
+
+def three_policies(finished: Sweep) -> Sweep:
+    """One linear trial whose three policies cost 30, 6 and 2 under 20, 10 and infinity; d_d is 5."""
+    trials = finished.trials.query(
+        "task == 'river-a' and agent == 'cpo' and method == 'linear' and seed == 0"
+    )
+    updates = finished.updates.merge(trials[["task", "agent", "method", "seed"]]).iloc[:3]
+    for name in ("task", "agent", "method"):
+        updates[name] = updates[name].astype(finished.updates[name].dtype)
+    updates = updates.assign(
+        cost_0=[30.0, 6.0, 2.0], limit_0=[20.0, 10.0, math.inf], kl=[0.0, 0.02, 0.0], episodes=[4, 4, 4]
+    )
+    return dataclasses.replace(finished, trials=trials, updates=updates)
+
+
+def test_sums_are_those_counted_by_hand(finished: Sweep) -> None:
+    (row,) = cumulative_cost.cumulative_costs(three_policies(finished)).to_dict("records")
+    assert (row["cost_sum"], row["limit_sum"]) == (38.0, 32.0)
+    assert (row["overshoot_sum"], row["violation_sum"]) == (10.0, 26.0)
+    assert row["episodes_per_policy"] == 4.0
+    # two-state costs at most 1 a step for 10 steps: the first policy 10, then min(20, 10), min(10, 10)
+    assert (row["bound"], row["ceiling_sum"]) == (30.0, 30.0)
+
+
+def test_a_budget_is_spent_by_the_limit_it_allows(finished: Sweep) -> None:
+    sweep = three_policies(finished)
+    rows = cumulative_cost.cumulative_costs(sweep)
+    # 4 episodes a policy: 80 are 20 a policy's episode. Overshoot is 10 in all; what is left, 10, is
+    # (1 + 2/3 + 1/3) (d_t - 5)
+    (row,) = cumulative_cost.admissible_limits(rows, sweep, budget=80.0).to_dict("records")
+    assert row["largest_train_limit"] == pytest.approx(10.0)
+    assert row["measured_violation"] == 104.0
+    (row,) = cumulative_cost.admissible_limits(rows, sweep, budget=39.0).to_dict("records")
+    assert math.isnan(row["largest_train_limit"])
+    table = cumulative_cost.admissible_table(pd.DataFrame([row]))
+    assert table["largest d_t"].tolist() == ["none"]
+
+
+def test_a_negative_budget_is_refused(finished: Sweep) -> None:
+    with pytest.raises(RecrlError, match=r"^--budget: must be at least 0, got -1$"):
+        cumulative_cost.admissible_limits(pd.DataFrame(), finished, budget=-1.0)
+
+
+def test_lemma_1_is_not_said_of_other_students(finished: Sweep) -> None:
+    rows = cumulative_cost.cumulative_costs(finished)
+    assert rows.loc[rows["agent"] == "ppo-lag", ["bound", "discounted_excess_sum"]].isna().all(axis=None)
+    assert rows["ceiling_sum"].notna().all()
+
+
+def test_the_command_says_it(river_grid: SweepStore, capsys: pytest.CaptureFixture[str]) -> None:
+    root = str(river_grid.folder.parent)
+    assert main(["bound", "--root", root, "--budget", "1000"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert "rivergrid-1a" in out
+    assert "The largest d_t within 1000 of cost above d_d over all episodes:" in out
+
+
+def with_discount(sweep: Sweep, discount: float) -> Sweep:
+    """The sweep of students with this discount."""
+    cpo = Choice("cpo", {"discount": discount})
+    facts = [dataclasses.replace(it, spec=dataclasses.replace(it.spec, agent=cpo)) for it in sweep.facts]
+    return dataclasses.replace(sweep, facts=tuple(facts))
+
+
+def test_measured_advantages_make_the_discounted_bound_tighter(finished: Sweep) -> None:
+    sweep = with_discount(three_policies(finished), 0.9)
+    updates = sweep.updates.assign(kl=[1e-8, 1e-8, 0.0], limit_0=[6.0, 5.0, 5.0])
+    (crude,) = cumulative_cost.cumulative_costs(dataclasses.replace(sweep, updates=updates)).to_dict(
+        "records"
+    )
+    seen = updates.assign(cost_advantage_max_0=[0.5, 0.25, 0.0])
+    (own,) = cumulative_cost.cumulative_costs(dataclasses.replace(sweep, updates=seen)).to_dict("records")
+    assert own["discounted_bound"] < crude["discounted_bound"] <= crude["ceiling_sum"]
+    assert own["bound"] == crude["bound"]
+    # the first policy 10, then 6 and 5 and what Lemma 1 adds
+    excess = math.sqrt(2e-8) * 0.9 * (0.5 + 0.25) / 0.1**2
+    assert own["discounted_excess_sum"] == pytest.approx(excess)
+    assert own["discounted_bound"] == pytest.approx(21.0 + excess)
+
+
+def test_without_horizon_the_first_policy_counts_with_its_cost(finished: Sweep) -> None:
+    updates = three_policies(finished).updates.assign(
+        cost_advantage_max_0=1.0, limit_0=[20.0, 10.0, 5.0], kl=0.0
+    )
+    policies = cumulative_cost.policy_costs(updates, cost=0, sizes=None, discount=0.99)
+    assert policies["discounted_bound"].tolist() == [30.0, 20.0, 10.0]
+    assert policies[["bound", "ceiling"]].isna().all(axis=None)
+
+
+def test_the_figure_adds_up_what_the_table_sums(finished: Sweep) -> None:
+    rows = cumulative_cost.cumulative_costs(finished)
+    figure = cumulative_bounds(finished, "cpo")
+    assert figure is not None
+    axes = figure.axes[1]  # linear on river-a
+    chosen = rows.query("task == 'river-a' and agent == 'cpo' and method == 'linear'")
+    ends = [np.asarray(line.get_ydata(), dtype=float)[-1] for line in axes.get_lines()]
+    assert ends[:3] == pytest.approx(chosen["cost_sum"].tolist())
+    assert ends[3] == pytest.approx(chosen["cost_sum"].mean())
+    assert ends[4] == pytest.approx(chosen["limit_sum"].mean())
+    assert ends[-1] == pytest.approx(chosen["ceiling_sum"].mean())

@@ -1,0 +1,199 @@
+"""The paper's figures show what the frames hold."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from PIL import Image
+
+from recrl.analysis.data import sweep_data
+from recrl.analysis.data.sweep_data import METHOD_ORDER, Sweep
+from recrl.analysis.figures import learning_curves, styles
+from recrl.analysis.figures.diagnostics import curriculum_diagnostics
+from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
+from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
+from recrl.orchestrator.files.store import SweepStore
+
+
+def lines_of(axes: Axes, colour: str) -> list[Line2D]:
+    return [line for line in axes.get_lines() if line.get_color() == colour]
+
+
+@pytest.fixture
+def panel(finished: Sweep) -> Sweep:
+    """One task and one agent, for what is only drawn to be saved."""
+    updates = finished.updates
+    one = (updates["task"] == "river-a") & (updates["agent"] == "cpo")
+    return dataclasses.replace(finished, updates=updates[one])
+
+
+def test_a_row_a_task_and_four_columns(finished: Sweep) -> None:
+    figure = learning_curves.learning_curves(finished, "cpo")
+    assert len(figure.axes) == 2 * 4
+    assert [axes.get_title() for axes in figure.axes[:4]] == [
+        "return",
+        "return in deployment",
+        "episode cost",
+        "cost in deployment",
+    ]
+    assert figure.axes[0].get_ylabel() == "river-a\n3 seeds, 16k steps"
+
+
+def test_curves_limit_boundary_and_optimum_are_where_the_frames_say(finished: Sweep) -> None:
+    returns, _, costs, deployed = learning_curves.learning_curves(finished, "cpo").axes[:4]
+    for method in ("none", "linear", "dynamic"):
+        assert len(lines_of(returns, STYLES[method].colour)) == 1
+    boundary = lines_of(returns, "black")[0]
+    assert list(np.asarray(boundary.get_xdata())) == [15_200, 15_200]
+    assert lines_of(costs, LIMIT_COLOUR)[0].get_ydata() == [5.0, 5.0]
+    assert lines_of(returns, OPTIMUM_COLOUR)[0].get_ydata() == [14.0, 14.0]
+    assert deployed.get_xlim() == (15_200, 16_000)
+
+
+def test_the_limit_can_be_read_where_costs_start_high(finished: Sweep) -> None:
+    costs = learning_curves.learning_curves(finished, "cpo").axes[2]
+    assert costs.get_yscale() == "symlog"
+    assert 5.0 in costs.get_yticks()
+    assert -5.0 < costs.get_ylim()[0] < 0.0
+
+
+def test_low_costs_stay_on_a_linear_axis(finished: Sweep) -> None:
+    updates = finished.updates.assign(cost_0=finished.updates["cost_0"].clip(upper=20.0))
+    costs = learning_curves.learning_curves(dataclasses.replace(finished, updates=updates), "cpo").axes[2]
+    assert costs.get_yscale() == "linear"
+
+
+def test_two_costs_have_six_columns(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(seeds=1, num_costs=2, tasks=["a"], agents=["cpo"], methods=["none", "step"])
+    figure = learning_curves.learning_curves(sweep_data.load(store), "cpo")
+    assert [axes.get_title() for axes in figure.axes][4:] == ["episode cost 2", "cost 2 in deployment"]
+    assert len(learning_curves.curricula(sweep_data.load(store)).axes) == 2
+
+
+def test_curricula_show_every_run_and_the_mean(finished: Sweep) -> None:
+    figure = learning_curves.curricula(finished)
+    assert len(figure.axes) == 4
+    dynamic = lines_of(figure.axes[0], STYLES["dynamic"].colour)
+    assert len(dynamic) == 3 + 1 + 1  # runs, the student's own mean cost, the mean limit
+    assert max(line.get_linewidth() for line in dynamic) > 3 * min(line.get_linewidth() for line in dynamic)
+
+
+def test_a_students_task_that_has_not_run_has_an_empty_panel_of_limits(finished: Sweep) -> None:
+    missing = (finished.updates["task"] == "river-a") & (finished.updates["agent"] == "cpo")
+    rest = dataclasses.replace(finished, updates=finished.updates[~missing])
+    titles = [axes.get_title(loc="left") for axes in learning_curves.curricula(rest).axes]
+    assert [title for title in titles if "nothing run yet" in title] == ["cpo\nriver-a: nothing run yet"]
+
+
+def test_infinite_limits_are_marked(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none", "unconstrained"])
+    panel = learning_curves.curricula(sweep_data.load(store)).axes[0]
+    assert [text.get_text().strip() for text in panel.texts] == ["∞"]
+
+
+def test_a_running_sweep_says_how_many_seeds_have_arrived(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(
+        seeds=2, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 1"]
+    )
+    figure = learning_curves.learning_curves(sweep_data.load(store), "cpo")
+    assert figure.axes[0].get_ylabel() == "a\n1–2 seeds, 16k steps"
+
+
+def test_one_seed_before_deployment_can_be_drawn(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(
+        seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 0"]
+    )
+    sweep = sweep_data.load(store)
+    assert "not yet" in [
+        text.get_text() for text in learning_curves.learning_curves(sweep, "cpo").axes[1].texts
+    ]
+    assert len(learning_curves.curricula(sweep).axes) == 1
+
+
+def test_the_frontier_is_sampled_where_it_bends() -> None:
+    asked: list[float] = []
+
+    def optimum(limit: float) -> float:  # RiverGrid 1a: -20 + 5.9 d up to 5, then flat
+        asked.append(limit)
+        return min(-20.0 + 5.9 * limit, 9.5)
+
+    points = concave_frontier(optimum, 12.0, tolerance=0.05)
+    exact = [min(-20.0 + 5.9 * limit, 9.5) for limit in np.linspace(0.0, 12.0, 200)]
+    assert np.interp(np.linspace(0.0, 12.0, 200), *points.T) == pytest.approx(exact, abs=0.1 * 5.9)
+    assert len(asked) < 25
+
+
+def test_final_policies_lie_under_the_frontier_at_their_means(finished: Sweep) -> None:
+    figure = return_against_cost(finished)
+    assert figure is not None
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["river-a, ppo-lag", "river-a, cpo"]
+    frontier = np.asarray(lines_of(figure.axes[0], OPTIMUM_COLOUR)[0].get_xydata())
+    assert [5.0, 14.0] in frontier.tolist()
+    means = [np.asarray(marks.get_offsets()).tolist() for marks in figure.axes[0].collections[1::2]]
+    assert means[0] == [pytest.approx([(0.5 + 0.5 + 4.8) / 3, -22 / 3])]  # none
+    assert means[1] == [pytest.approx([4.8, 8.0])]
+
+
+def test_without_a_known_optimum_there_is_no_frontier(finished: Sweep) -> None:
+    trials = finished.trials.assign(optimal_return=np.nan)
+    assert return_against_cost(dataclasses.replace(finished, trials=trials)) is None
+
+
+def test_diagnostics_show_limit_cost_multiplier_and_noise(finished: Sweep) -> None:
+    figure = curriculum_diagnostics(finished, "river-a", "cpo")
+    assert len(figure.axes) == 3 * 3
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["none", "linear", "dynamic"]
+    assert [axes.get_ylabel() for axes in figure.axes[::3]] == ["cost", "multiplier", "KL divergence"]
+    dynamic = figure.axes[2]
+    assert len(lines_of(dynamic, LIMIT_COLOUR)) == 3
+    ticks = [line for line in dynamic.get_lines() if line.get_transform() == dynamic.get_xaxis_transform()]
+    at = {float(np.asarray(line.get_xdata())[0]) for line in ticks if line.get_color() != "black"}
+    assert at == {4_000.0, 8_000.0, 12_000.0}
+
+
+def test_diagnostics_mark_recovery_steps(finished: Sweep) -> None:
+    case = np.where(finished.updates["end_step"] == 800, 2.0, 1.0)
+    sweep = dataclasses.replace(finished, updates=finished.updates.assign(case=case))
+    panel = curriculum_diagnostics(sweep, "river-a", "cpo").axes[6]
+    assert [800.0, 800.0] in [list(np.asarray(line.get_xdata())) for line in panel.get_lines()]
+
+
+def test_known_methods_look_the_same_in_every_sweep() -> None:
+    few = styles.method_styles(["dynamic", "mine"])
+    many = styles.method_styles([*METHOD_ORDER, "mine", "another"])
+    assert few["dynamic"] == many["dynamic"]
+    assert list(many) == [*METHOD_ORDER, "another", "mine"]
+
+
+def test_methods_differ_without_colour() -> None:
+    looks = [*STYLES.values(), *styles.SPARE_STYLES]
+    assert len({(look.dashes, look.marker) for look in looks}) == len(looks)
+    assert len({look.colour for look in looks}) == len(looks)
+
+
+def test_drawing_again_gives_equal_bytes(panel: Sweep, tmp_path: Path) -> None:
+    first = styles.save(learning_curves.curricula(panel), tmp_path / "first", "curricula")
+    second = styles.save(learning_curves.curricula(panel), tmp_path / "second", "curricula")
+    assert [path.suffix for path in first] == [".pdf", ".png"]
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+
+
+def test_figures_have_print_size(panel: Sweep, tmp_path: Path) -> None:
+    path = styles.save_png(learning_curves.learning_curves(panel, "cpo"), tmp_path / "curves.png")
+    with Image.open(path) as image:
+        assert image.width == 7.0 * 200
+        assert image.info["dpi"] == pytest.approx((200, 200), abs=0.1)
+
+
+def test_the_users_matplotlib_is_left_alone_and_leaves_ours_alone(panel: Sweep, tmp_path: Path) -> None:
+    before = dict(mpl.rcParams)
+    usual = styles.save_png(learning_curves.curricula(panel), tmp_path / "usual.png").read_bytes()
+    assert dict(mpl.rcParams) == before
+    with mpl.rc_context({"axes.facecolor": "red", "font.size": 30.0}):
+        other = styles.save_png(learning_curves.curricula(panel), tmp_path / "other.png")
+    assert other.read_bytes() == usual

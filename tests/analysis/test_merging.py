@@ -1,0 +1,175 @@
+"""Parts of a sweep that ran in several places: joined, they are the sweep that ran in one."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from recrl.analysis import report
+from recrl.analysis.data import export, sweep_data
+from recrl.analysis.data.merging import merge
+from recrl.analysis.data.sweep_data import Sweep, TrialFacts
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.spec import TrialState
+from tests.conftest import MadeUpSweep
+
+SMALL: Mapping[str, object] = {"tasks": ("a",), "methods": ("none", "dynamic"), "seeds": 2, "updates": 20}
+TITLES = [f"a {agent} {method} seed {seed}" for agent in ("cpo", "ppo-lag") for method in ("dynamic", "none")
+          for seed in (0, 1)]  # fmt: skip
+
+Part = Callable[..., Sweep]
+
+
+@pytest.fixture
+def part(tmp_path: Path) -> Part:
+    """A function that writes a part of the sweep, with these fields changed, and reads it."""
+
+    def write(name: str = "part", **fields: object) -> Sweep:
+        return sweep_data.load(MadeUpSweep(**{**SMALL, **fields}).write(tmp_path, name))  # type: ignore[arg-type]
+
+    return write
+
+
+def without_rows(trials: Sequence[TrialFacts]) -> Sweep:
+    """A part whose trials have learnt nothing yet."""
+    none = pd.DataFrame()
+    return sweep_data.assemble(
+        "part", trials, phases=none, updates=none, evaluations=none, events=none, policies=none
+    )
+
+
+def assert_equal(one: Sweep, other: Sweep) -> None:
+    """The frames are equal but for what was timed while writing them."""
+    for name in ("trials", *sweep_data.ROWS):
+        left, right = (getattr(it, name).drop(columns="cpu_seconds", errors="ignore") for it in (one, other))
+        pd.testing.assert_frame_equal(left, right, check_exact=True)
+
+
+def test_two_halves_are_the_whole(part: Part) -> None:
+    halves = part("one", missing=TITLES[::2]), part("two", missing=TITLES[1::2])
+    assert [len(half.facts) for half in halves] == [4, 4]
+    merged, whole = merge(halves), part("whole")
+    assert_equal(merged, whole)
+    assert (merged.name, merged.notes) == ("one", ())
+    assert {trial.spec.title for trial in merged.facts} == set(TITLES)
+
+
+def test_one_part_is_itself(finished: Sweep) -> None:
+    merged = merge([finished])
+    assert_equal(merged, finished)
+    assert (merged.facts, merged.grid, merged.notes) == (finished.facts, finished.grid, finished.notes)
+
+
+def test_the_part_that_got_furthest_is_taken(part: Part) -> None:
+    whole = part("whole")
+    behind = part("behind", unfinished=TITLES[:3], failed=TITLES[3:4])
+    for parts in ([behind, whole], [whole, behind]):
+        merged = merge(parts)
+        assert_equal(merged, whole)
+        assert all(trial.status is TrialState.COMPLETE for trial in merged.facts)
+
+
+def test_trials_of_other_limits_stay_apart(part: Part) -> None:
+    merged = merge([part("loose", deploy_limit=5.0), part("tight", deploy_limit=4.0)])
+    assert len(merged.facts) == 2 * len(TITLES)
+    assert "2 groups of trials have these labels but different settings" in merged.notes[0]
+
+
+def test_parts_of_other_numbers_of_costs_join(part: Part) -> None:
+    merged = merge([part("two", tasks=("b",), num_costs=2), part("one")])
+    assert merged.num_costs == 2
+    assert merged.updates.loc[merged.updates["task"] == "a", "cost_1"].isna().all()
+    assert merged.updates.loc[merged.updates["task"] == "b", "cost_1"].notna().all()
+
+
+def test_a_trial_that_failed_before_its_first_step_is_further_than_one_that_waits(part: Part) -> None:
+    failed = part("failed")
+    facts = [
+        dataclasses.replace(it, status=TrialState.FAILED, error="no luck", env_steps=0) for it in failed.facts
+    ]
+    waiting = [dataclasses.replace(it, status=TrialState.WAITING, env_steps=0) for it in failed.facts]
+    merged = merge([without_rows(of) for of in (waiting, facts)])
+    assert {trial.error for trial in merged.facts} == {"no luck"}
+
+
+def test_figures_need_no_row_of_the_trials_with_most_costs(part: Part, tmp_path: Path) -> None:
+    unstarted = part("two", tasks=("b",), num_costs=2)
+    waiting = [dataclasses.replace(it, status=TrialState.WAITING, env_steps=0) for it in unstarted.facts]
+    merged = merge([part("one"), without_rows(waiting)])
+    assert merged.num_costs == 2
+    assert merged.updates["limit_1"].isna().all()
+    assert report.draw(merged, tmp_path / "figures")
+
+
+def test_notes_that_are_no_longer_true_are_left_out(part: Part) -> None:
+    parts = [part(f"limit-{limit}", deploy_limit=limit) for limit in (3.0, 4.0, 5.0)]
+    notes = merge([merge(parts[:2]), parts[2]]).notes
+    assert {note.split(": ")[1].split()[0] for note in notes} == {"3"}
+    assert len(notes) == 4  # one a student and method
+
+
+def test_parts_of_different_grids_are_named(part: Part) -> None:
+    one, two = (dataclasses.replace(part(name), grid=f"name: {name}") for name in ("one", "two"))
+    merged = merge([one, two])
+    assert merged.notes == ("the parts have different grid files; the first part's is kept",)
+    assert merged.grid == "name: one"
+    assert merge([dataclasses.replace(one, grid=""), two]).grid == "name: two"
+
+
+def test_a_folder_that_cannot_be_made_is_a_sentence(part: Part, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecrlError, match=r"all\.zip: its folder cannot be made \(File exists\)"):
+        export.save(part(), tmp_path / "file" / "all.zip")
+
+
+def test_trials_completed_alike_in_two_parts_need_no_note(part: Part) -> None:
+    assert merge([part("one"), part("two")]).notes == ()
+
+
+def test_trials_completed_in_two_parts_with_other_episodes_are_named(part: Part, tmp_path: Path) -> None:
+    one, two = part("one"), part("two", missing=TITLES[:2])
+    changed = two.phases.assign(episode_return=two.phases["episode_return"] + 0.001)
+    merged = merge([one, dataclasses.replace(two, phases=changed)])
+    assert merged.notes == (
+        "completed in several parts with different episodes, as machines or versions differ; the first "
+        "part's are taken: a cpo none seed 0, a cpo none seed 1, a ppo-lag dynamic seed 0 and 3 more",
+    )
+    assert_equal(merged, one)
+
+
+def test_the_command_writes_one_file(part: Part, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [tmp_path / "one.zip", tmp_path / "two.zip"]
+    export.save(part("one", missing=TITLES[4:], unfinished=TITLES[:1]), paths[0])
+    export.save(part("two", missing=TITLES[1:4]), paths[1])
+    to = tmp_path / "all.zip"
+    assert main(["merge", *map(str, paths), "--to", str(to)]) == ExitCode.OK
+    assert "all.zip: 8 trials, 8 of them complete, " in capsys.readouterr().out
+    assert_equal(export.load(to), merge([export.load(path) for path in paths]))
+    assert main(["figures", str(to), "--sketch"]) == ExitCode.OK
+
+
+def test_a_sweep_that_is_no_file_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["merge", "my-sweep", "--to", str(tmp_path / "all.zip")]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: my-sweep: merge joins files that export wrote (.zip): recrl-sweep export SWEEP\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["merge", "export"])
+@pytest.mark.parametrize("name", ["all", "folder.zip"])
+def test_what_is_written_is_a_zip_file(
+    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder.zip").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        main([command, "one.zip", "--to", str(tmp_path / name)])
+    assert ended.value.code == ExitCode.WRONG_INPUT
+    assert (
+        f"argument --to: must be a file that ends with .zip, got '{tmp_path / name}'"
+        in capsys.readouterr().err
+    )

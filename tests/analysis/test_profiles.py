@@ -1,0 +1,31 @@
+"""Performance profiles show the share of runs above each return."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.figures.profiles import performance_profiles
+from recrl.analysis.figures.styles import STYLES
+from recrl.analysis.statistics.metrics import Measure, outcomes
+
+
+def test_a_profile_falls_by_a_run_at_the_return_of_each_run(finished: Sweep) -> None:
+    figure = performance_profiles(finished, Measure.STOCHASTIC)
+    assert figure is not None
+    panel = figure.axes[0]
+    assert panel.get_title(loc="left") == "river-a, ppo-lag"
+    (line,) = (line for line in panel.get_lines() if line.get_color() == STYLES["none"].colour)
+    rows = outcomes(finished).query(
+        "task == 'river-a' and agent == 'ppo-lag' and method == 'none' and measure == 'stochastic'"
+    )
+    thresholds, shares = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+    returns = rows["episode_return"].to_numpy()
+    assert shares == pytest.approx([(returns > threshold).mean() for threshold in thresholds])
+    assert (shares[0], shares[-1]) == (1.0, 0.0)
+
+
+def test_without_a_complete_trial_there_is_no_profile(finished: Sweep) -> None:
+    trials = finished.trials.assign(status="running")
+    assert performance_profiles(dataclasses.replace(finished, trials=trials), Measure.STOCHASTIC) is None

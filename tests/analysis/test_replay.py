@@ -1,0 +1,110 @@
+"""A run's own teacher, asked again, says what it said; another one is asked the same questions."""
+
+from dataclasses import replace as changed
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits
+from recrl.analysis.statistics.curriculum_replay import progress_reports, replay, replay_summary
+from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.trial.trial import run_recorded
+
+SPEC = TrialSpec(
+    task=Choice("two-state", {"horizon": 10}),
+    agent=Choice("ppo-lag", {"hidden_sizes": [8], "policy_steps": 4, "critic_steps": 4}),
+    method=Choice("dynamic", {"window": 8, "start_fraction": 0.1}),
+    train_limits=CostLimits.unlimited(1),
+    deploy_limits=CostLimits((1.0,)),
+    train_steps=37 * 60 - 1,  # deployment begins within the last update
+    deploy_steps=120,
+    num_envs=4,
+    rollout_steps=15,  # not a multiple of the horizon: some updates see more episodes than others
+    evaluation_episodes=0,
+    seed=1,
+)
+
+
+def run(root: Path, spec: TrialSpec) -> TrialStore:
+    store = SweepStore(root, "sweep")
+    trial = store.trial(spec)
+    run_recorded(spec, trial, should_stop=lambda: False)
+    store.write_info({"name": store.name})
+    return trial
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
+    return run(tmp_path_factory.mktemp("runs"), SPEC)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [SPEC.method, Choice("linear"), Choice("exponential"), Choice("step"), Choice("unconstrained")],
+    ids=lambda method: method.name,
+)
+def test_a_runs_own_teacher_gives_its_own_limits(tmp_path: Path, method: Choice) -> None:
+    rows = replay(run(tmp_path, changed(SPEC, method=method)), method)
+    assert rows["replayed_limit_0"].tolist() == rows["limit_0"].tolist()
+    assert rows["replayed_noise"].tolist() == rows["noise"].tolist()
+    assert rows["phase"].tolist() == ["training"] * 37 + ["deployment"] * 2
+
+
+def test_every_episode_is_reported_once_with_the_update_it_ended_in(trial: TrialStore) -> None:
+    reports = list(progress_reports(trial, trial.updates()))
+    assert [episode.index for report in reports for episode in report.episodes] == list(
+        range(len(trial.episodes()))
+    )
+    for report in reports:
+        assert all(
+            report.env_steps - 60 < episode.end_step <= report.env_steps for episode in report.episodes
+        )
+
+
+def test_another_teacher_sets_its_limits_on_the_same_episodes(trial: TrialStore) -> None:
+    rows = replay(trial, Choice("none"))
+    assert (rows["replayed_limit_0"] == 1.0).all()
+    (line,) = replay_summary(trial, rows).to_dict("records")
+    assert (line["replayed"], line["replayed reaches d_d"]) == ("1.00", "3%")
+    assert line["other limit"] == str((rows["limit_0"].iloc[:37] != 1.0).sum())
+
+
+def test_a_run_without_updates_cannot_be_replayed(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep").trial(SPEC)
+    store.begin(SPEC)
+    with pytest.raises(RecrlError) as error:
+        replay(store, SPEC.method)
+    assert str(error.value) == (
+        "two-state ppo-lag dynamic seed 1: cannot be replayed, because it has no policy update yet"
+    )
+
+
+def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest.CaptureFixture[str]) -> None:
+    root = trial.folder.parent.parent.parent
+    SweepStore(root, "sweep").write_specs([trial.spec])
+    command = ["replay", "--root", str(root), "--teacher"]
+    assert main([*command, "dynamic", "--option", "window=4"]) == ExitCode.OK
+    assert "two-state ppo-lag dynamic seed 1" in capsys.readouterr().out
+    written = {path.name for path in (root / "sweep" / "replays").iterdir()}
+    assert written == {f"{trial.folder.name}__dynamic.csv", "dynamic.pdf", "dynamic.png"}
+    assert main([*command, "dynamik"]) == ExitCode.WRONG_INPUT
+    assert "did you mean 'dynamic'?" in capsys.readouterr().err
+    assert main([*command, "dynamic", "--option", "window=0"]) == ExitCode.WRONG_INPUT
+    assert "recrl-sweep: teacher dynamic: window: " in capsys.readouterr().err
+
+
+def test_the_figure_shows_what_was_and_what_would_have_been(trial: TrialStore) -> None:
+    rows = replay(trial, Choice("none"))
+    figure = replayed_limits([Replayed(SPEC, rows)], "none")
+    (axes,) = figure.axes
+    limits = [line for line in axes.get_lines() if line.get_drawstyle() == "steps-pre"]
+    recorded, replayed = (np.asarray(line.get_ydata(), dtype=float) for line in limits)
+    known = rows["limit_0"].iloc[:37]
+    assert recorded.tolist() == pytest.approx(known.where(np.isfinite(known)).tolist(), nan_ok=True)
+    assert replayed.tolist() == [1.0] * 37

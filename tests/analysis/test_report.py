@@ -1,0 +1,150 @@
+"""One call draws a sweep, as far as it has come."""
+
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from recrl.analysis import report
+from recrl.analysis.data import sweep_data
+from recrl.analysis.report import NothingToDrawError
+from recrl.orchestrator.files.store import SweepStore
+from tests.faults.committing import commit_file
+
+
+def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=2,
+        tasks=["river-a"],
+        agents=["my cpo"],
+        methods=["none", "linear"],
+        unfinished=["river-a my cpo linear seed 0"],
+        failed=["river-a my cpo linear seed 1"],
+    )
+    written = report.draw(sweep_data.load(store), tmp_path / "first")
+    assert [path.name for path in written] == [
+        "report.html",
+        "report.md",
+        "learning-curves_my-cpo.pdf",
+        "learning-curves_my-cpo.png",
+        "curricula.pdf",
+        "curricula.png",
+        "diagnostics_river-a_my-cpo.pdf",
+        "diagnostics_river-a_my-cpo.png",
+        "bounds_my-cpo.pdf",
+        "bounds_my-cpo.png",
+        "return-against-cost.pdf",
+        "return-against-cost.png",
+        "performance-profiles.pdf",
+        "performance-profiles.png",
+        "training.csv",
+        "bounds.csv",
+        "outcomes.csv",
+        "outcomes.parquet",
+        "summary.csv",
+        "comparisons.csv",
+        "outcomes.tex",
+    ]
+    text = written[1].read_text().splitlines()
+    assert text[2] == "4 trials: 1 running, 2 complete, 1 failed."
+    assert (
+        "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
+    )
+    assert "- river-a my cpo linear seed 0: still running, 50% of its steps done" in text
+    again = report.draw(sweep_data.load(store), tmp_path / "second")
+    assert [path.read_bytes() for path in written] == [path.read_bytes() for path in again]
+
+
+def test_before_any_trial_is_complete_there_are_curves_and_no_table(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 0"]
+    )
+    sweep = sweep_data.load(store)
+    names = [path.name for path in report.sketch(sweep, tmp_path)]
+    assert "curricula.png" in names
+    assert "outcomes.csv" not in names
+    assert "No trial is complete yet: no table." in (tmp_path / "report.md").read_text()
+    for stem in ("bounds_cpo", "return-against-cost", "performance-profiles"):
+        assert report.drawings(sweep)[stem]() is None
+
+
+def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=1, tasks=["a"], agents=["cpo"], methods=["none", "step"], unfinished=["a cpo step seed 0"]
+    )
+    sweep = sweep_data.load(store)
+    sketched = report.sketch(sweep, tmp_path / "sketch")
+    pictures = {path.name for path in sketched if path.suffix == ".png"}
+    assert pictures == {"learning-curves_cpo.png", "curricula.png"}
+    assert not any(path.suffix == ".pdf" for path in sketched)
+    tables = {path.name for path in sketched if path.suffix in (".csv", ".tex", ".parquet")}
+    assert tables == {path.name for path in report.write_tables(sweep, tmp_path / "tables")[0]}
+    assert f"- {report.UNFINISHED}" in sketched[1].read_text().splitlines()
+
+
+def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "empty")
+    with pytest.raises(NothingToDrawError) as caught:
+        report.draw(sweep_data.load(store), tmp_path / "figures")
+    assert str(caught.value) == (
+        "empty: nothing to draw yet, because none of its 0 trials has committed a policy update"
+    )
+    assert not (tmp_path / "figures").exists()
+
+
+class Strict(HTMLParser):
+    """Reads a page; every tag that is opened must be closed, in order.
+
+    Attributes:
+        outside: what the page would fetch.
+        text: what it shows.
+    """
+
+    EMPTY = ("meta", "link", "img")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.outside: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+        addresses = (value or "" for name, value in attrs if name in ("src", "href"))
+        self.outside += [address for address in addresses if not address.startswith("data:")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_holds_everything_and_fetches_nothing(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=1,
+        tasks=["<b>bold & wide"],
+        agents=["cpo"],
+        methods=["none", "linear"],
+        failed=["<b>bold & wide cpo linear seed 0"],
+    )
+    trial = store.trials()[0]
+    commit_file(trial, "provenance.json", '{"torch": "9.9"}')
+    store.write_specs([trial.spec], b"name: made-up  # <script>alert(1)</script>\n")
+    report.sketch(sweep_data.load(store), tmp_path / "figures")  # the page is made as by draw
+    reader = Strict()
+    reader.feed((tmp_path / "figures" / "report.html").read_text())
+    assert reader.open == []
+    assert all(address.startswith("#s") for address in reader.outside)
+    for sentence in ("<b>bold & wide", "<script>alert(1)</script>", '{"torch": "9.9"}', "Provenance"):
+        assert sentence in reader.text

@@ -1,0 +1,59 @@
+"""Tables say what the frames hold, in digits that people read."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from recrl.analysis import report_tables
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.metrics import Measure
+
+
+def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
+    table = report_tables.outcome_table(metrics.summary(metrics.outcomes(finished)), Measure.STOCHASTIC)
+    assert len(table) == 2 * 2 * 3
+    assert table.iloc[0].to_dict() == {
+        "task": "river-a",
+        "agent": "ppo-lag",
+        "method": "none",
+        "seeds": "3",
+        "return": "-7.33 ± 7.67",
+        "cost": "1.933 ± 1.433",
+        "limit of cost": "5.00",
+        "optimum": "14.00",
+        "gap": "21.33 ± 7.67",
+        "cost ≤ limit": "3 of 3 (44–100%)",
+        "within one s.e.": "3 of 3",
+        "at the optimum": "0 of 3 (0–56%)",
+    }
+
+
+def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
+    compared = metrics.comparisons(metrics.outcomes(finished), np.random.default_rng(0))
+    table = report_tables.comparison_table(compared, Measure.STOCHASTIC)
+    assert table["P(higher return)"].str.endswith("†").all()
+    assert table["return gained"].iloc[0].startswith("15.33 [-17.65, 48.32]")
+
+
+def test_markdown_and_latex_by_hand() -> None:
+    table = pd.DataFrame({"task": ["a_1", "b"], "share": ["1 of 2 (9–91%)", "±"]})
+    assert report_tables.markdown(table).splitlines()[2] == "| a_1 | 1 of 2 (9–91%) |"
+    assert report_tables.latex(table).splitlines() == [
+        r"\begin{tabular}{ll}",
+        r"\toprule",
+        r"task & share \\",
+        r"\midrule",
+        r"a\_1 & 1 of 2 (9--91\%) \\",
+        r"\midrule",
+        r"b & $\pm$ \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+
+
+def test_csv_keeps_every_digit(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"value": [0.1 + 0.2, 1e-17, 9.5]})
+    path = report_tables.write_csv(frame, tmp_path / "deep" / "frame.csv")
+    assert pd.read_csv(path)["value"].tolist() == frame["value"].tolist()

@@ -1,0 +1,47 @@
+"""Our worlds, put into recorded states, observe, earn and pay what was recorded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recrl.environments.safety_gym.parity import compare_recording
+from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+
+RECORDINGS = Path(__file__).parents[1] / "parity"
+
+
+@pytest.mark.parametrize("name", SAFETY_TASKS)
+def test_recorded_states_are_observed_rewarded_and_charged_alike(name: str) -> None:
+    comparisons = compare_recording(RECORDINGS / f"{name}.npz")
+    assert comparisons
+    for comparison in comparisons:
+        assert comparison.task == name
+        assert comparison.observation <= 1e-5
+        assert comparison.reward <= 1e-5
+        assert comparison.goals == 0
+        assert set(comparison.costs.values()) == {0}
+
+
+def test_every_cost_term_occurs_in_the_recordings() -> None:
+    occurred: dict[str, int] = {}
+    for name in ("CarGoal2", "CarButton2", "PointButton2", "CarPush2"):
+        for comparison in compare_recording(RECORDINGS / f"{name}.npz"):
+            for term, count in comparison.costly.items():
+                occurred[term] = occurred.get(term, 0) + count
+    seen = {term for term, count in occurred.items() if count}
+    assert seen >= {"hazards", "vases_contact", "vases_velocity", "buttons", "gremlins"}
+
+
+def test_a_recording_with_another_goal_is_told_apart(tmp_path: Path) -> None:
+    with np.load(RECORDINGS / "PointGoal0.npz") as recording:
+        arrays = {name: recording[name] for name in recording.files}
+    assert json.loads(str(arrays["meta"]))["task"] == "Goal0"
+    arrays["e00_goal_pos"] = arrays["e00_goal_pos"] + 0.001
+    np.savez(tmp_path / "moved.npz", **arrays)
+    (comparison,) = compare_recording(tmp_path / "moved.npz")
+    assert not comparison.equal
+    assert comparison.observation > 1e-5

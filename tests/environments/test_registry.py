@@ -1,0 +1,133 @@
+"""Finding tasks by name and validating their options."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
+from recrl.environments.plugins import UnknownNameError, load_attribute
+from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
+from recrl.environments.rivergrid.maps import MAPS, parse_map
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_everything_a_task_refers_to_exists_and_explains_itself(name: str) -> None:
+    task = TASKS[name]
+    assert task.summary.endswith(".")
+    for reference in (task.make, task.optimum):
+        assert reference is None or callable(load_attribute(str(reference)))
+    model = load_attribute(str(task.options))
+    assert issubclass(model, BaseModel)
+    assert model.model_config["frozen"]
+    assert model.model_config["extra"] == "forbid"
+    for field_name, field in model.model_fields.items():
+        assert (field.description or "").endswith("."), field_name
+
+
+def test_building_rivergrid_imports_nothing_slow() -> None:
+    program = (
+        "import sys; from recrl.environments.registry import make_vector; make_vector('rivergrid-1a', 1); "
+        "print(sorted({'scipy', 'minigrid', 'pygame', 'torch', 'mujoco'} & set(sys.modules)))"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ran.stdout == "[]\n"
+
+
+def test_an_unknown_task_is_named_with_its_nearest_known_one() -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"no task is called 'rivergrid-1c'; did you mean 'rivergrid-1"
+    ):
+        make_vector("rivergrid-1c", 1)
+
+
+def test_all_mistakes_in_options_are_reported_at_once() -> None:
+    with pytest.raises(ValidationError) as error:
+        task_options("rivergrid-1a", {"horizon": 0, "costs": ["river", "fire"], "hats": 3})
+    assert {mistake["loc"] for mistake in error.value.errors()} == {("horizon",), ("costs", 1), ("hats",)}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "rivergrid needs either map or generate"),
+        ({"map": MAPS["1a"], "generate": {"seed": 1}}, "rivergrid needs either map or generate"),
+        ({"map": "####\n#>.#\n####"}, "map: needs a goal 'G'"),
+        ({"map": "no/such/map.txt"}, "no/such/map.txt: cannot be read as a map"),
+        ({"generate": {"seed": 1, "river_share": 1.0}}, "must sum to at most 1"),
+        ({"map": MAPS["1a"], "costs": ["river", "river"]}, "must differ, got river, river"),
+    ],
+)
+def test_maps_that_cannot_be_used_are_found_when_options_are_checked(
+    options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValidationError, match=message):
+        task_options("rivergrid", options)
+
+
+def test_options_keep_the_drawing_of_a_map_file_not_its_path(tmp_path: Path) -> None:
+    path = tmp_path / "ford.txt"
+    path.write_text(MAPS["1b"])
+    options = task_options("rivergrid", {"map": str(path)}).model_dump(mode="json")
+    assert options["map"] == str(parse_map(MAPS["1b"]))
+    path.unlink()
+    assert task_options("rivergrid", options).model_dump(mode="json") == options
+
+
+def test_a_map_of_ones_own_has_its_exact_optimum_too() -> None:
+    # Two steps through one river tile, or five on dry ground.
+    drawing = "#####\n#>~G#\n#...#\n#####"
+    optima = [
+        optimal_return("rivergrid", {"map": drawing}, CostLimits((limit,))) for limit in (0.0, 0.5, 1.0)
+    ]
+    round_it, across = 10.0 - 0.1 * 6, 10.0 - 0.1
+    assert optima == pytest.approx([round_it, (round_it + across) / 2.0, across])
+
+
+def test_limits_that_nobody_can_keep_have_the_optimum_of_an_empty_set() -> None:
+    options = {"costs": ["river", "turns"]}
+    # Heading east, 1a is either turned in or walked into the water: no policy does neither.
+    assert optimal_return("rivergrid-1a", options, CostLimits((0.0, 0.0))) == -math.inf
+
+
+def test_a_task_whose_optimum_nobody_knows_says_none() -> None:
+    assert optimal_return("gymnasium", {"id": "CartPole-v1", "costless": True}, CostLimits((1.0,))) is None
+
+
+def test_a_users_callable_is_a_task_by_its_import_path() -> None:
+    path = "recrl.environments.rivergrid.minigrid_env:RiverGridEnv"
+    environment = make_vector(path, 3, options={"max_steps": 9, "costs": ["river", "turns"]})
+    assert isinstance(environment, SyncCMDPVectorEnv)
+    assert environment.cmdp.name == path
+    assert environment.cmdp.cost_names == ("river", "turns")
+    environment.reset(seed=0)
+    _, rewards, _, _, info = environment.step(np.array([0, 1, 2]))
+    assert rewards.tolist() == [-0.1] * 3
+    assert info["cost"].tolist() == [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0]]
+
+
+def test_a_users_task_is_found_by_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "goldrush.py").write_text(
+        "from recrl.environments.registry import TASKS\nRUSH = TASKS['two-state']\n"
+    )
+    distribution = tmp_path / "goldrush-1.0.dist-info"
+    distribution.mkdir()
+    (distribution / "METADATA").write_text("Metadata-Version: 2.1\nName: goldrush\nVersion: 1.0\n")
+    (distribution / "entry_points.txt").write_text("[recrl.tasks]\nrush = goldrush:RUSH\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert find_task("rush") is TASKS["two-state"]
+
+
+def test_what_is_neither_a_task_nor_callable_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"task 'math:pi' must be a Task or return an environment, got float"
+    ):
+        find_task("math:pi")

@@ -1,0 +1,242 @@
+"""RiverGrid: by hand, on MiniGrid, and the fast one equal to MiniGrid's step for step."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from minigrid.minigrid_env import MiniGridEnv
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.registry import make_vector, optimal_return
+from recrl.environments.rivergrid.grid_world import (
+    FORWARD,
+    LEFT,
+    RIGHT,
+    CostName,
+    RiverGridMapOptions,
+    RiverGridVectorEnv,
+    state_index,
+)
+from recrl.environments.rivergrid.maps import MAPS, MapGenerator, generate_map, parse_map
+from recrl.environments.rivergrid.minigrid_env import RiverGridEnv, render_frame
+
+IDENTIFIERS = [
+    "recrl.environments.registration:recrl/RiverGrid-1a-v0",
+    "recrl.environments.registration:recrl/RiverGrid-1b-v0",
+    "recrl.environments.registration:recrl/RiverGrid-v0",
+]
+
+
+def episode(name: str, actions: Sequence[int], **options: Any) -> tuple[list[float], list[list[float]], bool]:
+    """Rewards, costs and whether the last step terminated."""
+    environment = make_vector(name, 1, options=options)
+    environment.reset(seed=0)
+    steps = [environment.step(np.array([action])) for action in actions]
+    return (
+        [float(step[1][0]) for step in steps],
+        [step[4]["cost"][0].tolist() for step in steps],
+        bool(steps[-1][2][0]),
+    )
+
+
+def test_crossing_1a_earns_nine_and_a_half_at_a_cost_of_five() -> None:
+    rewards, costs, terminated = episode("rivergrid-1a", [FORWARD] * 6)
+    assert rewards == [-0.1] * 5 + [10.0]
+    assert costs == [[1.0]] * 5 + [[0.0]]
+    assert terminated
+    assert sum(rewards) == pytest.approx(9.5)
+
+
+def test_walking_round_1b_earns_nine_at_no_cost() -> None:
+    actions = [RIGHT, FORWARD, LEFT, *[FORWARD] * 6, LEFT, FORWARD]
+    rewards, costs, terminated = episode("rivergrid-1b", actions)
+    assert sum(rewards) == pytest.approx(9.0)
+    assert sum(cost for (cost,) in costs) == 0.0
+    assert terminated
+
+
+def test_turning_and_bumping_in_the_water_cost_too() -> None:
+    drawing = "####\n#>~#\n#.G#\n####"
+    _, costs, _ = episode("rivergrid", [FORWARD, FORWARD, RIGHT, LEFT, RIGHT, FORWARD], map=drawing)
+    assert costs == [[1.0], [1.0], [1.0], [1.0], [1.0], [0.0]]
+
+
+def test_turns_are_a_second_cost_in_the_order_asked_for() -> None:
+    _, costs, _ = episode("rivergrid-1a", [LEFT, RIGHT, FORWARD], costs=("turns", "river"))
+    assert costs == [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+
+
+def test_mud_is_a_cost_of_its_own_and_no_river() -> None:
+    drawing = "######\n#>%~G#\n######"
+    _, costs, terminated = episode(
+        "rivergrid", [FORWARD, RIGHT, LEFT, FORWARD, FORWARD], map=drawing, costs=("river", "mud")
+    )
+    assert costs == [[0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]
+    assert terminated
+
+
+def test_with_river_and_mud_limited_the_optimum_mixes_all_three_ways() -> None:
+    # Straight on: 3 steps, 2 in the river. North: 4 steps, 2 in the mud. South: 6 steps, dry.
+    way = "#G#####|#%#####|#%#####|#>~~G##|#.#####|#.#####|#.#####|#.#####|#G#####"
+    drawing = "\n".join(["#######", *way.split("|"), "#######"])
+    options = {"map": drawing, "horizon": 30, "costs": ["river", "mud"]}
+    assert optimal_return("rivergrid", options, CostLimits((0.0, 0.0))) == pytest.approx(9.5)
+    # Half straight on at 9.8, a quarter north at 9.7, a quarter south at 9.5.
+    assert optimal_return("rivergrid", options, CostLimits((1.0, 0.5))) == pytest.approx(9.7)
+
+
+def test_staying_is_truncated_after_two_hundred_steps_at_minus_twenty() -> None:
+    environment = make_vector("rivergrid-1a", 1)
+    environment.reset(seed=0)
+    steps = [environment.step(np.array([LEFT])) for _ in range(200)]
+    assert sum(float(step[1][0]) for step in steps) == pytest.approx(-20.0)
+    assert [bool(step[3][0]) for step in steps] == [False] * 199 + [True]
+
+
+def test_a_goal_reached_on_the_last_step_terminates_and_does_not_truncate() -> None:
+    environment = make_vector("rivergrid-1a", 1, options={"horizon": 6})
+    environment.reset(seed=0)
+    for _ in range(6):
+        _, _, terminated, truncated, _ = environment.step(np.array([FORWARD]))
+    assert terminated[0]
+    assert not truncated[0]
+
+
+def test_the_observation_is_one_hot_x_y_and_heading() -> None:
+    environment = make_vector("rivergrid", 1, options={"map": "####\n#.~#\n#.G#\n#^.#\n####"})
+    observation = environment.reset(seed=0)[0][0]
+    assert observation.tolist() == [*(0, 1, 0, 0), *(0, 0, 0, 1, 0), *(0, 0, 0, 1)]
+
+
+@pytest.mark.parametrize("costs", [("river",), ("mud", "turns", "river")])
+@pytest.mark.parametrize(
+    "drawing",
+    [
+        MAPS["1a"],
+        MAPS["1b"],
+        "######\n#.%~G#\n#>~%.#\n#.%~.#\n######",
+        *(str(generate_map(MapGenerator(seed=seed, width=7, height=6))) for seed in range(4)),
+    ],
+    ids=["1a", "1b", "mud", "random-0", "random-1", "random-2", "random-3"],
+)
+def test_the_fast_environment_equals_minigrids_step_for_step(
+    drawing: str, costs: tuple[CostName, ...]
+) -> None:
+    horizon = 40
+    slow = RiverGridEnv(drawing, max_steps=horizon, costs=costs)
+    options = RiverGridMapOptions(map=drawing, horizon=horizon, costs=costs)
+    fast = RiverGridVectorEnv("rivergrid", parse_map(drawing), options, num_envs=2)
+    generator = np.random.default_rng(0)
+    slow_observation, _ = slow.reset(seed=1)
+    fast_observations, _ = fast.reset(seed=1)
+    ends = {"terminated": 0, "truncated": 0}
+    for _ in range(2_500):
+        np.testing.assert_array_equal(fast_observations[0], slow_observation)
+        # Forward more often than not, so that goals are reached.
+        actions = generator.choice(3, size=2, p=[0.2, 0.2, 0.6])
+        slow_observation, reward, terminated, truncated, info = slow.step(int(actions[0]))
+        fast_observations, fast_rewards, fast_terminated, fast_truncated, fast_info = fast.step(actions)
+        assert fast_rewards[0] == reward
+        assert (fast_terminated[0], fast_truncated[0]) == (terminated, truncated)
+        np.testing.assert_array_equal(fast_info["cost"][0], info["cost"])
+        if terminated or truncated:
+            np.testing.assert_array_equal(fast_info["final_obs"][0], slow_observation)
+            slow_observation, _ = slow.reset()
+            ends["terminated" if terminated else "truncated"] += 1
+    assert sum(ends.values()) >= 50
+    assert ends["terminated"] > 0
+
+
+@pytest.mark.filterwarnings("ignore:The system font")  # MiniGrid's tests ignore it too
+@pytest.mark.parametrize("identifier", IDENTIFIERS)
+def test_the_minigrid_environment_passes_gymnasiums_checker(
+    identifier: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # the checker also opens a window
+    environment = gymnasium.make(identifier, disable_env_checker=True).unwrapped
+    assert isinstance(environment, MiniGridEnv)
+    check_env(environment)
+
+
+@pytest.mark.parametrize("identifier", IDENTIFIERS)
+def test_the_minigrid_environment_passes_minigrids_own_checks(identifier: str) -> None:
+    """MiniGrid's tests/test_envs.py: repeatable rollouts, spec as JSON, max_steps, pickling, old_run_test."""
+    spec = gymnasium.spec(identifier)
+    assert json.loads(spec.to_json())["id"] == identifier
+    first, second = spec.make(max_steps=50), spec.make(max_steps=50)
+    np.testing.assert_array_equal(first.reset(seed=0)[0], second.reset(seed=0)[0])
+    first.action_space.seed(0)
+    for _ in range(50):
+        action = first.action_space.sample()
+        one, other = first.step(action), second.step(action)
+        np.testing.assert_array_equal(one[0], other[0])
+        assert one[0] in first.observation_space
+        assert one[1:4] == other[1:4]
+        if one[2] or one[3]:
+            first.reset(seed=0)
+            second.reset(seed=0)
+    turning = spec.make(max_steps=7)
+    turning.reset()
+    assert [turning.step(LEFT)[3] for _ in range(7)] == [False] * 6 + [True]
+    copied = pickle.loads(pickle.dumps(spec.make()))  # noqa: S301
+    np.testing.assert_array_equal(copied.reset()[0], first.reset()[0])
+    raw = first.unwrapped
+    assert isinstance(raw, RiverGridEnv)
+    grids = []
+    for seed in (1337, 1337):
+        raw.reset(seed=seed)
+        grids.append(raw.grid)
+    assert grids[0] == grids[1]
+    assert 0 <= raw.agent_pos[0] < raw.width
+    assert raw.pprint_grid().count(">>") == 1  # type: ignore[no-untyped-call]
+    first.close()
+
+
+def test_an_action_that_minigrid_has_but_rivergrid_has_not_is_refused() -> None:
+    environment = RiverGridEnv()
+    environment.reset()
+    with pytest.raises(ValueError, match=r"RiverGrid: the action must be 0, 1 or 2, got 3"):
+        environment.step(3)
+
+
+def test_both_environments_draw_the_same_picture() -> None:
+    slow = RiverGridEnv(MAPS["1b"], render_mode="rgb_array")
+    fast = make_vector("rivergrid-1b", 2)
+    assert isinstance(fast, RiverGridVectorEnv)
+    slow.reset()
+    fast.reset(seed=0)
+    for action in (FORWARD, RIGHT):
+        slow.step(action)
+        fast.step(np.array([action, LEFT]))
+    frames = fast.render()
+    np.testing.assert_array_equal(frames[0], slow.render())  # type: ignore[no-untyped-call]
+    assert frames[0].shape == (9 * 32, 9 * 32, 3)
+    assert frames[0].dtype == np.uint8
+
+
+def test_a_picture_shows_walls_river_goal_and_agent_where_they_are() -> None:
+    frame = render_frame(parse_map("#####\n#>~G#\n#####"), (1, 1), 0, tile_pixels=16)
+    assert frame.shape == (48, 80, 3)
+    wall, agent, river, goal = (frame[y, x] for y, x in ((8, 8), (24, 24), (24, 40), (24, 56)))
+    assert len(set(wall.tolist())) == 1
+    assert agent.argmax() == 0
+    assert river.argmax() == 2
+    assert goal.argmax() == 1
+
+
+def test_states_are_numbered_by_column_row_and_heading() -> None:
+    river_map = parse_map(MAPS["1a"])
+    environment = make_vector("rivergrid-1a", 1)
+    assert isinstance(environment, RiverGridVectorEnv)
+    environment.reset(seed=0)
+    environment.step(np.array([LEFT]))
+    assert environment.states.tolist() == [state_index(river_map, 1, 4, 3)]
+    seen = environment.observations[environment.states[0]]
+    assert np.flatnonzero(seen).tolist() == [1, 9 + 4, 9 + 9 + 3]

@@ -1,0 +1,209 @@
+"""Generated instances: the same on every machine, of the kind asked for, and binding at their limits."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.registry import make_vector, optimal_return, task_options
+from recrl.environments.rivergrid import instances
+from recrl.environments.rivergrid.grid_world import RiverGridGeneratedOptions, RiverGridVectorEnv, task_map
+from recrl.environments.rivergrid.instances import (
+    LEAST_DETOUR,
+    InstanceSettings,
+    Route,
+    cheapest_route,
+    draw_instance,
+    is_instance,
+    quickest_route,
+    suggested_limit,
+)
+from recrl.environments.rivergrid.limits import grid_entry, main
+from recrl.environments.rivergrid.maps import DRY, MAPS, RIVER, MapError, parse_map
+from recrl.orchestrator.grid.grid import parse_grid, read_grid
+
+PAPERS = {name: parse_map(drawing) for name, drawing in MAPS.items()}
+
+
+def test_equal_seeds_give_these_maps_on_every_machine() -> None:
+    assert draw_instance(InstanceSettings(map_seed=0)) == parse_map(
+        """
+        #########
+        #.......#
+        #.~~#~..#
+        #.~~~~~.#
+        #.~~#~~.#
+        #.~~~~#.#
+        #.~~~~~.#
+        #G~~#~^.#
+        #########
+        """
+    )
+    assert draw_instance(InstanceSettings(map_seed=2)) == parse_map(
+        """
+        #########
+        #.~~~~~.#
+        #.~~~~~v#
+        #.~~~~..#
+        #.~~~...#
+        #G~~~.#.#
+        #..~~~..#
+        #..~~~.##
+        #########
+        """
+    )
+
+
+def test_routes_of_the_papers_maps_are_counted_by_hand() -> None:
+    assert quickest_route(PAPERS["1a"]) == cheapest_route(PAPERS["1a"]) == Route(steps=6, cost=5)
+    assert quickest_route(PAPERS["1b"]) == Route(steps=6, cost=5)
+    assert cheapest_route(PAPERS["1b"]) == Route(steps=11, cost=0)
+
+
+def test_a_turn_in_the_river_is_a_step_that_costs() -> None:
+    river_map = parse_map("#####\n#>~##\n##~G#\n#####")
+    # Forward, right, forward, left, forward: all but the last end in the water.
+    assert quickest_route(river_map) == cheapest_route(river_map) == Route(steps=5, cost=4)
+
+
+def test_of_equally_quick_ways_the_cheapest_counts_and_of_equally_cheap_ones_the_quickest() -> None:
+    # Round the wall either way: seven steps; two of them in the water above, one below.
+    assert quickest_route(parse_map("#####\n#..~#\n#>#G#\n#.~.#\n#####")) == Route(steps=7, cost=1)
+    # Straight on, or along the bottom and up: two steps in the water either way.
+    assert cheapest_route(parse_map("######\n#v~~G#\n#...~#\n######")) == Route(steps=4, cost=2)
+
+
+def test_the_papers_maps_are_instances_and_the_rule_gives_their_limits() -> None:
+    anything = InstanceSettings(map_seed=0)
+    assert is_instance(PAPERS["1a"], anything, dry_route=False)
+    assert is_instance(PAPERS["1b"], anything, dry_route=True)
+    assert suggested_limit(PAPERS["1a"]) == 5.0
+    assert suggested_limit(PAPERS["1b"]) == 1.0
+
+
+def test_a_map_on_which_the_river_does_not_matter_is_no_instance_and_has_no_limit() -> None:
+    river_map = parse_map("#####\n#>.G#\n#~~~#\n#####")
+    for dry_route in (True, False):
+        assert not is_instance(river_map, InstanceSettings(map_seed=0), dry_route=dry_route)
+    with pytest.raises(MapError, match="the quickest way leads through no river, so no limit makes a diff"):
+        suggested_limit(river_map)
+
+
+@settings(max_examples=25, deadline=None)  # a loaded machine is no failure
+@given(
+    map_seed=st.integers(0, 2**64),
+    width=st.integers(6, 12),
+    height=st.integers(6, 12),
+    dry_route=st.sampled_from([None, True, False]),
+)
+def test_instances_are_valid_repeatable_and_as_asked_for(
+    map_seed: int, width: int, height: int, dry_route: bool | None
+) -> None:
+    wanted = InstanceSettings(
+        map_seed=map_seed, width=width, height=height, river_width=(1, 2), dry_route=dry_route
+    )
+    river_map = draw_instance(wanted)
+    assert parse_map(str(river_map)) == river_map
+    assert draw_instance(wanted) == river_map
+    assert (river_map.width, river_map.height) == (width, height)
+    assert dry_route is None or river_map.has_dry_route == dry_route
+    dry, quickest = river_map.shortest_route(through=DRY), river_map.shortest_route(through=DRY + RIVER)
+    assert quickest is not None
+    assert dry is None or dry >= quickest + LEAST_DETOUR
+
+
+def test_other_seeds_give_other_maps_of_both_kinds() -> None:
+    drawn = {draw_instance(InstanceSettings(map_seed=seed)) for seed in range(20)}
+    assert len(drawn) == 20
+    assert {river_map.has_dry_route for river_map in drawn} == {True, False}
+
+
+@pytest.mark.parametrize("dry_route", [True, False])
+@pytest.mark.parametrize("map_seed", range(3))
+def test_the_limit_binds_at_the_exact_optimum(map_seed: int, dry_route: bool) -> None:
+    options = {"map_seed": map_seed, "dry_route": dry_route, "horizon": 40}
+    river_map = draw_instance(InstanceSettings(map_seed=map_seed, dry_route=dry_route))
+    quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
+    assert quickest is not None and cheapest is not None
+
+    def optimum(limit: float) -> float:
+        value = optimal_return("rivergrid-generated", options, CostLimits((limit,)))
+        assert value is not None
+        return value
+
+    limit = suggested_limit(river_map)
+    assert optimum(math.inf) == pytest.approx(10.0 - 0.1 * (quickest.steps - 1))
+    if dry_route:
+        assert optimum(0.0) == pytest.approx(10.0 - 0.1 * (cheapest.steps - 1))
+        assert optimum(0.0) <= optimum(math.inf) - 0.5 + 1e-9
+        mixture = 0.8 * optimum(0.0) + 0.2 * optimum(math.inf)  # a third way may be better
+        assert mixture - 1e-9 <= optimum(limit) < optimum(math.inf) - 1e-3
+    else:
+        assert optimum(limit) >= 10.0 - 0.1 * (cheapest.steps - 1) - 1e-9
+        assert optimum(limit - 1.0) < optimum(limit) - 1.0  # at times nothing but staying is left
+
+
+def test_a_trial_walks_on_the_map_that_its_options_name() -> None:
+    environment = make_vector("rivergrid-generated", 1, options={"map_seed": 4, "width": 11})
+    assert isinstance(environment, RiverGridVectorEnv)
+    assert environment.river_map == draw_instance(InstanceSettings(map_seed=4, width=11))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"river_width": [2, 6]}, "two widths from 1 to 5 in a map of 9 by 9, the least first, got 2 and 6"),
+        ({"river_width": [3, 2]}, "the least first, got 3 and 2"),
+        ({"wall_share": 0.6}, "less than or equal to 0.5"),
+    ],
+)
+def test_settings_that_give_no_instance_are_refused(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        task_options("rivergrid-generated", {"map_seed": 0, **wrong})
+
+
+def test_settings_that_hardly_ever_give_an_instance_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instances, "GENERATION_ATTEMPTS", 3)
+    with pytest.raises(MapError, match=r"no instance in 3 attempts met .*\"wall_share\":0\.5.*, change the"):
+        draw_instance(InstanceSettings(map_seed=0, width=20, wall_share=0.5))
+
+
+def test_what_the_command_prints_is_a_grids_task(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["river_limits", "0", "1", "--options", '{"horizon": 30}'])
+    main()
+    printed = capsys.readouterr().out
+    assert printed == "\n".join(grid_entry({"map_seed": seed, "horizon": 30}) for seed in (0, 1)) + "\n"
+    head = "name: generated\nagents: [ppo-lag]\nmethods: [none]\nseeds: 1\nrun: {total_steps: 4000}\ntasks:\n"
+    grid = parse_grid((head + printed).encode(), source="printed.yaml")
+    for seed, cell in enumerate(grid.tasks):
+        assert cell.task.label == f"map-{seed}"
+        river_map = draw_instance(InstanceSettings(map_seed=seed))
+        assert cell.deploy_limits == CostLimits((suggested_limit(river_map),))
+        assert all(f"  # {row}\n" in printed for row in river_map.rows)
+
+
+def test_the_command_names_a_wrong_option(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["river_limits", "0", "--options", '{"widht": 8}'])
+    with pytest.raises(SystemExit):
+        main()
+    assert "widht" in capsys.readouterr().err
+
+
+def test_the_committed_grid_has_the_first_six_maps_under_the_limits_of_the_rule() -> None:
+    path = Path(__file__).parents[2] / "results" / "rivergrid" / "generated.yaml"
+    grid = read_grid(path)
+    assert [cell.task.options["map_seed"] for cell in grid.tasks] == list(range(6))
+    for cell in grid.tasks:
+        river_map = task_map(cell.task.name, RiverGridGeneratedOptions.model_validate(cell.task.options))
+        assert cell.deploy_limits == CostLimits((suggested_limit(river_map),))
+        assert "\n".join(f"  # {row}" for row in river_map.rows) in grid.text.decode()

@@ -1,0 +1,267 @@
+"""Batches of simulations: equal to MuJoCo's own loop, and restored to the last bit, sleepers too."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+import pytest
+from numba.core import types
+
+from recrl.environments.cmdp import Floats
+from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.scene import make_scene
+from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.simulation.machine_code import array_at, compiled_for_batch
+from recrl.environments.simulation.mujoco_batch import PhysicsError, Simulations
+
+SCENE = make_scene(SAFETY_TASKS["CarGoal2"])
+NUMBER = 2
+COORDINATES = mujoco.mjtState.mjSTATE_QPOS
+CONTROL = mujoco.mjtState.mjSTATE_CTRL
+MANY = 12
+MESSAGE = np.frombuffer(b"no more of this\0", np.uint8)
+FAILS = 5
+numbers_at = array_at(np.int64)
+mju_error = types.ExternalFunction("mju_error", types.void(types.int64))
+
+
+@compiled_for_batch
+def count(_model: int, _data: int, index: int, argument: int) -> None:
+    numbers_at(argument, MANY)[index] += 1
+
+
+@compiled_for_batch
+def fail(_model: int, _data: int, index: int, argument: int) -> None:
+    numbers = numbers_at(argument, MANY + 1)
+    numbers[index] += 1
+    if index == FAILS:
+        mju_error(numbers[MANY])
+
+
+def counters() -> npt.NDArray[np.int64]:
+    """What ``count`` and ``fail`` count, [MANY], and the address of an error message."""
+    return np.array([0] * MANY + [MESSAGE.ctypes.data])
+
+
+def many(num_threads: int) -> Simulations:
+    return Simulations(make_scene(SAFETY_TASKS["PointGoal0"]).model, MANY, num_threads=num_threads)
+
+
+def crowd(*, num_threads: int = 1) -> Simulations:
+    """Cars with vases: four around them, the others far away."""
+    simulations = Simulations(SCENE.model, NUMBER, num_threads=num_threads)
+    everyone = list(range(NUMBER))
+    simulations.reset(everyone)
+    qpos = simulations.state(COORDINATES, (SCENE.model.nq,))
+    for index, address in enumerate(SCENE.vase_qpos):
+        near = 0.4 * (index % 2) - 0.2, 0.4 * (index // 2) - 0.2 + np.sign(index // 2 - 0.5) * 0.2
+        qpos[:, address : address + 2] = near if index < 4 else (0.3 * index, 1.5)
+    simulations.forward(everyone)
+    return simulations
+
+
+def controls(steps: int) -> Floats:
+    """Random, held for 20 steps, so that the cars get somewhere."""
+    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (steps // 20 + 1, NUMBER, 2))
+    return np.repeat(drawn, 20, axis=0)[:steps]
+
+
+def run(simulations: Simulations, chosen: Floats) -> list[bytes]:
+    control = simulations.state(CONTROL, (2,))
+    robot = slice(0, SCENE.robot_qvel)
+    past = []
+    for number, step in enumerate(chosen):
+        control[...] = step
+        simulations.step(10)
+        past.append(simulations.rows.tobytes())
+        if number % 20 == 19:
+            datas = [simulations.data(index) for index in range(NUMBER)]
+            past += [data.tree_awake.tobytes() + data.qacc[robot].tobytes() for data in datas]
+    return past
+
+
+def test_a_batch_moves_as_mujoco_alone_does() -> None:
+    simulations, chosen = crowd(), controls(100)
+    start = simulations.state(COORDINATES, (SCENE.model.nq,))[1].copy()
+    run(simulations, chosen)
+    data = mujoco.MjData(SCENE.model)
+    data.qpos[:] = start
+    mujoco.mj_forward(SCENE.model, data)
+    for step in chosen[:, 1]:
+        data.ctrl[:] = step
+        mujoco.mj_step(SCENE.model, data, 10)
+        mujoco.mj_forward(SCENE.model, data)
+    np.testing.assert_allclose(
+        simulations.state(COORDINATES, (SCENE.model.nq,))[1], data.qpos, rtol=0.0, atol=1e-9
+    )
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    chosen = controls(60)
+    assert run(crowd(num_threads=1), chosen) == run(crowd(num_threads=3), chosen)
+
+
+def test_restored_simulations_with_sleeping_bodies_continue_to_the_last_bit() -> None:
+    chosen, simulations = controls(3000), crowd()
+    run(simulations, chosen[:1500])
+    for start in range(1500, 2000, 100):
+        saved = simulations.save()
+        assert (saved["asleep"] >= 0).any()
+        restored = Simulations(SCENE.model, NUMBER, num_threads=2)
+        restored.load(saved)
+        assert restored.rows.tobytes() == simulations.rows.tobytes()
+        ahead = chosen[start : start + 100]
+        assert run(restored, ahead) == run(simulations, ahead)
+    assert run(restored, chosen[2000:]) == run(simulations, chosen[2000:])
+
+
+def test_saving_changes_nothing() -> None:
+    chosen = controls(400)
+    undisturbed, saved = crowd(), crowd()
+    first = run(saved, chosen[:200])
+    snapshot = saved.save()
+    assert first + run(saved, chosen[200:]) == run(undisturbed, chosen)
+    restored = Simulations(SCENE.model, NUMBER)
+    restored.load(snapshot)
+    assert first + run(restored, chosen[200:]) == run(crowd(), chosen)
+
+
+def test_simulations_stepped_in_parts_move_as_those_stepped_together() -> None:
+    together, apart = crowd(), crowd()
+    for chosen in controls(50):
+        for simulations in (together, apart):
+            simulations.state(CONTROL, (2,))[...] = chosen
+        together.step(10)
+        apart.step(10, [1])
+        apart.step(10, [0])
+    assert together.rows.tobytes() == apart.rows.tobytes()
+
+
+def test_a_state_of_another_batch_is_refused() -> None:
+    saved = crowd().save()
+    with pytest.raises(ValueError, match=r"saved physics must have shape \(3, 389\), got \(2, 389\)"):
+        Simulations(SCENE.model, 3).load(saved)
+
+
+def test_a_diverged_simulation_is_reported_until_it_is_reset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
+    simulations = crowd()
+    simulations.state(COORDINATES, (SCENE.model.nq,))[1, 0] = np.nan
+    simulations.step(10)
+    assert simulations.broken().tolist() == [False, True]
+    simulations.reset([1])
+    simulations.forward([1])
+    assert not simulations.broken().any()
+
+
+def test_a_model_that_cannot_be_batched_is_reported() -> None:
+    with pytest.raises((PhysicsError, ValueError)):
+        Simulations(SCENE.model, 0)
+
+
+@pytest.mark.parametrize("num_threads", [1, 2, 5, 20])
+def test_every_simulation_chosen_is_worked_on_once(num_threads: int) -> None:
+    simulations, numbers = many(num_threads), counters()
+    simulations.apply(count, numbers.ctypes.data)
+    simulations.apply(count, numbers.ctypes.data, [7, 2, 11])
+    simulations.apply(count, numbers.ctypes.data, [])
+    assert numbers[:MANY].tolist() == [2 if index in (2, 7, 11) else 1 for index in range(MANY)]
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_an_error_of_mujoco_stops_one_simulation_alone(
+    num_threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its errors to a file where it runs
+    broken, numbers = many(num_threads), counters()
+    before = broken.rows.copy()
+    broken.apply(fail, numbers.ctypes.data)
+    others = np.arange(MANY) != FAILS
+    assert numbers[:MANY].tolist() == [1] * MANY
+    assert broken.any_stopped
+    assert np.array_equal(broken.stopped, ~others)
+    assert np.array_equal(broken.broken(), ~others)
+    assert np.array_equal(broken.rows, before)
+    broken.apply(count, numbers.ctypes.data, [2, 3])
+    assert np.array_equal(broken.stopped, ~others), "until it is reset"
+    broken.reset([FAILS])
+    assert not broken.any_stopped
+    broken.apply(count, numbers.ctypes.data)
+    assert not broken.stopped.any()
+
+
+def test_a_failure_in_an_interrupted_call_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    broken, numbers = many(2), counters()
+    run = broken._run
+
+    def interrupted(*arguments: Any) -> None:
+        run(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(broken, "_run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        broken.apply(fail, numbers.ctypes.data)
+    assert np.flatnonzero(broken.broken()).tolist() == [FAILS]
+    assert broken.any_stopped
+
+
+@pytest.mark.parametrize("ids", [[3, 3, 4], [-1], [MANY], [True] * MANY, [0.5]])
+def test_simulations_that_are_not_there_or_named_twice_are_refused(ids: list[Any]) -> None:
+    with pytest.raises(ValueError, match=r"must be different whole numbers from 0 to 11, got \["):
+        many(2).apply(count, counters().ctypes.data, ids)
+
+
+def _states(num_threads: int) -> bytes:
+    environment = SafetyGymVectorEnv("CarPush2", 6, num_threads=num_threads)
+    environment.reset(seed=3)
+    for actions in np.random.default_rng(0).uniform(-1.0, 1.0, (40, 6, 2)):
+        environment.step(actions)
+    return environment.worlds.simulations.rows.tobytes()
+
+
+@pytest.mark.parametrize("num_threads", [2, 3, 8])
+def test_threads_change_no_bit(num_threads: int) -> None:
+    assert _states(num_threads) == _states(1)
+
+
+def test_a_view_outlives_its_simulations() -> None:
+    rows, expected = many(2).rows, many(1).rows.copy()
+    assert np.array_equal(rows, expected)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+@pytest.mark.parametrize(("num_threads", "exit_code"), [(1, 1), (2, 42)])
+def test_a_fork_uses_simulations_of_one_thread_and_is_told_to_make_others_anew(
+    num_threads: int, exit_code: int
+) -> None:
+    simulations = many(num_threads)
+    simulations.apply(count, counters().ctypes.data)
+    child = multiprocessing.get_context("fork").Process(target=_count_and_exit, args=(simulations,))
+    child.start()
+    del simulations
+    child.join(60.0)
+    assert child.exitcode == exit_code
+
+
+def _count_and_exit(simulations: Simulations) -> None:
+    numbers = counters()
+    try:
+        simulations.apply(count, numbers.ctypes.data)
+    except PhysicsError as error:
+        assert str(error) == (
+            "simulations with num_threads = 2 stay in the process that made them, and this is a fork of it: "
+            "make them anew here, or with num_threads = 1"
+        )
+        del simulations
+        os._exit(42)
+    os._exit(int(numbers[:MANY].min()))

@@ -1,0 +1,233 @@
+"""Scalar Gymnasium environments as a batch: nothing of an episode's last step is lost."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
+from recrl.environments.registry import make_vector, task_options
+
+
+class Countdown(gymnasium.Env[Any, Any]):
+    """Ends after ``steps`` steps; step t costs t (and its double); observes t and the last action."""
+
+    cost_names: ClassVar = ("time", "double")
+
+    def __init__(self, steps: int = 3, *, terminates: bool = True) -> None:
+        self.observation_space = spaces.Dict(
+            {"action": spaces.Discrete(3), "time": spaces.Box(0.0, 100.0, (1,), np.float64)}
+        )
+        self.action_space = spaces.Discrete(3)
+        self.steps, self.terminates, self.time, self.action = steps, terminates, 0, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.time, self.action = 0, 0
+        return self.observe(), {"cost": -1.0}  # a trap: the reset's info is not a step's
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.time, self.action = self.time + 1, int(action)
+        ended = self.time >= self.steps
+        info = {"cost": [self.time, 2 * self.time]}
+        return self.observe(), 1.0, ended and self.terminates, ended, info
+
+    def observe(self) -> Any:
+        return {"action": self.action, "time": np.array([self.time], np.float64)}
+
+
+class Forgetful(Countdown):
+    """Its episodes depend on more than their seed: on how many there were."""
+
+    episodes = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.episodes += 1
+        self.time = self.episodes
+        return self.observe(), {}
+
+
+class Steered(gymnasium.Env[Any, Any]):
+    """Observes the action that reached it."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-9.0, 9.0, (2,), np.float32)
+        self.action_space = spaces.Box(np.array([-1.0, 0.0]), np.array([1.0, 2.0]), dtype=np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return action.astype(np.float32), 0.0, False, False, {"cost": 0.5}
+
+
+def test_the_cost_and_observation_of_the_last_step_are_kept() -> None:
+    environment = SyncCMDPVectorEnv("countdown", [lambda: Countdown(2), lambda: Countdown(3)])
+    first, _ = environment.reset(seed=0)
+    assert first.tolist() == [[1, 0, 0, 0], [1, 0, 0, 0]]  # one-hot action, time
+    environment.step(np.array([1, 1]))
+    observations, rewards, terminated, truncated, info = environment.step(np.array([2, 1]))
+    assert info["cost"].tolist() == [[2.0, 4.0], [2.0, 4.0]]
+    assert rewards.tolist() == [1.0, 1.0]
+    assert terminated.tolist() == [True, False]
+    assert truncated.tolist() == [False, False]
+    assert info["final_obs"][0].tolist() == [0, 0, 1, 2]
+    assert observations.tolist() == [[1, 0, 0, 0], [0, 1, 0, 2]]
+
+
+def test_gymnasiums_own_batch_would_lose_that_cost() -> None:
+    theirs = SyncVectorEnv([lambda: Countdown(1)], autoreset_mode=AutoresetMode.SAME_STEP)
+    theirs.reset(seed=0)
+    assert theirs.step(np.array([0]))[4]["cost"].tolist() == [-1.0]
+    ours = SyncCMDPVectorEnv("countdown", [lambda: Countdown(1)])
+    ours.reset(seed=0)
+    assert ours.step(np.array([0]))[4]["cost"].tolist() == [[1.0, 2.0]]
+
+
+def test_a_step_that_terminates_at_the_time_limit_is_not_truncated() -> None:
+    for terminates in (True, False):
+        environment = SyncCMDPVectorEnv("countdown", [partial(Countdown, 1, terminates=terminates)])
+        environment.reset(seed=0)
+        _, _, terminated, truncated, _ = environment.step(np.array([0]))
+        assert (terminated[0], truncated[0]) == (terminates, not terminates)
+
+
+def test_cost_names_are_the_environments_unless_given() -> None:
+    assert SyncCMDPVectorEnv("countdown", [Countdown]).cmdp.cost_names == ("time", "double")
+    assert SyncCMDPVectorEnv("countdown", [Countdown], cost_names=("a", "b")).cmdp.cost_names == ("a", "b")
+    assert SyncCMDPVectorEnv("steered", [Steered]).cmdp.cost_names == ("cost",)
+
+
+def test_an_environment_that_reports_no_cost_is_refused_unless_told() -> None:
+    silent = make_vector("gymnasium", 1, options={"id": "CartPole-v1"})
+    silent.reset(seed=0)
+    with pytest.raises(
+        ValueError, match=r"gymnasium: the environment must report info\['cost'\] at every step"
+    ):
+        silent.step(np.array([0]))
+    costless = make_vector("gymnasium", 1, options={"id": "CartPole-v1", "costless": True})
+    costless.reset(seed=0)
+    assert costless.step(np.array([0]))[4]["cost"].tolist() == [[0.0]]
+    assert costless.cmdp.horizon == 500
+
+
+def test_another_number_of_costs_than_named_is_refused() -> None:
+    environment = SyncCMDPVectorEnv("countdown", [Countdown], cost_names=("time",))
+    environment.reset(seed=0)
+    with pytest.raises(
+        ValueError, match=r"info\['cost'\] must be a finite number for each of time, got \[1, 2\]"
+    ):
+        environment.step(np.array([0]))
+
+
+def test_continuous_actions_reach_the_environment_within_its_bounds() -> None:
+    environment = SyncCMDPVectorEnv("steered", [Steered] * 2)
+    environment.reset(seed=0)
+    observations, *_ = environment.step(np.array([[-5.0, 1.5], [0.5, 5.0]], np.float32))
+    assert observations.tolist() == [[-1.0, 1.5], [0.5, 2.0]]
+
+
+def test_an_environment_with_hidden_state_is_not_resumed_silently() -> None:
+    environment = SyncCMDPVectorEnv("forgetful", [lambda: Forgetful(5)])
+    environment.reset(seed=0)
+    for _ in range(7):
+        environment.step(np.array([1]))
+    with pytest.raises(
+        ValueError, match=r"forgetful: cannot be resumed, because replaying the episode of envi"
+    ):
+        SyncCMDPVectorEnv("forgetful", [lambda: Forgetful(5)]).load_state_dict(environment.state_dict())
+
+
+def test_environments_of_a_batch_do_not_repeat_each_other_nor_the_next_seeds() -> None:
+    first_observations = set()
+    for seed in range(5):
+        environment = make_vector("gymnasium", 4, options={"id": "CartPole-v1", "costless": True})
+        first_observations |= {row.tobytes() for row in environment.reset(seed=seed)[0]}
+    assert len(first_observations) == 20  # Gymnasium's seed + i would repeat 12 of them
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.MultiDiscrete([2, 2]), spaces.Discrete(2, start=1), spaces.Box(0.0, 1.0, (2, 2))]
+)
+def test_action_spaces_that_no_student_handles_are_refused(space: spaces.Space[Any]) -> None:
+    def build() -> Countdown:
+        environment = Countdown()
+        environment.action_space = space
+        return environment
+
+    with pytest.raises(
+        ValueError, match="countdown: actions must be Discrete from 0 or a Box of one dimension"
+    ):
+        SyncCMDPVectorEnv("countdown", [build])
+
+
+def test_an_unknown_gymnasium_id_is_found_when_options_are_checked() -> None:
+    with pytest.raises(ValueError, match="CartPoole"):
+        task_options("gymnasium", {"id": "CartPoole-v1"})
+
+
+@pytest.mark.parametrize(
+    "identifier",
+    ["recrl.environments.registration:recrl/CarGoal2-v0", "gymnasium.envs:CartPole-v1"],
+)
+def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
+    costless = "CartPole" in identifier
+    options = {"id": identifier, "costless": costless}
+    assert task_options("gymnasium", options).model_dump()["id"] == identifier
+    environments = make_vector("gymnasium", 2, options=options)
+    observations, _ = environments.reset(seed=0)
+    assert observations.shape == environments.observation_space.shape
+    assert environments.step(np.stack([environments.single_action_space.sample()] * 2))[4]["cost"].shape == (
+        2,
+        1,
+    )
+    environments.close()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        (
+            "observation",
+            np.array([np.nan]),
+            "wrong: an observation must be finite, got ndarray of shape ",
+        ),
+        ("observation", np.zeros(2), "wrong: an observation must lie in Box("),
+        ("observation", None, "wrong: an observation must lie in Box("),
+        ("reward", np.inf, "wrong: a reward must be finite, got inf"),
+        ("reward", None, "wrong: a reward must be a number, got None"),
+        ("cost", -1.0, "wrong: info['cost'] must be at least 0, got -1.0"),
+        ("cost", "x", "wrong: info['cost'] must be a finite number for each of cost, got x"),
+    ],
+)
+def test_what_an_environment_returns_is_looked_at(field: str, value: Any, sentence: str) -> None:
+    returned: dict[str, Any] = {"observation": np.zeros(1), "reward": 0.0, "cost": 0.0, field: value}
+
+    class Wrong(gymnasium.Env[Any, Any]):
+        observation_space = spaces.Box(-1.0, 1.0, (1,))
+        action_space = spaces.Discrete(2)
+
+        def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+            return np.zeros(1), {}
+
+        def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+            info = {"cost": returned["cost"]}
+            return returned["observation"], returned["reward"], False, False, info
+
+    environments = SyncCMDPVectorEnv("wrong", [Wrong])
+    environments.reset(seed=0)
+    with pytest.raises(ValueError) as caught:
+        environments.step(np.array([0]))
+    assert str(caught.value).startswith(sentence)
+
+
+def test_a_factory_that_makes_no_environment_is_named() -> None:
+    with pytest.raises(ValueError, match=r"^os:getpid must return a Gymnasium environment, got int 3$"):
+        SyncCMDPVectorEnv("os:getpid", [lambda: 3])  # type: ignore[list-item, return-value]

@@ -1,0 +1,418 @@
+"""The command line: quick to start, honest in its exit codes, and its errors are sentences."""
+
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from recrl.analysis.figures import learning_curves
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.spec import TrialState
+
+GRID = """\
+name: small
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [ppo-lag]
+methods: [none, linear]
+seeds: 1
+run: {total_steps: 160, deploy_fraction: 0.5, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
+"""
+UNLUCKY_STUDENT = """\
+from recrl.agents.algorithm_configs import PPOLagConfig
+from recrl.agents.registry import AgentEntry
+
+def make(cmdp, config, seed):
+    raise ArithmeticError("no luck")
+
+ENTRY = AgentEntry("An unlucky student.", PPOLagConfig, make)
+"""
+INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory that holds ``grid.yaml``."""
+    (tmp_path / "grid.yaml").write_text(GRID)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def _python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["launch", "--help"], ["validate", "grid.yaml"]])
+def test_help_and_validate_import_nothing_heavy(folder: Path, arguments: list[str]) -> None:
+    code = f"""
+import sys
+from recrl.orchestrator.cli.main import main
+try:
+    code = main({arguments!r})
+except SystemExit as end:
+    code = end.code
+heavy = {{"torch", "ray", "mlflow", "matplotlib"}} & set(sys.modules)
+assert not heavy, heavy
+sys.exit(code)
+"""
+    done = _python(code, folder)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_help_imports_nothing_but_the_parser(folder: Path) -> None:
+    code = """
+import sys
+from recrl.orchestrator.cli.main import parser
+parser().format_help()
+assert not {"numpy", "pandas", "pydantic", "gymnasium", "rich", "yaml"} & set(sys.modules)
+"""
+    done = _python(code, folder)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_help_names_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--help"])
+    assert end.value.code == 0
+    epilog = capsys.readouterr().out.partition("Exit codes:")[2]
+    assert [int(line.split()[0]) for line in epilog.splitlines() if line.strip()] == [*ExitCode]
+
+
+def test_a_right_grid_is_confirmed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", "grid.yaml"]) == ExitCode.OK
+    assert capsys.readouterr().out == (
+        "grid.yaml: small is right: 2 trials, from tasks x agents x methods x seeds = 1 x 1 x 2 x 1\n"
+    )
+
+
+@pytest.mark.parametrize("command", [["validate"], ["plan"], ["launch", *INLINE]])
+def test_a_wrong_grid_starts_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("linear", "linea").replace("seeds: 1", "seeds: 0"))
+    assert main([*command, "grid.yaml"]) == ExitCode.WRONG_INPUT
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    first, second, last = shown.err.splitlines()
+    assert first.startswith("grid.yaml:4: methods.1: no teacher is called 'linea'; did you mean 'linear'?")
+    assert second == "grid.yaml:5: seeds: must be a number of seeds from 1 to 10000, or a list, got 0"
+    assert last == "2 mistakes in grid.yaml; nothing was started"
+    assert not (folder / "runs").exists()
+
+
+def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Plan, launch, plan again, status, figures: what a first user does."""
+    assert main(["plan", "grid.yaml", "--check"]) == ExitCode.TRIALS_LEFT
+    out = capsys.readouterr().out
+    assert "small: 2 trials: 2 new" in out
+    assert " at once on this machine, " in out
+    assert main(["plan", "grid.yaml", "--cores", "64"]) == ExitCode.OK
+    assert "; 2 trials at once on 64 cores, about " in capsys.readouterr().out
+    assert not (folder / "runs").exists()
+
+    assert main(["launch", "grid.yaml", "--executor", "inline", "--no-mlflow"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert "Results    runs/small\n" in out
+    assert "Figures    runs/small/figures\n" in out
+    assert "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n" in out
+    assert any((folder / "runs/small/figures").glob("*.png"))
+
+    assert main(["plan", "grid.yaml", "--check"]) == ExitCode.OK
+    assert "small: 2 trials: 2 complete\nnothing to do\n" in capsys.readouterr().out
+
+    for sweep in ([], ["small"], ["grid.yaml"]):
+        assert main(["status", "--brief", *sweep]) == ExitCode.OK
+        assert capsys.readouterr().out == "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
+
+    assert main(["figures", "small", "--sketch"]) == ExitCode.OK
+
+
+def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mistaken(*_: object, **__: object) -> None:
+        raise KeyError("river")
+
+    monkeypatch.setattr(learning_curves, "curricula", mistaken)
+    assert main(["launch", "grid.yaml", *INLINE[:-1]]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert (
+        "Figures    not all are drawn (KeyError: 'river'), by a mistake in recrl\n"
+        "           for its traceback: recrl-sweep figures small\n"
+        "Results    runs/small\n"
+        "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
+    ) in out
+    with pytest.raises(KeyError, match="river"):
+        main(["figures", "small"])
+
+
+def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=linear", "seed=0"]) == ExitCode.OK
+    assert "small: 1 of 1 complete" in capsys.readouterr().out
+    assert main(["status", "--brief"]) == ExitCode.OK
+    assert "small: 1 of 2 complete, 0 running, 1 waiting" in capsys.readouterr().out
+
+
+def test_failed_trials_are_named_with_their_log(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "my_unlucky_student.py").write_text(UNLUCKY_STUDENT)
+    monkeypatch.syspath_prepend(folder)
+    (folder / "grid.yaml").write_text(
+        GRID.replace("[ppo-lag]", "[{name: 'my_unlucky_student:ENTRY', label: unlucky}]")
+    )
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
+    del sys.modules["my_unlucky_student"]
+    trial = SweepStore(Path("runs"), "small").trials()[0].folder.name
+    assert capsys.readouterr().out.splitlines()[-4:] == [
+        "small: 0 of 1 complete, 0 running, 0 waiting, 1 failed; 0%",
+        "failed: two-state unlucky none seed 0: ArithmeticError: no luck",
+        f"        log and traceback: runs/small/trials/{trial}",
+        "Try what failed again with: recrl-sweep launch grid.yaml --executor inline --no-mlflow --no-figures "
+        "--only method=none --retry-failed",
+    ]
+
+
+def test_no_password_is_printed(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "my_unlucky_student.py").write_text(UNLUCKY_STUDENT)
+    monkeypatch.syspath_prepend(folder)
+    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_unlucky_student:ENTRY'"))
+    uri = "postgresql://me:hunter2@database/mlflow"
+    assert main(["launch", "grid.yaml", *INLINE, "--tracking-uri", uri]) == ExitCode.TRIALS_FAILED
+    del sys.modules["my_unlucky_student"]
+    out = capsys.readouterr().out
+    assert "--tracking-uri postgresql://***@database/mlflow --retry-failed" in out
+    assert "hunter2" not in out
+
+
+def test_a_busy_sweep_has_its_own_code(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with SweepStore(folder / "runs", "small").lock():
+        assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.BUSY
+    assert capsys.readouterr().err.startswith("recrl-sweep: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["status"], "runs: holds 0 sweeps; launch one first"),
+        (["status", "smal"], "runs: holds no sweep 'smal', nothing was launched there yet"),
+        (
+            ["plan", "grid.yaml", "--only", "linear"],
+            "--only: must look like method=dynamic or seed=0,1, got 'linear'",
+        ),
+        (
+            ["plan", "grid.yaml", "--only", "method=linaer"],
+            "--only: no trial has method 'linaer'; did you mean 'linear'? (known: none, linear)",
+        ),
+    ],
+)
+def test_wrong_arguments_are_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    assert main(arguments) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+
+
+def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("large", "small"):
+        store = SweepStore(folder / "runs", name)
+        store.folder.mkdir(parents=True)
+        store.write_info({"name": store.name})
+    assert main(["status"]) == ExitCode.WRONG_INPUT
+    assert main(["status", "smal"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.splitlines() == [
+        "recrl-sweep: runs: holds 2 sweeps; say which one: large, small",
+        "recrl-sweep: runs: holds no sweep 'smal'; did you mean 'small'? (there: large, small)",
+    ]
+
+
+def test_a_plan_for_a_cluster_that_is_not_there_is_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plan", "grid.yaml", "--address", "127.0.0.1:1"]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err.startswith("recrl-sweep: cannot use the Ray cluster at 127.0.0.1:1: ")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["lunch"], [], ["launch"], ["launch", "g.yaml", "--max-concurrent", "0"]]
+)
+def test_what_cannot_be_parsed_is_wrong_input(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == ExitCode.WRONG_INPUT
+
+
+def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
+    long = GRID.replace("total_steps: 160", "total_steps: 1e9")
+    (folder / "grid.yaml").write_text(long)
+    command = [sys.executable, "-m", "recrl.orchestrator.cli.main", "launch", "grid.yaml", *INLINE]
+    with subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "small: 2 trials: 2 new\n"  # from here on signals are handled
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (ExitCode.STOPPED, "")
+    assert out.splitlines()[-1] == (
+        "Stopped; nothing is lost. Go on with: recrl-sweep launch grid.yaml "
+        "--executor inline --no-mlflow --no-figures"
+    )
+    store = SweepStore(folder / "runs", "small")
+    assert tuple(store.specs()) == parse_grid(long.encode(), source="grid.yaml").trials()
+    assert not any(trial.record().status.is_finished for trial in store.trials())
+
+
+def test_the_module_runs_like_the_script(folder: Path) -> None:
+    command = [sys.executable, "-m", "recrl.orchestrator.cli.main", "--version"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("recrl ")
+
+
+LONG = GRID.replace("total_steps: 160", "total_steps: 1e9")
+
+
+def test_stop_ends_a_launch_from_another_terminal(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "grid.yaml").write_text(LONG)
+    command = [sys.executable, "-m", "recrl.orchestrator.cli.main", "launch", "grid.yaml", *INLINE]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "small: 2 trials: 2 new\n"
+        assert main(["stop", "small"]) == ExitCode.OK
+        first, last = capsys.readouterr().out.splitlines()
+        assert first == "small: its trials save where they are"
+        assert last.startswith("small: 0 of 2 complete, 0 running, ")
+        assert "Stopped; nothing is lost." in process.communicate(timeout=60)[0]
+    assert process.returncode == ExitCode.STOPPED
+    assert main(["stop", "small"]) == ExitCode.OK
+    assert capsys.readouterr().out == "small: no launch runs this sweep\n"
+    assert not SweepStore(folder / "runs", "small").stop_request_path.exists()
+
+
+def test_logs_are_found_by_id_title_or_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    capsys.readouterr()
+    trial = SweepStore(Path("runs"), "small").trials()[1]
+    assert trial.spec.title == "two-state ppo-lag none seed 0"
+    for words in (
+        [trial.spec.trial_id],
+        [trial.spec.trial_id[:5]],
+        ["two-state", "ppo-lag", "none"],
+        [trial.folder.name],
+    ):
+        assert main(["logs", "small", *words, "--follow"]) == ExitCode.OK
+        assert capsys.readouterr().out == trial.log_path.read_text()
+    assert main(["logs", "small", trial.spec.trial_id, "--folder"]) == ExitCode.OK
+    assert capsys.readouterr().out == f"runs/small/trials/{trial.folder.name}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["nobody"], "small: no trials on disk begin with 'nobody'; status names them"),
+        ([], "small: no trials are running; status names them"),
+        (
+            ["two-state"],
+            "small: 2 trials on disk begin with 'two-state'; say which one, by its id or title: ",
+        ),
+    ],
+)
+def test_logs_of_nobody_and_of_several(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    grid = parse_grid(GRID.encode(), source="grid.yaml")
+    store = SweepStore(folder / "runs", "small")
+    for spec in grid.trials():
+        store.trial(spec).begin(spec).close(TrialState.WAITING)
+    store.write_info({"name": store.name})
+    assert main(["logs", "small", *words]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
+
+
+def test_status_says_why_a_trial_waits(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = parse_grid(GRID.encode(), source="grid.yaml")
+    store = SweepStore(folder / "runs", "small")
+    spec = grid.trials()[0]
+    store.trial(spec).begin(spec).close(TrialState.WAITING, error="the disk was full")
+    store.write_info({"name": store.name})
+    assert main(["status", "--brief"]) == ExitCode.OK  # nothing was launched: no trials are known
+    store.write_specs([spec])
+    assert main(["status", "--brief"]) == ExitCode.OK
+    assert "\nwaiting: two-state ppo-lag none seed 0: the disk was full\n" in capsys.readouterr().out
+
+
+def test_a_disk_that_takes_nothing_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
+    try:
+        code = main(["launch", "grid.yaml", *INLINE])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert code == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err.endswith("File too large; what was saved stays\n")
+
+
+@pytest.mark.parametrize(
+    "sweep_command", ["status", "stop", "logs", "evaluate", "figures", "export", "bound", "ui"]
+)
+def test_a_wrong_grid_file_is_a_sentence_for_every_command(
+    folder: Path, capsys: pytest.CaptureFixture[str], sweep_command: str
+) -> None:
+    (folder / "bad.yaml").write_text(GRID.replace("name: small", "name: ../small"))
+    assert main([sweep_command, "bad.yaml"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "bad.yaml:1: name: must be a name for a folder: letters, digits and . _ - only, at most 64, got "
+        "'../small'\n1 mistake in bad.yaml; nothing was started\n"
+    )
+    assert main([sweep_command, "gird.yaml"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        f"gird.yaml: there is no such file in {folder}; did you mean 'grid.yaml'?\n"
+        "1 mistake in gird.yaml; nothing was started\n"
+    )
+
+
+def test_lists_and_films_do_not_swallow_what_follows(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plan", "--only", "method=none", "seed=0", "grid.yaml"]) == ExitCode.OK
+    assert "small: 1 trial: 1 new" in capsys.readouterr().out
+    assert main(["plan", "--only", "method=none,linear", "--only", "seed=0", "grid.yaml"]) == ExitCode.OK
+    assert "small: 2 trials: 2 new" in capsys.readouterr().out
+    assert main(["evaluate", "--video", "nope"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith("recrl-sweep: runs: holds no sweep 'nope'")
+
+
+@pytest.mark.parametrize(
+    ("option", "sentence"),
+    [
+        ("--cores=1e9", "argument --cores: must be a whole number, written with digits only, got '1e9'"),
+        ("--cores=0", "argument --cores: must be at least 1, got 0"),
+        ("--root=grid.yaml", "argument --root: must be a folder, got the file 'grid.yaml'"),
+        (
+            "--root=" + "x" * 999,
+            "argument --root: cannot be used (File name too long), got '" + "x" * 60 + "'...",
+        ),
+    ],
+)
+def test_a_wrong_option_is_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture[str], option: str, sentence: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["plan", "grid.yaml", option])
+    assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep plan: error: {sentence}"
+
+
+def test_a_root_below_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "grid.yaml").write_text("name: x")
+    with pytest.raises(SystemExit):
+        main(["status", "x", "--root", str(tmp_path / "grid.yaml" / "below")])
+    assert f"must be a folder, but '{tmp_path / 'grid.yaml'}' is a file" in capsys.readouterr().err

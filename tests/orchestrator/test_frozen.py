@@ -1,0 +1,258 @@
+"""A trial can be looked at afterwards, as it was, and is not changed by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from recrl.agents.evaluation import FrozenPolicy, evaluate, film
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.registry import TASKS, make_drawn, make_vector
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.trial.saved_policy import FrozenTrial, NoCheckpointError, summary
+from recrl.orchestrator.trial.trial import run_recorded
+from recrl.orchestrator.trial.videos import VideoFormat
+
+SPEC = TrialSpec(
+    task=Choice("two-state", {"horizon": 10}),
+    agent=Choice("ppo-lag", {"hidden_sizes": [8]}),
+    method=Choice("none"),
+    train_limits=CostLimits.unlimited(1),
+    deploy_limits=CostLimits((3.0,)),
+    train_steps=160,
+    deploy_steps=40,
+    num_envs=4,
+    rollout_steps=10,
+    evaluation_episodes=6,
+    seed=5,
+)
+RIVER = replace(SPEC, task=Choice("rivergrid-1a", {"horizon": 12}), num_envs=2, rollout_steps=12)
+BOTH = tuple(FrozenPolicy)
+
+
+def run(folder: Path, spec: TrialSpec, *, updates: int | None = None) -> TrialStore:
+    """The trial, stopped after some updates or run to its end."""
+    store = SweepStore(folder, "small")
+    answers = iter([False] * (updates if updates is not None else spec.num_updates) + [True])
+    run_recorded(spec, store.trial(spec), should_stop=lambda: next(answers))
+    store.write_info({"name": store.name})
+    store.write_specs([spec])
+    return store.trial(spec)
+
+
+def contents(store: TrialStore) -> dict[str, bytes]:
+    """Every file of the trial's own."""
+    return {
+        str(path.relative_to(store.folder)): path.read_bytes()
+        for path in store.folder.rglob("*")
+        if path.is_file() and path.parent not in (store.evaluations_folder, store.videos_folder)
+    }
+
+
+@pytest.fixture
+def complete(tmp_path: Path) -> TrialStore:
+    return run(tmp_path, SPEC)
+
+
+@pytest.fixture
+def crossing(tmp_path: Path) -> TrialStore:
+    return run(tmp_path, RIVER)
+
+
+def test_a_complete_trials_evaluation_comes_out_again(complete: TrialStore) -> None:
+    before = contents(complete)
+    frozen = FrozenTrial.thaw(complete)
+    assert (frozen.update, frozen.env_steps) == (5, 200)
+    rows, path = frozen.evaluate(BOTH, num_episodes=6, seed=None)
+    assert path == complete.evaluations_folder / "update-00000005__seed-own.csv"
+    assert path.read_bytes() == complete.evaluation_path.read_bytes()
+    pd.testing.assert_frame_equal(rows, complete.evaluation(), check_dtype=False)
+    assert contents(complete) == before
+
+
+def test_another_seed_gives_other_episodes_and_the_same_seed_the_same(complete: TrialStore) -> None:
+    frozen = FrozenTrial.thaw(complete)
+    once, path = frozen.evaluate(BOTH[:1], num_episodes=20, seed=7)
+    again, _ = frozen.evaluate(BOTH[:1], num_episodes=20, seed=7)
+    other, _ = frozen.evaluate(BOTH[:1], num_episodes=20, seed=8)
+    assert path.name == "update-00000005__seed-7.csv"
+    assert once.equals(again)
+    assert not once.equals(other)
+
+
+def test_a_stopped_trial_is_looked_at_as_far_as_it_is(tmp_path: Path) -> None:
+    store = run(tmp_path, SPEC, updates=2)
+    assert store.record().status is TrialState.WAITING
+    assert FrozenTrial.thaw(store).update == 2
+    assert not store.evaluation_path.exists()
+
+
+def test_a_damaged_checkpoint_is_passed_over_and_left_where_it_is(tmp_path: Path) -> None:
+    run(tmp_path, SPEC, updates=2)
+    store = run(tmp_path, SPEC)
+    newest, _ = store.checkpoints()
+    newest.write_bytes(newest.read_bytes()[:-1])
+    assert FrozenTrial.thaw(store).update == 2
+    assert newest.exists()
+
+
+def test_a_trial_without_a_checkpoint_is_a_sentence(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "small").trial(SPEC)
+    store.begin(SPEC)
+    with pytest.raises(NoCheckpointError, match=r"^two-state ppo-lag none seed 5: has no intact checkpoint"):
+        FrozenTrial.thaw(store)
+
+
+def test_a_checkpoint_that_does_not_fit_is_a_sentence(complete: TrialStore) -> None:
+    """Its tree has the networks of another agent, as if the agent's code had changed since."""
+    other = replace(SPEC, agent=Choice("ppo-lag", {"hidden_sizes": [16]}))
+    tree = complete.latest_checkpoint()
+    assert tree is not None
+    changed = TrialStore(complete.folder.parent / other.folder_name)
+    changed.begin(other).commit(tree["trial"], update=5, env_steps=200)
+    with pytest.raises(
+        RecrlError, match=r"^two-state ppo-lag none seed 5: its checkpoint cannot be used with the task and "
+    ):
+        FrozenTrial.thaw(changed)
+
+
+def test_a_summary_is_hand_computed(complete: TrialStore) -> None:
+    rows = pd.DataFrame(
+        {
+            "policy": ["stochastic"] * 3 + ["deterministic"],
+            "episode_return": [1.0, 2.0, 3.0, 5.0],
+            "cost_0": [2.0, 3.0, 4.0, 0.5],
+        }
+    )
+    one, other = summary(rows, FrozenTrial.thaw(complete))
+    assert one["return"] == "2.00 ± 0.58"  # standard deviation 1, over the root of 3
+    assert (one["costs"], one["d_d"], one["within"]) == ("3.00 ± 0.58", "3", "67%")
+    assert (other["policy"], other["return"], other["within"]) == ("deterministic", "5.00", "100%")
+
+
+def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
+    frozen = FrozenTrial.thaw(crossing)
+    options = RIVER.task.options
+    shots = list(
+        film(
+            frozen.agent,
+            make_drawn("rivergrid-1a", options=options),
+            FrozenPolicy.DETERMINISTIC,
+            num_costs=1,
+            seed=np.random.SeedSequence(0),
+        )
+    )
+    environments = make_vector("rivergrid-1a", 1, options=options)
+    seed = np.random.SeedSequence(0)
+    (episode,) = evaluate(frozen.agent, environments, FrozenPolicy.DETERMINISTIC, num_episodes=1, seed=seed)
+    assert [shot.step for shot in shots] == list(range(episode.length + 1))
+    assert shots[-1].episode_return == pytest.approx(episode.episode_return)
+    assert tuple(shots[-1].costs) == episode.costs
+    assert shots[0].picture.shape == (288, 288, 3)
+    drawn = make_drawn("rivergrid-1a", options=options)
+    seldom = film(frozen.agent, drawn, FrozenPolicy.DETERMINISTIC, num_costs=1, seed=seed, every=5)
+    assert [shot.step for shot in seldom] == sorted({*range(0, episode.length + 1, 5), episode.length})
+
+
+def test_a_video_has_a_picture_a_step(crossing: TrialStore) -> None:
+    before = contents(crossing)
+    path = FrozenTrial.thaw(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=3)
+    assert path == crossing.videos_folder / "update-00000009__seed-3__stochastic.gif"
+    with Image.open(path) as video:
+        assert 2 <= video.n_frames <= 13  # type: ignore[attr-defined]  # pictures without a change are one
+        assert video.size == (288, 312)
+    assert contents(crossing) == before
+
+
+def test_a_task_without_pictures_is_a_sentence(complete: TrialStore) -> None:
+    with pytest.raises(RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state has no pic"):
+        FrozenTrial.thaw(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+
+
+@pytest.mark.parametrize("name", ["rivergrid-1b", "rivergrid", "gymnasium"])
+def test_a_drawn_task_is_the_task(name: str) -> None:
+    options = TASKS[name].sample_options
+    environments, drawn = make_vector(name, 1, options=options), make_drawn(name, options=options)
+    first, _ = environments.reset(seed=1)
+    observation, _ = drawn.reset(seed=1)
+    assert np.shape(observation) == first.shape[1:]
+    info = drawn.step(drawn.action_space.sample())[4]
+    assert np.size(info["cost"]) == environments.cmdp.num_costs
+    picture = drawn.render()
+    assert isinstance(picture, np.ndarray)
+    assert picture.dtype == np.uint8
+    drawn.close()
+
+
+def test_evaluate_says_what_it_found_and_where(
+    complete: TrialStore, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = complete.folder.parents[2]
+    monkeypatch.chdir(root)
+    command = "evaluate small two-state ppo-lag --root . --episodes 8 --seed 1"
+    assert main(command.split()) == ExitCode.OK
+    heads, stochastic, deterministic, legend, file = capsys.readouterr().out.splitlines()
+    assert heads.split() == ["trial", "update", "policy", "episodes", "return", "costs", "d_d", "within"]
+    assert stochastic.startswith("two-state ppo-lag none seed 5  5 of 5  stochastic     8         ")
+    assert "  deterministic  8  " in deterministic
+    assert legend == "Means and standard errors; within: episodes in which no cost exceeded its d_d."
+    csv = f"small/trials/{complete.folder.name}/evaluations/update-00000005__seed-1.csv"
+    assert file == f"Episodes   {csv}"
+    assert len(Path(csv).read_text().splitlines()) == 1 + 2 * 8
+
+
+def test_evaluate_leaves_out_what_has_no_checkpoint(
+    complete: TrialStore, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = str(complete.folder.parents[2])
+    store = SweepStore(Path(root), "small")
+    begun = replace(SPEC, seed=6)
+    store.trial(begun).begin(begun)
+    assert main(["evaluate", "--root", root]) == ExitCode.OK
+    sentence = "two-state ppo-lag none seed 6: has no intact checkpoint yet\n"
+    assert capsys.readouterr().out.endswith(f"left out   {sentence}")
+    assert main(["evaluate", "--root", root, "--only", "seed=6"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}"
+    assert main(["evaluate", "--root", root, "small", "nobody"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: small: no trials on disk begin with 'nobody'; status names them\n"
+    )
+
+
+def test_evaluate_films_on_demand(crossing: TrialStore, capsys: pytest.CaptureFixture[str]) -> None:
+    root = str(crossing.folder.parents[2])
+    arguments = ["evaluate", "--root", root, "--video", "--policy", "deterministic", "--episodes", "1"]
+    assert main(arguments) == ExitCode.OK
+    (video,) = crossing.videos_folder.iterdir()
+    assert video.name == "update-00000009__seed-own__deterministic.gif"
+    assert capsys.readouterr().out.splitlines()[-1] == f"Video      {video}"
+
+
+def test_a_launch_films_what_the_grid_wants(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grid.yaml").write_text(
+        "name: small\n"
+        "tasks: [{name: rivergrid-1a, deploy_limits: 5, options: {horizon: 12}}]\n"
+        "agents: [ppo-lag]\n"
+        "methods: [none]\n"
+        "seeds: [3, 4]\n"
+        "run: {total_steps: 96, num_envs: 4, evaluation_episodes: 2, videos: first-seed}\n"
+    )
+    launch = ["launch", "grid.yaml", "--executor", "inline", "--no-mlflow", "--no-figures"]
+    assert main(launch) == ExitCode.OK
+    assert "Videos     runs/small/trials/*/videos\n" in capsys.readouterr().out
+    (video,) = Path("runs").rglob("videos/*")
+    assert "__s3__" in video.parts[-3]
+    assert main(launch) == ExitCode.OK
+    assert "Videos" not in capsys.readouterr().out

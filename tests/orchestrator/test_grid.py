@@ -1,0 +1,391 @@
+"""A grid file is checked whole: every mistake at once, each with its line; what is right is a product."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.registry import TASKS
+from recrl.orchestrator.errors import GridError
+from recrl.orchestrator.grid.grid import GridSpec, parse_grid, read_grid
+
+SMALL = """\
+name: small
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [ppo-lag]
+methods: [none, linear]
+seeds: 2
+run: {total_steps: 4000}
+"""
+
+TEN_MISTAKES = """\
+name: ten mistakes
+tasks:
+  - name: two-state
+    deploy_limits: [1, 2]
+  - name: two-stat
+    deploy_limits: 3
+agents:
+  - ppo-lag
+  - ppo-lag
+method: [none]
+methods:
+  - linear
+  - name: dynamic
+    options:
+      window: 0
+      widnow: 80
+seeds: 3
+train_limits: automatic
+run:
+  total_steps: lots
+  num_env: 4
+"""
+
+
+def _problems(text: str | bytes) -> list[str]:
+    data = text.encode() if isinstance(text, str) else text
+    with pytest.raises(GridError) as caught:
+        parse_grid(data, source="grid.yaml")
+    return caught.value.problems
+
+
+def _grid(text: str) -> GridSpec:
+    return parse_grid(text.encode(), source="grid.yaml")
+
+
+def test_ten_mistakes_give_ten_located_sentences() -> None:
+    known = ", ".join(sorted(TASKS))
+    assert _problems(TEN_MISTAKES) == [
+        "grid.yaml:1: name: must be a name for a folder: letters, digits and . _ - only, at most 64, "
+        "got 'ten mistakes'",
+        "grid.yaml:4: tasks.0.deploy_limits: two-state has 1 cost (wear), got 2 limits",
+        "grid.yaml:5: tasks.1.name: no task is called 'two-stat'; did you mean 'two-state'? "
+        f"(known: {known}; or an import path package.module:attribute)",
+        "grid.yaml:9: agents.1: is called 'ppo-lag', as is agents.0; give it another label",
+        "grid.yaml:10: method: unknown key; did you mean 'methods'?",
+        "grid.yaml:15: methods.1.options.window: must be at least 1, got 0",
+        "grid.yaml:16: methods.1.options.widnow: unknown key; did you mean 'window'?",
+        "grid.yaml:18: train_limits: must be 'auto', a number or a list of numbers, got 'automatic'",
+        "grid.yaml:20: run.total_steps: must be a whole number, got 'lots'",
+        "grid.yaml:21: run.num_env: unknown key; did you mean 'num_envs'?",
+    ]
+
+
+def test_the_product_is_ordered_with_seeds_outermost() -> None:
+    titles = [spec.title for spec in _grid(SMALL).trials()]
+    assert titles == [
+        "two-state ppo-lag none seed 0",
+        "two-state ppo-lag linear seed 0",
+        "two-state ppo-lag none seed 1",
+        "two-state ppo-lag linear seed 1",
+    ]
+
+
+def test_every_default_is_filled_in() -> None:
+    spec = _grid(SMALL).trials()[0]
+    assert spec.task.options == {"horizon": 10, "arrival": 1.0}
+    assert spec.train_limits == CostLimits((math.inf,))
+    assert spec.deploy_limits == CostLimits((2.0,))
+    assert (spec.train_steps, spec.deploy_steps) == (3800, 200)
+    assert (spec.num_envs, spec.rollout_steps, spec.evaluation_episodes) == (64, 10, 100)
+
+
+def test_saying_a_default_changes_no_trial() -> None:
+    said = SMALL.replace("{name: two-state,", "{name: two-state, label: two-state, options: {horizon: 10},")
+    assert _grid(said).trials() == _grid(SMALL).trials()
+
+
+def test_more_seeds_keep_the_trials_there_are() -> None:
+    few = {spec.trial_id for spec in _grid(SMALL).trials()}
+    many = {spec.trial_id for spec in _grid(SMALL.replace("seeds: 2", "seeds: [1, 0, 7]")).trials()}
+    assert few < many
+
+
+def test_resources_change_no_trial() -> None:
+    assert (
+        _grid(SMALL + "resources: {cpus_per_trial: 0.5, max_concurrent: 3}\n").trials()
+        == _grid(SMALL).trials()
+    )
+
+
+def test_exclusions_leave_out_what_matches_everything_in_them() -> None:
+    grid = _grid(SMALL + "exclude: [{method: linear, seed: 1}]\n")
+    assert [spec.title for spec in grid.trials()] == [
+        "two-state ppo-lag none seed 0",
+        "two-state ppo-lag linear seed 0",
+        "two-state ppo-lag none seed 1",
+    ]
+
+
+def test_limits_are_the_tasks_own_or_the_grids() -> None:
+    grid = _grid(
+        """\
+name: limits
+tasks:
+  - {name: two-state-2, deploy_limits: [3, 1], train_limits: 9}
+  - {name: two-state-2, label: other}
+agents: [ppo-lag]
+methods: [none]
+seeds: 1
+deploy_limits: 2
+train_limits: [.inf, 8]
+run: {total_steps: 4000}
+"""
+    )
+    first, second = grid.trials()
+    assert (first.train_limits, first.deploy_limits) == (CostLimits((9, 9)), CostLimits((3, 1)))
+    assert (second.train_limits, second.deploy_limits) == (CostLimits((math.inf, 8)), CostLimits((2, 2)))
+
+
+def test_two_teachers_of_one_kind_need_two_labels() -> None:
+    methods = "methods: [dynamic, {name: dynamic, label: dynamic-40, options: {window: 40}}]"
+    specs = _grid(SMALL.replace("methods: [none, linear]", methods)).trials()
+    assert [spec.method.label for spec in specs[:2]] == ["dynamic", "dynamic-40"]
+    assert len({spec.trial_id for spec in specs}) == 4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("name: small\n", "", "grid.yaml:1: name: is required"),
+        (
+            "seeds: 2",
+            "seeds: 0",
+            "grid.yaml:5: seeds: must be a number of seeds from 1 to 10000, or a list, got 0",
+        ),
+        ("seeds: 2", "seeds: [3, 4, 3]", "grid.yaml:5: seeds: must differ, got 3 twice"),
+        (
+            "seeds: 2",
+            "seeds: yes",
+            "grid.yaml:5: seeds: must be a number of seeds or a list of seeds, got 'yes'",
+        ),
+        (
+            "seeds: 2",
+            "seeds: true",
+            "grid.yaml:5: seeds: must be a number of seeds or a list of seeds, got true",
+        ),
+        ("4000", "true", "grid.yaml:6: run.total_steps: must be a number, got true"),
+        ("4000", "4000.5", "grid.yaml:6: run.total_steps: must be a whole number, got 4000.5"),
+        (
+            "4000",
+            "100",
+            "grid.yaml:6: run.total_steps: must be at least one update of two-state, "
+            "64 environments x 10 steps = 640, got 100",
+        ),
+        ("4000}", "4000, num_envs: 0}", "grid.yaml:6: run.num_envs: must be at least 1, got 0"),
+        (
+            "4000}",
+            "4000, deploy_fraction: 1}",
+            "grid.yaml:6: run.deploy_fraction: must be at most 0.9, got 1",
+        ),
+        ("[ppo-lag]", "ppo-lag", "grid.yaml:3: agents: must be a list, got 'ppo-lag'"),
+        ("[ppo-lag]", "[]", "grid.yaml:3: agents: must have at least 1 entries, got 0"),
+        ("[ppo-lag]", "[3]", "grid.yaml:3: agents.0: must be a name or a mapping with a name, got 3"),
+        ("[ppo-lag]", "[{label: x}]", "grid.yaml:3: agents.0.name: is required"),
+        (
+            "[ppo-lag]",
+            "[ppo-lag, {name: ppo-lag, label: again}]",
+            "grid.yaml:3: agents.1: is the same as agents.0, under another label",
+        ),
+        (
+            "[ppo-lag]",
+            "['json:no_such_thing']",
+            "grid.yaml:3: agents.0: cannot import 'json:no_such_thing': "
+            "module 'json' has no attribute 'no_such_thing'",
+        ),
+        (", deploy_limits: 2", "", "grid.yaml:2: tasks.0: deploy_limits is required, here or for all tasks"),
+        (
+            "deploy_limits: 2",
+            "deploy_limits: .inf",
+            "grid.yaml:2: tasks.0.deploy_limits: must be finite, got infinity",
+        ),
+        (
+            "deploy_limits: 2",
+            "deploy_limits: -0.5",
+            "grid.yaml:2: tasks.0.deploy_limits: must be numbers of at least 0 (cost per episode), got -0.5",
+        ),
+        (
+            "deploy_limits: 2",
+            "deploy_limits: .nan",
+            "grid.yaml:2: tasks.0.deploy_limits: must be numbers of at least 0 (cost per episode), got NaN",
+        ),
+        (
+            "deploy_limits: 2",
+            "deploy_limits: 5, train_limits: 3",
+            "grid.yaml:2: tasks.0.train_limits: must be at least the deploy_limits of two-state "
+            "(d_t >= d_d), got 3 under 5",
+        ),
+        (
+            "deploy_limits: 2",
+            "deploy_limits: 2, options: {horizon: 1}",
+            "grid.yaml:2: tasks.0.options.horizon: must be at least 2, got 1",
+        ),
+        (
+            "run:",
+            "exclude: [{method: linaer}]\nrun:",
+            "grid.yaml:6: exclude.0.method: this grid has no method 'linaer'; did you mean 'linear'?",
+        ),
+        ("run:", "exclude: [{agent: ppo-lag}]\nrun:", "grid.yaml:6: exclude: leaves no trial at all"),
+        (
+            "run:",
+            "exclude: [{}]\nrun:",
+            "grid.yaml:6: exclude.0: must name at least one of task, agent, method, seed",
+        ),
+        (
+            "run:",
+            "resources: {cpus_per_trial: 0}\nrun:",
+            "grid.yaml:6: resources.cpus_per_trial: must be greater than 0.0, got 0",
+        ),
+        ("seeds: 2", "seeds: 2\nseeds: 3", "grid.yaml:6: seeds: given twice, first on line 5"),
+        ("seeds: 2", "seeds: !!python/name:os.system ''", None),
+        ("seeds: 2", "<<: {seeds: 2}", None),
+        ("seeds: 2", "? [1]\n: 2\nseeds: 2", "grid.yaml:5: a key must be text"),
+    ],
+)
+def test_each_mistake_has_its_sentence(old: str, new: str, problem: str | None) -> None:
+    problems = _problems(SMALL.replace(old, new))
+    if problem is None:
+        problem = {
+            "seeds": "grid.yaml:5: seeds: only plain values are allowed, got the tag "
+            "'tag:yaml.org,2002:python/name:os.system'",
+            "<<": "grid.yaml:5: <<: unknown key (known: train_limits, deploy_limits, name, tasks, agents, "
+            "methods, seeds, run, resources, exclude)",
+        }[new.partition(":")[0]]
+        assert problem in problems
+    else:
+        assert problems == [problem]
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"", "grid.yaml:1: the file is empty"),
+        (b"# nothing but a remark\n", "grid.yaml:1: the file is empty"),
+        (b"- 1\n", "grid.yaml:1: a grid must be a mapping of settings, got [1]"),
+        (b"just text", "grid.yaml:1: a grid must be a mapping of settings, got 'just text'"),
+        (b"name: [1\nseeds: 2", "grid.yaml:2: not valid YAML: expected ',' or ']', but got ':'"),
+        (b"a: 1\n\tb: 2", "grid.yaml:2: not valid YAML: found character '\\t' that cannot start any token"),
+        (b"a: 1\nb: \xff\n", "grid.yaml:2: the file must be UTF-8 text, and this line is not"),
+        (b"a: \x00", "grid.yaml:1: the file holds a character that YAML does not allow"),
+        (b"a: 1\n---\nb: 2\n", "grid.yaml:2: not valid YAML: but found another document"),
+        (b"a: *b\n", "grid.yaml:1: not valid YAML: found undefined alias 'b'"),
+        (b"a: " + b"x" * 2**20, "grid.yaml:1: the file must have at most 1048576 bytes, got 1048579"),
+        (b"[" * 3000, "grid.yaml:1: nested deeper than 40 levels"),
+        (b"a: " + b"[" * 60 + b"]" * 60, "grid.yaml:1: nested deeper than 40 levels"),
+        (b"a: &a [*a]", "grid.yaml:1: nested deeper than 40 levels"),
+        (
+            b"a0: &a0 [x]\n"
+            + b"".join(
+                b"a%d: &a%d [%s]\n" % (i, i, b", ".join([b"*a%d" % (i - 1)] * 9)) for i in range(1, 10)
+            ),
+            "grid.yaml:1: the file expands to more than 20000 values",
+        ),
+    ],
+)
+def test_what_is_no_grid_at_all_is_refused_in_one_sentence(data: bytes, problem: str) -> None:
+    assert _problems(data) == [problem]
+
+
+def test_a_missing_file_is_a_sentence_that_says_where_it_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "sweep.yaml").touch()
+    meant = "; did you mean 'sweep.yaml'?"
+    for name, ends in [("sweep.yml", meant), ("sweeps.yaml", meant), ("other.yaml", "")]:
+        with pytest.raises(GridError) as raised:
+            read_grid(tmp_path / name)
+        assert str(raised.value) == f"{tmp_path / name}: there is no such file in {tmp_path}{ends}"
+    with pytest.raises(GridError, match=r"grid\.yaml: there is no folder .*nowhere$"):
+        read_grid(tmp_path / "nowhere" / "grid.yaml")
+
+
+def test_what_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(GridError, match=": cannot be read: Is a directory"):
+        read_grid(tmp_path)
+
+
+def test_scalars_are_what_they_look_like() -> None:
+    """``1e3`` is a number, ``none`` and ``no`` are text, ``010`` is ten."""
+    grid = _grid(SMALL.replace("4000", "1e4").replace("[ppo-lag]", "[{name: ppo-lag, label: no}]"))
+    assert grid.run.total_steps == 10_000
+    assert grid.agents[0].label == "no"
+    assert _grid(SMALL.replace("seeds: 2", "seeds: [010]")).seeds == (10,)
+
+
+def test_aliases_stand_for_what_they_repeat() -> None:
+    text = SMALL.replace("run:", "resources: &r {cpus_per_trial: 1}\nrun:")
+    assert _grid(text).trials() == _grid(SMALL).trials()
+    shared = SMALL.replace("deploy_limits: 2}]", "deploy_limits: &d 2}]").replace("seeds: 2", "seeds: *d")
+    assert _grid(shared).trials() == _grid(SMALL).trials()
+
+
+def test_a_task_that_cannot_be_built_is_a_sentence() -> None:
+    problems = _problems(SMALL.replace("name: two-state,", "name: 'json:loads',"))
+    assert len(problems) == 1
+    assert problems[0].startswith("grid.yaml:2: tasks.0: json:loads cannot be built: TypeError: ")
+
+
+def test_too_many_trials_are_refused() -> None:
+    methods = ", ".join(
+        f"{{name: linear, label: l{i}, options: {{start_fraction: 0.{i + 10}}}}}" for i in range(11)
+    )
+    text = SMALL.replace("[none, linear]", f"[{methods}]").replace("seeds: 2", "seeds: 10000")
+    assert _problems(text) == ["grid.yaml:1: a grid must have at most 100000 trials, got 110000"]
+
+
+ROOT = Path(__file__).parents[2]
+SHIPPED = {
+    "demo": 20,
+    "rivergrid": 100,
+    "safety-gym": 150,
+    "safety-gym-agents": 27,
+    "safety-gym-small": 36,
+    "velocity": 180,
+    "velocity-curricula": 180,
+}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "grids").glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_grids_we_ship_are_right(path: Path) -> None:
+    grid = read_grid(path)
+    assert grid.name == path.stem
+    assert len(grid.trials()) == SHIPPED[path.stem]
+
+
+# Grids of results are archives: some name options and a curriculum that no longer exist.
+REMOVED = re.compile(
+    "cross_fitting|limit_margin|multiplier_(geometric|reset|waits)|noisy_target_kl|temperature|observation"
+    "|'annealed'"
+)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "results").glob("*/*.yaml")), ids=lambda path: path.stem)
+def test_the_grids_of_our_results_are_right_but_for_what_was_removed_since(path: Path) -> None:
+    try:
+        assert read_grid(path).trials()
+    except GridError as error:
+        assert all(REMOVED.search(problem) for problem in error.problems), error.problems
+
+
+@given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
+def test_no_bytes_whatever_raise_anything_but_sentences(data: bytes) -> None:
+    assert all(problem.startswith("grid.yaml:") for problem in _problems(data))
+
+
+@given(
+    cut=st.integers(0, len(TEN_MISTAKES)),
+    at=st.integers(0, len(SMALL)),
+    text=st.sampled_from(
+        ["null", "[]", "{}", ": ", "- ", "'", "&a ", "*a", "!!x ", "1e999", "\n", "\t", "{a: 1}"]
+    ),
+)
+def test_a_grid_damaged_anywhere_is_right_or_gives_located_sentences(cut: int, at: int, text: str) -> None:
+    for damaged in (TEN_MISTAKES[:cut], SMALL[:at] + text + SMALL[at:]):
+        try:
+            assert parse_grid(damaged.encode(), source="grid.yaml").trials()
+        except GridError as error:
+            assert error.problems
+            assert all(problem.startswith("grid.yaml:") for problem in error.problems)

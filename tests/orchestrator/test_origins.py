@@ -1,0 +1,190 @@
+"""What code a trial ran is known for each attempt, and results of other code are not mixed without a word."""
+
+import importlib
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from recrl.analysis import report
+from recrl.analysis.data import sweep_data
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.executors import InlineExecutor
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.code_changes import (
+    code_of,
+    has_other_code,
+    no_curriculum_sentence,
+    other_code_sentence,
+)
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.sweep import launch
+
+TASK = """\
+from recrl.environments.registry import Task
+from recrl.environments.finite.two_state import TwoStateOptions, make_two_state
+
+FACTOR = 1.0
+
+def make(name, num_envs, options):
+    environments = make_two_state("two-state", num_envs, options)
+    step = environments.step
+    def scaled(actions):
+        observations, rewards, *rest = step(actions)
+        return observations, FACTOR * rewards, *rest
+    environments.step = scaled
+    return environments
+
+TASK = Task("Scaled.", TwoStateOptions, make)
+"""
+GRID = """\
+name: small
+tasks: [{name: "my_scaled_task:TASK", label: scaled, deploy_limits: 2, options: {horizon: 5}}]
+agents: [{name: ppo-lag, options: {hidden_sizes: [4], policy_steps: 2, critic_steps: 2}}]
+methods: [none]
+seeds: [SEEDS]
+train_limits: 9
+run: {total_steps: 80, deploy_fraction: 0.5, num_envs: 2, rollout_steps: 10, evaluation_episodes: 2}
+"""
+INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
+SENTENCE = (
+    "warning: 1 complete trial comes from other code than is installed now; launch --rerun-changed runs it "
+    "again"
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A working directory with a task of the user's own and a grid."""
+    (tmp_path / "my_scaled_task.py").write_text(TASK)
+    (tmp_path / "grid.yaml").write_text(GRID.replace("SEEDS", "0"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    sys.modules.pop("my_scaled_task", None)
+
+
+def change(folder: Path) -> None:
+    """Multiply the task's rewards by ten, as an editor would between two launches."""
+    (folder / "my_scaled_task.py").write_text(TASK.replace("FACTOR = 1.0", "FACTOR = 10.00"))
+    sys.modules.pop("my_scaled_task", None)
+    importlib.invalidate_caches()
+
+
+def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store = SweepStore(folder / "runs", "small")
+    trial = store.trials()[0]
+    assert not has_other_code(trial, trial.spec)
+    before = trial.episodes_path.read_bytes()
+    change(folder)
+    (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1"))
+    capsys.readouterr()
+    assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
+    assert SENTENCE in capsys.readouterr().out.splitlines()
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["status", "--brief"]) == ExitCode.OK
+    assert SENTENCE in capsys.readouterr().out.splitlines()
+    assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
+    assert f"{SENTENCE}; here their policies met the present code" in capsys.readouterr().out.splitlines()
+    assert SENTENCE.removeprefix("warning: ") in report.missing(sweep_data.load(store))
+
+    assert main(["launch", "grid.yaml", *INLINE, "--rerun-changed"]) == ExitCode.OK
+    assert "small: 2 trials: 1 to run again on the present code, 1 complete\n" in capsys.readouterr().out
+    assert main(["status", "--brief"]) == ExitCode.OK
+    assert capsys.readouterr().out == "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
+    assert (trial.aside_folder / "run-001" / "episodes.csv").read_bytes() == before
+    assert trial.episodes_path.read_bytes() != before
+    assert main(["check"]) == ExitCode.OK
+
+
+def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    (spec,) = grid.trials()
+
+    class Stopping(InlineExecutor):
+        def run(self, specs: object, store: SweepStore, stop: threading.Event) -> None:
+            from recrl.orchestrator.trial.trial import run_recorded  # noqa: PLC0415
+
+            answers = iter([False])
+            run_recorded(spec, store.trial(spec), should_stop=lambda: next(answers, True))
+
+    launch(grid, store, Stopping(), stop=threading.Event())
+    first = code_of(spec)
+    change(folder)
+    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    attempts = store.trial(spec).provenance()
+    assert [attempt["attempt"] for attempt in attempts] == [1, 2]
+    assert [attempt["code"] for attempt in attempts] == [first, code_of(spec)]
+    assert first["recrl"] == code_of(spec)["recrl"]
+    assert first["my_scaled_task"] != code_of(spec)["my_scaled_task"]
+    assert all({"recrl", "python", "packages", "source"} <= set(attempt) for attempt in attempts)
+    assert has_other_code(store.trial(spec), spec)  # its first attempt ran other code
+
+
+def test_the_code_of_a_task_is_found_without_running_it(folder: Path) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    (folder / "my_scaled_task.py").write_text("raise SystemExit\n")
+    sys.modules.pop("my_scaled_task", None)
+    assert set(code_of(spec)) == {"recrl", "my_scaled_task"}
+    assert "my_scaled_task" not in sys.modules
+
+
+def test_of_a_package_that_is_not_here_nothing_is_said(folder: Path) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    trial = SweepStore(folder / "runs", "small").trials()[0]
+    (folder / "my_scaled_task.py").unlink()
+    importlib.invalidate_caches()
+    sys.modules.pop("my_scaled_task", None)
+    assert set(code_of(trial.spec)) == {"recrl"}
+    assert not has_other_code(trial, trial.spec)
+
+
+def test_the_sentences_count() -> None:
+    assert other_code_sentence(0, 0) == ""
+    assert other_code_sentence(12, 0) == (
+        "12 complete trials come from other code than is installed now; launch --rerun-changed runs them "
+        "again"
+    )
+    assert other_code_sentence(1, 2).startswith("1 complete trial and 2 begun ones come from other code than")
+    assert other_code_sentence(0, 1).startswith("1 begun trial comes from other code than")
+    assert no_curriculum_sentence([]) == ""
+    assert no_curriculum_sentence([f"t{i}" for i in range(7)]) == (
+        "the measured d_t is not above d_d, so that the curriculum is none: t0, t1, t2, t3, t4 and 2 more; "
+        "give a finite train_limits above d_d"
+    )
+
+
+def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A student that costs less than d_d from the start leaves the curriculum no room."""
+    (folder / "grid.yaml").write_text(
+        GRID.replace("SEEDS", "0")
+        .replace('"my_scaled_task:TASK", label: scaled', "two-state")
+        .replace("deploy_limits: 2", "deploy_limits: 50")
+        .replace("methods: [none]", "methods: [none, linear, dynamic]")
+        .replace("train_limits: 9\n", "")
+    )
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store = SweepStore(folder / "runs", "small")
+    for trial in store.trials():
+        events = [event["event"] for event in trial.events()]
+        none = trial.spec.method.label != "none"
+        assert ("the curriculum is none" in events) == none
+    capsys.readouterr()
+    assert main(["status", "--brief"]) == ExitCode.OK
+    sentence = (
+        "the measured d_t is not above d_d, so that the curriculum is none: two-state ppo-lag linear seed 0, "
+        "two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
+    )
+    assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
+    assert sentence in report.missing(sweep_data.load(store))
+    assert json.loads(store.trials()[0].provenance_path.read_text())["attempts"][0]["attempt"] == 1

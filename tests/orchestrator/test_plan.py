@@ -1,0 +1,121 @@
+"""The plan says what a launch would do with every trial, and about how long it takes."""
+
+from pathlib import Path
+
+import pytest
+
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.plan import Work, estimate, make_plan, select, trials_at_once
+from recrl.orchestrator.spec import TrialSpec, TrialState
+
+GRID = b"""\
+name: plan
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [ppo-lag, cpo]
+methods: [none, linear]
+seeds: 2
+run: {total_steps: 1000, num_envs: 1}
+"""
+SPECS = parse_grid(GRID, source="grid.yaml").trials()
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SweepStore:
+    return SweepStore(tmp_path, "plan")
+
+
+def _begin(store: SweepStore, spec: TrialSpec, *, env_steps: int, end: TrialState | None = None) -> None:
+    """Leave a trial that has taken some steps, in the given state or running."""
+    writer = store.trial(spec).begin(spec)
+    writer.commit({}, update=1, env_steps=env_steps)
+    if end is not None:
+        writer.close(end)
+
+
+def test_nothing_on_disk_is_all_new(store: SweepStore) -> None:
+    plan = make_plan(SPECS, store)
+    assert plan.to_do == SPECS
+    assert plan.counts == {**dict.fromkeys(Work, 0), Work.NEW: 8}
+    assert plan.steps_left == 8000
+    assert not store.folder.exists()
+
+
+def test_each_trial_gets_the_work_its_files_ask_for(store: SweepStore) -> None:
+    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
+    _begin(store, SPECS[1], env_steps=400, end=TrialState.WAITING)
+    _begin(store, SPECS[2], env_steps=300)
+    _begin(store, SPECS[3], env_steps=200, end=TrialState.FAILED)
+    plan = make_plan(SPECS[:5], store)
+    work = [trial.work for trial in plan.trials]
+    assert work == [Work.COMPLETE, Work.RESUME, Work.RESUME, Work.FAILED, Work.NEW]
+    assert plan.to_do == (SPECS[1], SPECS[2], SPECS[4])
+    assert plan.steps_left == 600 + 700 + 1000
+
+
+def test_failed_trials_are_tried_again_only_when_asked(store: SweepStore) -> None:
+    _begin(store, SPECS[0], env_steps=200, end=TrialState.FAILED)
+    assert make_plan(SPECS[:1], store).to_do == ()
+    assert make_plan(SPECS[:1], store, retry_failed=True).trials[0].work is Work.RETRY
+
+
+def test_trials_that_left_the_grid_are_listed_and_kept(store: SweepStore) -> None:
+    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
+    plan = make_plan(SPECS[1:], store)
+    assert [orphan.spec for orphan in plan.orphans] == [SPECS[0]]
+    assert store.trial(SPECS[0]).record().status is TrialState.COMPLETE
+
+
+def test_a_selection_makes_no_orphans(store: SweepStore) -> None:
+    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
+    plan = make_plan(SPECS, store, only={"seed": ["1"]})
+    assert {spec.seed for spec in plan.to_do} == {1}
+    assert plan.orphans == ()
+
+
+def test_a_selection_takes_what_matches_every_key() -> None:
+    chosen = select(SPECS, {"method": ["linear"], "seed": ["0", "1"], "agent": ["cpo"]})
+    assert [spec.title for spec in chosen] == ["two-state cpo linear seed 0", "two-state cpo linear seed 1"]
+
+
+def test_a_selection_of_what_is_not_there_is_refused() -> None:
+    with pytest.raises(RecrlError) as caught:
+        select(SPECS, {"method": ["linaer"]})
+    assert str(caught.value) == (
+        "--only: no trial has method 'linaer'; did you mean 'linear'? (known: none, linear)"
+    )
+    with pytest.raises(RecrlError) as caught:
+        select(SPECS, {"colour": ["red"]})
+    assert str(caught.value) == "--only: trials are chosen by task, agent, method, seed, got 'colour'"
+
+
+def test_the_time_is_unknown_before_a_trial_of_the_kind_has_run(store: SweepStore) -> None:
+    found = estimate(make_plan(SPECS, store), concurrent=2)
+    assert (found.cpu_seconds, found.wall_seconds) == (None, None)
+    assert found.unknown == ("two-state ppo-lag", "two-state cpo")
+    assert found.concurrent == 2
+
+
+def test_the_time_follows_from_the_speed_of_the_same_task_and_student(store: SweepStore) -> None:
+    for spec in (SPECS[0], SPECS[2]):  # one of each student
+        _begin(store, spec, env_steps=1000, end=TrialState.COMPLETE)
+    plan = make_plan(SPECS, store)
+    seconds = {
+        trial.spec.agent.label: trial.record.cpu_seconds for trial in plan.trials if trial.record.update
+    }
+    found = estimate(plan, concurrent=2)
+    assert found.unknown == ()
+    assert found.cpu_seconds == pytest.approx(3 * seconds["ppo-lag"] + 3 * seconds["cpo"])
+    assert found.wall_seconds == pytest.approx((found.cpu_seconds or 0.0) / 2)
+
+
+def test_nothing_to_do_takes_nothing(store: SweepStore) -> None:
+    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
+    found = estimate(make_plan(SPECS[:1], store), concurrent=2)
+    assert (found.cpu_seconds, found.concurrent, found.gigabytes) == (0.0, 0, 0.0)
+
+
+def test_at_least_one_trial_fits_and_no_more_than_allowed() -> None:
+    assert trials_at_once(cpus_per_trial=1e6, max_concurrent=None) == 1
+    assert trials_at_once(cpus_per_trial=1e-3, max_concurrent=3) == 3

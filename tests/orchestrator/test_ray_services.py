@@ -1,0 +1,93 @@
+"""A launch whose Ray dies around it: it ends with a sentence, and the same launch goes on."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.spec import TrialState
+from tests.faults.chaos import comm, descendants
+
+GRID = """\
+name: bereft
+tasks: [{name: two-state, deploy_limits: 3, options: {horizon: 10}}]
+agents: [{name: ppo-lag, options: {hidden_sizes: [8]}}]
+methods: [linear]
+seeds: 1
+run: {total_steps: 16_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
+"""
+COMMAND = [
+    sys.executable,
+    "-m",
+    "recrl.orchestrator.cli.main",
+    "launch",
+    "grid.yaml",
+    "--no-figures",
+    "--no-mlflow",
+]
+
+
+def launch(folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(COMMAND, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def running_trial(store: SweepStore) -> int:
+    """The process of the trial, once it has done some updates."""
+    end = time.monotonic() + 120.0
+    while time.monotonic() < end:
+        for trial in store.trials():
+            record = trial.record()
+            if record.status is TrialState.RUNNING and record.update:
+                return record.pid
+    raise AssertionError("no trial began within two minutes")
+
+
+@pytest.mark.parametrize(
+    ("title", "said"),
+    [
+        ("raylet", "Ray's node service (raylet) at 127.0.0.1:"),
+        ("gcs_server", "Ray's head service (GCS) at 127.0.0.1:"),
+    ],
+)
+def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_process(
+    title: str, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "grid.yaml").write_text(GRID)
+    store = SweepStore(tmp_path / "runs", "bereft")
+    driver = launch(tmp_path)
+    trial = running_trial(store)
+    [victim] = [pid for pid in descendants(driver.pid, "") if comm(pid) == title]
+    os.kill(victim, signal.SIGKILL)
+    _, errors = driver.communicate(timeout=100.0)
+    assert driver.returncode == 4
+    expected = r"[0-9]+ has died; nothing that was saved is lost, and the same launch goes on\n"
+    assert re.fullmatch("(recrl-sweep: )?" + re.escape(said) + expected, errors)
+    assert not store.is_locked()
+    end = time.monotonic() + 30.0
+    while comm(trial) and time.monotonic() < end:  # it is killed; the kernel takes its time
+        time.sleep(0.1)
+    assert comm(trial) == ""
+    again = launch(tmp_path)
+    again.communicate(timeout=300.0)
+    assert again.returncode == 0
+    assert [trial.record().status for trial in store.trials()] == [TrialState.COMPLETE]
+
+
+def test_what_a_killed_launch_left_of_ray_is_ended_by_the_next_one(tmp_path: Path) -> None:
+    (tmp_path / "grid.yaml").write_text(GRID)
+    driver = launch(tmp_path)
+    running_trial(SweepStore(tmp_path / "runs", "bereft"))
+    processes = [pid for pid in descendants(driver.pid, "") if comm(pid).startswith(("ray::", "raylet"))]
+    assert len(processes) >= 4
+    driver.kill()
+    driver.communicate()
+    again = launch(tmp_path)
+    again.communicate(timeout=300.0)
+    assert again.returncode == 0
+    assert [comm(pid) for pid in processes] == [""] * len(processes)

@@ -1,0 +1,35 @@
+"""The report is drawn again while a sweep runs, and never in anybody's way."""
+
+import time
+from collections.abc import Callable
+
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.report_refresh import refreshing
+
+
+def test_a_report_appears_while_the_sweep_runs_and_says_so(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(
+        seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 0"]
+    )
+    store.write_info({"name": store.name})
+    page, end = store.figures_folder / "report.md", time.monotonic() + 120.0
+    with refreshing(store, first_seconds=0.0, interval_seconds=60.0):
+        while not page.exists() and time.monotonic() < end:
+            time.sleep(0.1)
+    assert "still running, 50% of its steps done" in page.read_text()
+    assert '<meta http-equiv="refresh" content="120">' in page.with_suffix(".html").read_text()
+
+
+def test_the_end_does_not_wait_for_a_drawing(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none"])
+    began = time.monotonic()
+    with refreshing(store, first_seconds=0.0):
+        time.sleep(0.3)
+    assert time.monotonic() - began < 5.0
+
+
+def test_a_short_sweep_is_left_alone(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none"])
+    with refreshing(store):
+        pass
+    assert not store.figures_folder.exists()

@@ -1,0 +1,451 @@
+"""A sweep in an object store is the sweep of a folder, from whatever machine it is run or looked at."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
+from recrl.orchestrator.executors import InlineExecutor
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.grid.grid import GridSpec, parse_grid
+from recrl.orchestrator.remote.object_store import ObjectStore
+from recrl.orchestrator.remote.remote_sweep import SILENT_SECONDS, RemoteSweep, StopObject
+from recrl.orchestrator.remote.remote_trial import Upload
+from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.sweep import SweepResult, launch, request_stop
+from recrl.orchestrator.trial.trial import run_recorded
+from tests.faults.unreliable import Unreliable
+
+GRID = """\
+name: small
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [ppo-lag]
+methods: [none, linear]
+seeds: 1
+run: {total_steps: 320, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
+"""
+INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine that shares nothing with others but the object store.
+
+    Attributes:
+        store: the mirror in its own folder.
+        storage: the sweep, as it reaches it.
+    """
+
+    store: SweepStore
+    storage: RemoteSweep
+
+    def launch(self, *, stop: threading.Event | None = None, retry_failed: bool = False) -> SweepResult:
+        self.storage.mark(self.store)
+        return launch(
+            grid(),
+            self.store,
+            InlineExecutor(self.storage),
+            stop=stop or threading.Event(),
+            retry_failed=retry_failed,
+            storage=self.storage,
+        )
+
+
+def grid() -> GridSpec:
+    return parse_grid(GRID.encode(), source="grid.yaml")
+
+
+def never() -> bool:
+    return False
+
+
+def machine(folder: Path, name: str, kind: str = "file") -> Machine:
+    return Machine(SweepStore(folder / name, "small"), RemoteSweep(f"{kind}://{folder}/bucket", "small"))
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
+    """The same sweep in a folder."""
+    store = SweepStore(tmp_path_factory.mktemp("local"), "small")
+    launch(grid(), store, InlineExecutor(), stop=threading.Event())
+    return store
+
+
+@pytest.fixture(autouse=True)
+def reliable() -> Iterator[None]:
+    Unreliable.plan.clear()
+    yield
+    Unreliable.plan.clear()
+
+
+def assert_equal(ours: SweepStore, theirs: SweepStore) -> None:
+    """That both hold the same complete trials: rows byte for byte, parameters number for number."""
+    assert [trial.spec for trial in ours.trials()] == [trial.spec for trial in theirs.trials()] != []
+    for trial in theirs.trials():
+        assert_equal_trial(ours.trial(trial.spec), trial)
+
+
+def assert_equal_trial(ours: TrialStore, theirs: TrialStore) -> None:
+    assert ours.record().status is TrialState.COMPLETE
+    assert ours.episodes_path.read_bytes() == theirs.episodes_path.read_bytes()
+    assert ours.evaluation_path.read_bytes() == theirs.evaluation_path.read_bytes()
+    assert ours.events_path.read_bytes() == theirs.events_path.read_bytes()
+    mine, other = ours.latest_checkpoint(), theirs.latest_checkpoint()
+    assert mine is not None and other is not None
+    np.testing.assert_equal(mine["trial"], other["trial"])
+
+
+def test_a_sweep_in_an_object_store_is_the_sweep_of_a_folder(tmp_path: Path, local: SweepStore) -> None:
+    one = machine(tmp_path, "one")
+    result = one.launch()
+    assert result.progress.is_complete
+    assert_equal(one.store, local)
+    other = machine(tmp_path, "other")
+    other.storage.mark(other.store)
+    other.storage.pull(other.store)
+    assert_equal(other.store, local)
+    assert other.store.specs() == local.specs()
+    again = other.launch()
+    assert again.plan.to_do == ()
+    assert not [key for key in one.storage.objects.keys_in() if "probe" in key or "launch" in key]
+
+
+def test_a_damaged_mirror_says_that_it_is_one(tmp_path: Path, local: SweepStore) -> None:
+    one = machine(tmp_path, "one")
+    one.launch()
+    other = machine(tmp_path, "other")
+    other.storage.mark(other.store)
+    other.storage.pull(other.store)
+    trial = other.store.trial(grid().trials()[0])
+    whole = trial.episodes_path.read_bytes()
+    trial.episodes_path.write_bytes(whole[:-1])
+    assert trial.record().error == (
+        f"episodes.csv has {len(whole) - 1:,} of its {len(whole):,} committed bytes; the sweep's folder is a "
+        "mirror here: delete it, and it is fetched again"
+    )
+    shutil.rmtree(other.store.folder)
+    again = machine(tmp_path, "other")
+    again.storage.mark(again.store)
+    again.storage.pull(again.store)
+    assert_equal(again.store, local)
+
+
+def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
+    here = machine(tmp_path, "here")
+    with pytest.raises(RecrlError, match="trials of a sweep that is kept there are not run again: "):
+        launch(
+            grid(),
+            here.store,
+            InlineExecutor(here.storage),
+            stop=threading.Event(),
+            storage=here.storage,
+            rerun_damaged=True,
+        )
+    assert not here.store.folder.exists()
+
+
+def test_a_trial_stopped_again_and_again_on_other_machines_equals_itself(
+    tmp_path: Path, local: SweepStore
+) -> None:
+    spec = grid().trials()[1]
+    for number, updates in enumerate((1, 0, 3, 99)):
+        here = machine(tmp_path, f"machine {number}")
+        answers = iter([False] * updates + [True] * 99)
+        with here.storage.working_copy(spec, never) as trial:
+            run_recorded(spec, trial, should_stop=partial(next, answers))
+        assert not trial.folder.exists()  # what a machine had is gone
+    seen = machine(tmp_path, "seen")
+    seen.storage.pull(seen.store)
+    assert seen.store.trial(spec).record().attempt == 4
+    assert_equal_trial(seen.store.trial(spec), local.trial(spec))
+
+
+def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local: SweepStore) -> None:
+    spec = grid().trials()[0]
+    program = (
+        "import json, sys, threading\n"
+        "from recrl.orchestrator.remote.remote_sweep import RemoteSweep\n"
+        "from recrl.orchestrator.spec import TrialSpec\n"
+        "from recrl.orchestrator.trial.trial import run_recorded\n"
+        "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
+        "asked = iter(range(99))\n"
+        "hang = lambda: next(asked) >= 3 and threading.Event().wait()\n"
+        "with RemoteSweep(sys.argv[1], 'small').working_copy(spec, hang) as trial:\n"
+        "    run_recorded(spec, trial, should_stop=hang, commit_seconds=0.0)\n"
+    )
+    first, seen = machine(tmp_path, "first"), machine(tmp_path, "seen")
+    arguments = [first.storage.uri, json.dumps(spec.to_json())]
+    process = subprocess.Popen([sys.executable, "-c", program, *arguments])
+    deadline = time.monotonic() + 60.0
+    while seen.store.trial(spec).saved_update < 3 and time.monotonic() < deadline:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(0.1)
+        seen.storage.pull(seen.store, checkpoints=True)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert seen.store.trial(spec).record().status is TrialState.RUNNING  # it had no time to say otherwise
+    second = machine(tmp_path, "second")
+    second.launch()
+    assert second.store.trial(spec).record().attempt == 2
+    assert "resumed after update 3" in second.store.trial(spec).log_path.read_text()
+    assert_equal(second.store, local)
+
+
+def test_a_storage_that_is_down_for_a_while_loses_nothing(
+    tmp_path: Path, local: SweepStore, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.remote.remote_trial.FIRST_PAUSE_SECONDS", 0.01)
+    here = machine(tmp_path, "here", "unreliable")
+    spec = grid().trials()[1]
+    with here.storage.working_copy(spec, never) as trial:
+        Unreliable.plan += ["refused", "cut"] * 4
+        run_recorded(spec, trial, should_stop=never, commit_seconds=0.0)
+    assert "cannot be written (OSError: the network is down); it is tried again for 15 minutes" in caplog.text
+    here.storage.pull(here.store)
+    assert_equal_trial(here.store.trial(spec), local.trial(spec))
+
+
+def test_a_storage_that_stays_down_is_given_up_and_the_trial_goes_on_later(
+    tmp_path: Path, local: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.remote.remote_trial.PATIENCE_SECONDS", 0.0)
+    here = machine(tmp_path, "here", "unreliable")
+    spec = grid().trials()[1]
+    with (
+        pytest.raises(StorageError, match="the network is down"),
+        here.storage.working_copy(spec, never) as trial,
+    ):
+        Unreliable.plan += ["refused"] * 1000
+        run_recorded(spec, trial, should_stop=never)
+    Unreliable.plan.clear()
+    here.storage.pull(here.store)
+    assert here.store.trial(spec).record().status is not TrialState.COMPLETE
+    here.launch()
+    assert_equal(here.store, local)
+
+
+def test_an_attempt_that_was_taken_over_ends_itself(tmp_path: Path) -> None:
+    spec = grid().trials()[0]
+    here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
+    with here.storage.working_copy(spec, never) as orphan:
+        writer = orphan.begin(spec)
+        deadline = time.monotonic() + 30.0
+        while not here.storage.objects.keys_in("trials") and time.monotonic() < deadline:
+            os.sched_yield()
+        with there.storage.working_copy(spec, never) as successor:
+            successor.begin(spec)
+        writer.commit({}, update=1, env_steps=40)
+        while orphan.record().token and time.monotonic() < deadline:
+            os.sched_yield()
+        with pytest.raises(LostLeaseError):
+            writer.commit({}, update=2, env_steps=80)
+    there.storage.pull(there.store)
+    assert there.store.trial(spec).record().update == 0
+
+
+def test_one_launch_at_a_time_and_a_dead_one_frees_the_sweep(tmp_path: Path) -> None:
+    one, other = machine(tmp_path, "one"), machine(tmp_path, "other")
+    with one.storage.held(threading.Event()):
+        assert other.storage.is_held()
+        with pytest.raises(SweepBusyError) as error, other.storage.held(threading.Event()):
+            pass
+        assert str(error.value).startswith(
+            f"file://{tmp_path}/bucket/small: this sweep is already being run by process {os.getpid()} on "
+        )
+        assert str(error.value).endswith("the sweep is free after 90 seconds of silence)")
+    assert not other.storage.is_held()
+    elsewhere = {"host": "elsewhere", "pid": 1, "token": "1", "boot": "1"}
+    for holder, free in (
+        ({**elsewhere, "at": time.time()}, False),
+        ({**elsewhere, "at": time.time() - SILENT_SECONDS - 1.0}, True),
+        ({}, True),
+    ):
+        one.storage.objects.write("launch.json", json.dumps(holder).encode())
+        assert other.storage.is_held() is not free
+        if free:
+            with other.storage.held(threading.Event()):
+                assert other.storage.is_held()
+
+
+def test_a_launch_that_is_taken_over_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.BEAT_SECONDS", 0.01)
+    here, stop = machine(tmp_path, "here"), threading.Event()
+    with here.storage.held(stop):
+        taken = json.dumps(
+            {"host": "elsewhere", "pid": 1, "token": "1", "boot": "", "at": time.time()}
+        ).encode()
+        while not stop.is_set():
+            here.storage.objects.write("launch.json", taken)
+            stop.wait(0.05)
+    assert here.storage.is_held()  # by the other one
+
+
+def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.LOOK_SECONDS", 0.01)
+    here, there, stop = machine(tmp_path, "here"), machine(tmp_path, "there"), threading.Event()
+    assert not request_stop(there.store, there.storage)()
+    with here.storage.held(stop):
+        still_runs = request_stop(there.store, there.storage)
+        assert stop.wait(30.0)
+        assert still_runs()
+    assert not still_runs()
+    assert here.storage.objects.keys_in() == []
+
+
+def test_a_mirror_is_too_old_to_judge_a_silence_by_a_third_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.PULL_SECONDS", 0.0)
+    here = machine(tmp_path, "here")
+    assert here.storage.is_out_of_touch(0.0)
+    assert not here.storage.is_out_of_touch(300.0)
+
+
+def test_workers_hear_of_the_end_of_their_own_run_and_of_all_earlier_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objects = ObjectStore(f"unreliable://{tmp_path}/bucket/small")
+    with StopObject.open(objects) as earlier:
+        assert not StopObject(objects, earlier.place).is_set()
+        with StopObject.open(objects) as sign:
+            assert StopObject(objects, earlier.place).is_set()
+            worker = StopObject(objects, sign.place)
+            assert not worker.is_set()
+            Unreliable.plan.append("refused")
+            sign.set()
+            assert not sign.is_set()
+            sign.set()
+            assert not worker.is_set()  # it asked a moment ago
+            monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.STOP_QUESTION_SECONDS", 0.0)
+            assert worker.is_set()
+    assert objects.keys_in() == []
+
+
+def test_what_only_the_launch_knows_of_a_trial_is_seen_elsewhere(tmp_path: Path) -> None:
+    here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
+    crashed, silent = grid().trials()
+    for spec in (crashed, silent):
+        with here.storage.working_copy(spec, never) as trial:
+            trial.begin(spec)
+    here.storage.pull(here.store)
+    here.store.trial(crashed).set_status(TrialState.FAILED, error="failures of its process: 4")
+    here.store.trial(silent).set_status(TrialState.WAITING)
+    here.storage.settle([crashed, silent], here.store)
+    there.storage.pull(there.store)
+    record = there.store.trial(crashed).record()
+    assert (record.status, record.error) == (TrialState.FAILED, "failures of its process: 4")
+    assert there.store.trial(silent).record().status is TrialState.WAITING
+
+
+def test_a_launch_that_was_taken_over_leaves_the_trials_of_the_other_alone(tmp_path: Path) -> None:
+    here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
+    spec = grid().trials()[0]
+    trial = TrialStore(tmp_path / spec.folder_name)
+    upload = Upload(there.storage.trial(spec.folder_name), trial)
+    with there.storage.held(threading.Event()):
+        trial.begin(spec)
+        upload.push()
+        here.storage.pull(here.store)
+        here.store.trial(spec).set_status(TrialState.WAITING)
+        here.storage.settle([spec], here.store)
+        upload.push()
+    here.storage.settle([spec], here.store)
+    with pytest.raises(LostLeaseError):  # of a launch that is over
+        upload.push()
+
+
+def test_the_command_line_takes_the_address_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grid.yaml").write_text(GRID)
+    uri = f"file://{tmp_path}/bucket"
+    sweep = ["--only", "method=none"]
+    assert main(["launch", "grid.yaml", *INLINE, *sweep, "--storage", uri]) == ExitCode.OK
+    assert f"Results    runs/small, a mirror of {uri}/small\n" in capsys.readouterr().out
+    elsewhere = ["--root", "elsewhere"]
+    assert main(["status", "--brief", "--storage", uri, *elsewhere]) == ExitCode.OK
+    assert capsys.readouterr().out == "small: 1 of 2 complete, 0 running, 1 waiting, 0 failed; 50%\n"
+    assert main(["launch", "grid.yaml", *INLINE, *elsewhere]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["status", "--brief"]) == ExitCode.OK
+    assert capsys.readouterr().out == "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
+    assert main(["logs", "small", "two-state ppo-lag linear", *elsewhere]) == ExitCode.OK
+    assert "complete: 8 updates" in capsys.readouterr().out
+    assert main(["stop", "small", *elsewhere]) == ExitCode.OK
+    assert capsys.readouterr().out == "small: no launch runs this sweep\n"
+    assert main(["evaluate", "small", "two-state ppo-lag none", "--root", "third", "--storage", uri]) == 0
+
+
+def test_a_folder_is_the_mirror_of_one_address_or_none(tmp_path: Path, local: SweepStore) -> None:
+    here = machine(tmp_path, "here")
+    with pytest.raises(RecrlError, match=r": this sweep is kept in that folder, not at file://"):
+        here.storage.mark(local)
+    here.storage.mark(here.store)
+    here.storage.mark(here.store)
+    with pytest.raises(RecrlError, match=r": this sweep is kept at file://.*/bucket, not at file:///other; "):
+        RemoteSweep("file:///other", "small").mark(here.store)
+
+
+@pytest.mark.parametrize(
+    ("storage", "code", "sentence"),
+    [
+        (
+            "bucket",
+            ExitCode.WRONG_INPUT,
+            "the storage must be an address such as s3://bucket/folder, got 'bucket'",
+        ),
+        (
+            "lacking://b/x",
+            ExitCode.WRONG_INPUT,
+            "lacking://b/x: lacking:// needs a package that is not installed: ",
+        ),
+        (
+            "unreliable:///b",
+            ExitCode.CANNOT_RUN,
+            "unreliable:///b/small: cannot be written (OSError: the network is",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_a_sentence_before_any_work(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    storage: str,
+    code: ExitCode,
+    sentence: str,
+) -> None:
+    fsspec.register_implementation("lacking", "no_such_package.LackingFileSystem", errtxt="?", clobber=True)
+    Unreliable.plan += ["refused"]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grid.yaml").write_text(GRID)
+    assert main(["launch", "grid.yaml", *INLINE, "--storage", storage]) == code
+    assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
+    assert [path.name for path in tmp_path.iterdir()] == ["grid.yaml"]
+
+
+def test_memory_is_for_one_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grid.yaml").write_text(GRID)
+    assert main(["launch", "grid.yaml", "--storage", "memory://bucket"]) == ExitCode.WRONG_INPUT
+    assert "is one process's memory, which others do not see" in capsys.readouterr().err

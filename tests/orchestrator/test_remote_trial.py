@@ -1,0 +1,453 @@
+"""A trial in an object store is there whole or as it was before, whoever writes, fails or comes back."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError
+from recrl.orchestrator.files.store import TrialStore, TrialWriter
+from recrl.orchestrator.remote.object_store import ObjectStore
+from recrl.orchestrator.remote.remote_trial import Manifest, RemoteTrial, Upload
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from tests.faults.unreliable import Unreliable
+
+SPEC = TrialSpec(
+    task=Choice("two-state"),
+    agent=Choice("ppo-lag"),
+    method=Choice("none"),
+    train_limits=CostLimits.unlimited(1),
+    deploy_limits=CostLimits((5.0,)),
+    train_steps=95,
+    deploy_steps=5,
+    num_envs=1,
+    rollout_steps=10,
+    evaluation_episodes=0,
+    seed=0,
+)
+
+
+@pytest.fixture(params=["file", "memory", "unreliable"])
+def remote(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[RemoteTrial]:
+    Unreliable.plan.clear()
+    yield RemoteTrial(ObjectStore(f"{request.param}://{tmp_path}/bucket"), SPEC.folder_name)
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> RemoteTrial:
+    """One whose objects are files below ``bucket``."""
+    Unreliable.plan.clear()
+    return RemoteTrial(ObjectStore(f"unreliable://{tmp_path}/bucket"), SPEC.folder_name)
+
+
+class Machine:
+    """A machine that takes the trial up: its folder, its writer and its upload."""
+
+    def __init__(self, remote: RemoteTrial, folder: Path) -> None:
+        self.trial = TrialStore(folder / SPEC.folder_name)
+        remote.take_up(self.trial)
+        self.upload = Upload(remote, self.trial)
+        self.writer: TrialWriter = self.trial.begin(SPEC)
+        self.restored = self.writer.restore()
+
+    def work(self, update: int) -> None:
+        """One update's rows, committed, and not yet sent."""
+        episode = EpisodeStats(
+            index=update,
+            phase=Phase.TRAINING,
+            end_step=10 * update,
+            length=10,
+            episode_return=0.1 * update,
+            costs=(1.0 / 3.0,),
+            limits=CostLimits.unlimited(1),
+            noise=0.0,
+        )
+        self.writer.append_episode(episode)
+        self.writer.append_update({"update": update, "limit_0": float("inf")})
+        self.writer.commit(tree(update), update=update, env_steps=10 * update)
+
+
+def tree(update: int) -> dict[str, Any]:
+    return {"update": update, "weights": np.full(3, update, dtype=np.float32)}
+
+
+def mirror(remote: RemoteTrial, folder: Path, *, checkpoints: bool = True) -> TrialStore:
+    trial = TrialStore(folder / SPEC.folder_name)
+    remote.mirror(trial, checkpoints=checkpoints)
+    return trial
+
+
+def updates(trial: TrialStore) -> list[int]:
+    """The committed updates of a trial whose files belong together."""
+    frame = trial.updates()
+    found = frame["update"].tolist() if len(frame) else []
+    assert found == (trial.episodes()["index"].tolist() if len(frame) else [])
+    checkpoint = trial.latest_checkpoint()
+    assert (checkpoint["trial"]["update"] if checkpoint else 0) == len(found)
+    assert found == list(range(1, len(found) + 1))
+    return found
+
+
+def test_a_trial_goes_on_elsewhere_with_what_was_sent_last(remote: RemoteTrial, tmp_path: Path) -> None:
+    first = Machine(remote, tmp_path / "first")
+    assert first.restored is None
+    first.work(1)
+    first.work(2)
+    first.upload.push()
+    first.work(3)  # dies before this is sent
+    second = Machine(remote, tmp_path / "second")
+    np.testing.assert_equal(second.restored, tree(2))
+    assert second.trial.record().attempt == 2
+    second.work(3)
+    second.work(4)
+    second.writer.close(TrialState.COMPLETE)
+    second.upload.finish()
+    there = mirror(remote, tmp_path / "mirror")
+    assert updates(there) == [1, 2, 3, 4]
+    assert there.record() == second.trial.record()
+    for path in ("episodes_path", "updates_path", "spec_path"):
+        assert getattr(there, path).read_bytes() == getattr(second.trial, path).read_bytes()
+
+
+def test_a_mirror_follows_commit_by_commit(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    for update in range(1, 8):
+        machine.work(update)
+        machine.upload.push()
+        there = mirror(bucket, tmp_path / "mirror")
+        assert updates(there) == list(range(1, update + 1))
+        assert there.episodes_path.read_bytes() == machine.trial.episodes_path.read_bytes()
+
+
+def test_a_mirror_leaves_checkpoints_of_running_trials_where_they_are(
+    bucket: RemoteTrial, tmp_path: Path
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    assert mirror(bucket, tmp_path / "mirror", checkpoints=False).checkpoints() == []
+    assert len(mirror(bucket, tmp_path / "mirror", checkpoints=True).checkpoints()) == 1
+    machine.work(2)
+    machine.writer.close(TrialState.COMPLETE)
+    machine.upload.finish()
+    there = mirror(bucket, tmp_path / "mirror", checkpoints=False)
+    assert [path.name for path in there.checkpoints()] == ["checkpoint-00000002.recrl"]
+
+
+def test_many_commits_leave_few_objects(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    for update in range(1, 33):
+        machine.work(update)
+        machine.upload.push()
+    assert len(bucket.objects.keys_in()) < 2 * (
+        2 * 7 + 3
+    )  # two manifests; two row files of log2(64) + 1 parts
+    assert updates(mirror(bucket, tmp_path / "mirror")) == list(range(1, 33))
+
+
+def test_a_commit_that_broke_off_behind_its_checkpoint_takes_its_rows_along(
+    bucket: RemoteTrial, tmp_path: Path
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    record = machine.trial.state_path.read_bytes()
+    machine.work(2)
+    machine.trial.state_path.write_bytes(record)  # the disk was full
+    machine.upload.push()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2]
+    np.testing.assert_equal(Machine(bucket, tmp_path / "next").restored, tree(2))
+
+
+def test_signs_of_life_say_how_far_a_trial_is_and_commit_nothing(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    machine.writer.heartbeat(update=7, env_steps=70, steps_per_second=3.0)
+    machine.upload.follow()
+    there = mirror(bucket, tmp_path / "mirror")
+    assert (there.record().update, there.record().env_steps) == (7, 70)
+    assert updates(there) == [1]
+    machine.writer.close(TrialState.WAITING)
+    machine.upload.finish()
+    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.WAITING
+
+
+def test_what_a_dead_node_writes_late_is_not_read(bucket: RemoteTrial, tmp_path: Path) -> None:
+    orphan = Machine(bucket, tmp_path / "orphan")
+    orphan.work(1)
+    orphan.upload.push()
+    successor = Machine(bucket, tmp_path / "successor")
+    successor.upload.follow()
+    orphan.work(2)
+    orphan.work(3)
+    with pytest.raises(LostLeaseError, match="another attempt runs this trial now"):
+        orphan.upload.push()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+
+
+def test_not_even_what_was_under_way_when_it_was_declared_dead(bucket: RemoteTrial, tmp_path: Path) -> None:
+    orphan = Machine(bucket, tmp_path / "orphan")
+    orphan.work(1)
+    orphan.upload.push()
+    orphan.work(2)
+    orphan.upload.push()
+    late = {key: bucket.objects.read(key) for key in bucket.objects.keys_in()}
+    successor = Machine(bucket, tmp_path / "successor")
+    successor.work(3)
+    successor.upload.push()
+    for key, data in late.items():
+        assert data is not None
+        bucket.objects.write(key.replace("manifest-0000000", "manifest-0000009"), data)
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2, 3]
+    third = Machine(bucket, tmp_path / "third")
+    np.testing.assert_equal(third.restored, tree(3))
+    assert third.trial.record().attempt == 3
+    third.upload.push()
+    assert not [key for key in bucket.objects.keys_in() if key.startswith(("000001-", "000002-"))]
+
+
+def test_a_sign_of_life_of_an_attempt_before_the_manifests_is_passed_over(
+    bucket: RemoteTrial, tmp_path: Path
+) -> None:
+    first = Machine(bucket, tmp_path / "first")
+    first.work(1)
+    first.upload.follow()
+    keys = bucket.objects.keys_in()
+    [alive] = [key for key in keys if key.endswith("/alive.json")]
+    sign = bucket.objects.read(alive)
+    second = Machine(bucket, tmp_path / "second")
+    second.writer.close(TrialState.COMPLETE)
+    second.upload.finish()
+    assert sign is not None
+    bucket.objects.write(alive, sign)
+    trial = TrialStore(tmp_path / "mirror" / SPEC.folder_name)
+    bucket.mirror(trial, keys, checkpoints=True)
+    assert (trial.record().attempt, trial.record().status) == (2, TrialState.COMPLETE)
+
+
+def test_of_two_attempts_at_once_all_agree_on_one(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machines = [Machine(bucket, tmp_path / name) for name in ("one", "other")]
+    assert [machine.trial.record().attempt for machine in machines] == [1, 1]
+    loser, winner = sorted(machines, key=lambda machine: machine.trial.record().token)
+    winner.work(1)
+    winner.upload.push()
+    with pytest.raises(LostLeaseError):
+        loser.upload.push()
+    loser.upload.revoke()
+    with pytest.raises(LostLeaseError):
+        loser.writer.heartbeat(update=1, env_steps=10, steps_per_second=1.0)
+    assert mirror(bucket, tmp_path / "mirror").record().token == winner.trial.record().token
+
+
+@pytest.mark.parametrize("victim", ["parts/updates.csv.*", "parts/checkpoint*", "manifest-00000002.json"])
+@pytest.mark.parametrize("harm", ["cut", "gone"])
+def test_a_set_that_is_not_whole_is_not_there(
+    bucket: RemoteTrial, tmp_path: Path, victim: str, harm: str
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    before = set(bucket.objects.keys_in())
+    machine.work(2)
+    machine.upload.push()
+    new = set(bucket.objects.keys_in()) - before
+    [key] = [key for key in new if re.search(victim, key)]
+    path = tmp_path / "bucket" / key
+    if harm == "cut":
+        path.write_bytes(path.read_bytes()[:-3])
+    else:
+        path.unlink()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    np.testing.assert_equal(Machine(bucket, tmp_path / "next").restored, tree(1))
+
+
+def test_a_manifest_cannot_name_files_that_no_trial_has(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.upload.push()
+    [key] = [key for key in bucket.objects.keys_in() if "manifest" in key]
+    text = (bucket.objects.read(key) or b"").decode()
+    assert Manifest.from_bytes(text.encode()).record == machine.trial.record()
+    for wrong in (
+        text.replace("spec.json", "../../evil"),
+        text.replace('"format": 1', '"format": 2'),
+        "[]",
+        "",
+    ):
+        with pytest.raises(ValueError, match=r"manifest|Expecting"):
+            Manifest.from_bytes(wrong.encode())
+    value = json.loads(text)
+    value["files"]["spec.json"][0]["start"] = 1
+    with pytest.raises(ValueError, match="leave a gap"):
+        Manifest.from_bytes(json.dumps(value).encode())
+
+
+def test_a_verdict_from_outside_stands_until_the_trial_speaks(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.follow()
+    there = mirror(bucket, tmp_path / "mirror")
+    there.set_status(TrialState.FAILED, error="its process died")
+    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.FAILED
+    successor = Machine(bucket, tmp_path / "successor")
+    successor.upload.follow()
+    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.RUNNING
+
+
+def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    machine.work(2)
+    Unreliable.plan += ["ok", "cut"]
+    with pytest.raises(
+        StorageError, match=r"^unreliable://.*/bucket: cannot be written \(OSError: the network is down\)$"
+    ):
+        machine.upload.push()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    machine.work(3)
+    machine.upload.push()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2, 3]
+
+
+def test_a_manifest_whose_answer_was_lost_is_not_taken_for_the_next(
+    bucket: RemoteTrial, tmp_path: Path
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    Unreliable.plan += ["ok"] * 4 + ["lost"]  # two row files, the spec and a checkpoint; the manifest
+    with pytest.raises(StorageError):
+        machine.upload.push()
+    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    machine.writer.close(TrialState.COMPLETE)
+    machine.upload.finish()
+    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.COMPLETE
+    manifests = [key for key in bucket.objects.keys_in() if "/manifest-" in key]
+    assert [key.rpartition("/")[2] for key in manifests] == ["manifest-00000002.json"]
+
+
+STEPS = st.lists(
+    st.sampled_from(["work", "push", "push", "take over", "refused", "cut", "lost", "ok"]),
+    min_size=1,
+    max_size=20,
+)
+
+
+@given(steps=STEPS)
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_whatever_fails_readers_see_one_commit_and_the_end_is_complete(
+    steps: list[str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("example")
+    Unreliable.plan.clear()
+    remote = RemoteTrial(ObjectStore(f"unreliable://{folder}/bucket"), SPEC.folder_name)
+    machine = Machine(remote, folder / "0")
+    seen = 0
+    for number, step in enumerate([*steps, "end"]):
+        update = machine.trial.record().update if machine.trial.checkpoints() else 0
+        if step == "work":
+            machine.work(update + 1)
+        elif step == "take over":
+            machine = Machine(remote, folder / str(number + 1))
+        elif step in ("refused", "cut", "lost", "ok"):
+            Unreliable.plan.append(step)
+        elif step == "end":
+            Unreliable.plan.clear()
+            machine.writer.close(TrialState.COMPLETE)
+            machine.upload.finish()
+            assert updates(mirror(remote, folder / "mirror")) == list(range(1, update + 1))
+            assert mirror(remote, folder / "mirror").record().status is TrialState.COMPLETE
+        else:
+            try:
+                machine.upload.push()
+                assert updates(mirror(remote, folder / "mirror")) == list(range(1, update + 1))
+            except StorageError:
+                pass
+        found = updates(mirror(remote, folder / f"mirror at {number}"))
+        assert len(found) >= seen  # what was once there stays
+        seen = len(found)
+
+
+def test_addresses_that_are_none_are_a_sentence() -> None:
+    for wrong in ("bucket/folder", "s3://", "simplecache::s3://bucket/folder"):
+        with pytest.raises(RecrlError) as error:
+            ObjectStore(wrong)
+        assert str(error.value) == (
+            f"the storage must be an address such as s3://bucket/folder, got {wrong!r}"
+        )
+    with pytest.raises(RecrlError, match=r"^s4://bucket: no kind of storage is called 's4'; fsspec knows "):
+        ObjectStore("s4://bucket")
+
+
+def test_credentials_are_neither_taken_nor_shown() -> None:
+    for uri, shown in (
+        ("ftp://me:hunter2@host/folder", "ftp://host/folder"),
+        ("s3://AKIA:hunter2/+x@bucket/folder", "s3://bucket/folder"),
+        ("s3://bucket/x?key=hunter2", "s3://bucket/x"),
+    ):
+        with pytest.raises(RecrlError) as error:
+            ObjectStore(uri)
+        assert str(error.value).startswith(f"{shown}: credentials do not belong into the address; ")
+        assert "hunter2" not in str(error.value)
+
+
+def test_a_missing_package_is_named() -> None:
+    fsspec.register_implementation("nowhere", "no_such_package.NowhereFileSystem", errtxt="?", clobber=True)
+    with pytest.raises(RecrlError) as error:
+        ObjectStore("nowhere://bucket/folder")
+    assert str(error.value) == (
+        "nowhere://bucket/folder: nowhere:// needs a package that is not installed: "
+        "pip install no_such_package, on every machine"
+    )
+
+
+def test_a_probe_finds_what_is_wrong_and_leaves_nothing(tmp_path: Path) -> None:
+    Unreliable.plan.clear()
+    store = ObjectStore(f"unreliable://{tmp_path}/bucket")
+    store.probe()
+    assert store.keys_in() == []
+    for fate in ("refused", "cut"):
+        Unreliable.plan.append(fate)
+        with pytest.raises(StorageError, match="the network is down"):
+            store.probe()
+
+
+def test_only_one_creates_an_object(remote: RemoteTrial) -> None:
+    assert remote.objects.create("launch.json", b"first")
+    assert not remote.objects.create("launch.json", b"second")
+    assert remote.objects.read("launch.json") == b"first"
+    remote.objects.delete(["launch.json", "launch.json"])
+    assert remote.objects.read("launch.json") is None
+
+
+def test_a_store_without_exclusive_writes_is_looked_at_first(bucket: RemoteTrial) -> None:
+    Unreliable.plan.append("unsupported")
+    assert bucket.objects.create("launch.json", b"first")
+    Unreliable.plan.append("unsupported")
+    assert not bucket.objects.create("launch.json", b"second")
+    assert bucket.objects.read("launch.json") == b"first"
+
+
+def test_who_cannot_create_exclusively_for_once_does_not_write_all_the_same(bucket: RemoteTrial) -> None:
+    Unreliable.plan.append("refused")
+    with pytest.raises(StorageError, match=r"launch|cannot be written"):
+        bucket.objects.create("launch.json", b"first")
+    assert bucket.objects.read("launch.json") is None
+
+
+def test_names_are_those_right_below(remote: RemoteTrial) -> None:
+    for key in ("a/x", "a/b/y", "c"):
+        remote.objects.write(key, b"1")
+    assert remote.objects.keys_in() == ["a/b/y", "a/x", "c"]
+    assert remote.objects.keys_in("a") == ["b/y", "x"]
+    assert remote.objects.keys_in("nowhere") == []
+    assert remote.objects.names("file") == ["c"]
+    assert remote.objects.names("directory") == ["a"]
+    assert remote.objects.below("a").read("x") == b"1"

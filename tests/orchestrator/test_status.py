@@ -1,0 +1,130 @@
+"""Progress is read from files alone, and the silence of a trial is noticed."""
+
+import io
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from recrl.orchestrator.cli import display
+from recrl.orchestrator.files.store import SweepStore, TrialRecord
+from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.plan import make_plan
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.status import (
+    SILENCE_SECONDS,
+    Standing,
+    SweepProgress,
+    TrialProgress,
+    progress,
+    standing_of,
+)
+
+GRID = b"""\
+name: status
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [ppo-lag]
+methods: [none, linear, cosine]
+seeds: 2
+run: {total_steps: 1000, num_envs: 1}
+"""
+SPECS = parse_grid(GRID, source="grid.yaml").trials()
+
+
+def _trial(spec: TrialSpec, record: TrialRecord) -> TrialProgress:
+    return TrialProgress(spec, standing_of(record, now=1000.0), record)
+
+
+RUNNING = TrialRecord(TrialState.RUNNING, attempt=1, env_steps=250, heartbeat=995.0, steps_per_second=50.0)
+
+
+def test_a_silent_trial_is_interrupted() -> None:
+    assert standing_of(RUNNING, now=995.0 + SILENCE_SECONDS) is Standing.RUNNING
+    assert standing_of(RUNNING, now=995.1 + SILENCE_SECONDS) is Standing.INTERRUPTED
+
+
+@pytest.mark.parametrize(
+    ("record", "standing"),
+    [
+        (TrialRecord(), Standing.WAITING),
+        (TrialRecord(TrialState.WAITING, attempt=1), Standing.STOPPED),
+        (TrialRecord(TrialState.COMPLETE, attempt=1), Standing.COMPLETE),
+        (TrialRecord(TrialState.FAILED, attempt=1), Standing.FAILED),
+    ],
+)
+def test_every_state_has_its_standing(record: TrialRecord, standing: Standing) -> None:
+    assert standing_of(record, now=1e9) is standing
+
+
+def test_the_time_left_counts_what_runs_and_what_waits_but_not_what_failed() -> None:
+    sweep = SweepProgress(
+        (
+            _trial(SPECS[0], RUNNING),
+            _trial(SPECS[1], replace(RUNNING, steps_per_second=100.0, env_steps=500)),
+            _trial(SPECS[2], TrialRecord()),
+            _trial(SPECS[3], TrialRecord(TrialState.COMPLETE, attempt=1, env_steps=1000)),
+            _trial(SPECS[4], TrialRecord(TrialState.FAILED, attempt=1, env_steps=10)),
+        )
+    )
+    assert sweep.steps_per_second == 150.0
+    assert sweep.steps_left == 750 + 500 + 1000
+    assert sweep.seconds_left == 15.0
+    assert sweep.fraction == pytest.approx((0.25 + 0.5 + 0.0 + 1.0 + 0.01) / 5)
+    assert display.status_sentence(sweep) == (
+        "1 of 5 complete, 2 running, 1 waiting, 1 failed; 35%; 150 steps/s; 15 s left"
+    )
+
+
+def test_nothing_running_has_no_time_left() -> None:
+    sweep = SweepProgress(
+        (_trial(SPECS[0], replace(RUNNING, heartbeat=0.0)), _trial(SPECS[1], TrialRecord()))
+    )
+    assert sweep.seconds_left is None
+    assert display.status_sentence(sweep) == (
+        "0 of 2 complete, 0 running, 1 waiting, 0 failed, 1 interrupted; 12%"
+    )
+
+
+def test_progress_is_what_the_files_say(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "status")
+    writer = store.trial(SPECS[0]).begin(SPECS[0])
+    writer.commit({}, update=1, env_steps=1000)
+    writer.close(TrialState.COMPLETE)
+    store.trial(SPECS[1]).begin(SPECS[1]).heartbeat(update=1, env_steps=500, steps_per_second=7.0)
+    sweep = progress(SPECS, store)
+    standings = [trial.standing for trial in sweep.trials]
+    assert standings == [Standing.COMPLETE, Standing.RUNNING, *[Standing.WAITING] * 4]
+    assert sweep.fraction == 0.25
+    assert not sweep.is_complete
+
+
+def test_the_tables_have_a_line_for_every_trial(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "status")
+    console = Console(file=io.StringIO(), width=160)
+    console.print(display.status_table(progress(SPECS, store)))
+    console.print(display.plan_table(make_plan(SPECS, store)))
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    for spec in SPECS:
+        assert text.count(spec.trial_id) == 2
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_live_display_ends_with_its_context(tmp_path: Path, terminal: bool) -> None:
+    store = SweepStore(tmp_path, "status")
+    store.trial(SPECS[0]).begin(SPECS[0]).heartbeat(update=1, env_steps=500, steps_per_second=7.0)
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=160)
+    asked = threading.Event()
+
+    def ask() -> SweepProgress:
+        asked.set()
+        return progress(SPECS, store)
+
+    with display.live_progress(ask, console):
+        if terminal:
+            assert asked.wait(30.0)
+    assert not any(thread.name == "progress" for thread in threading.enumerate())
+    assert isinstance(console.file, io.StringIO)
+    assert ("two-state ppo-lag none seed 0" in console.file.getvalue()) == terminal

@@ -1,0 +1,220 @@
+"""Nothing committed is ever lost, nothing is there twice, and one attempt at a time may write."""
+
+import json
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.orchestrator.errors import LostLeaseError, SweepBusyError
+from recrl.orchestrator.files.small_files import write_atomically
+from recrl.orchestrator.files.store import SweepStore, TrialStore, TrialWriter
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+
+SPEC = TrialSpec(
+    task=Choice("two-state"),
+    agent=Choice("ppo-lag"),
+    method=Choice("none"),
+    train_limits=CostLimits.unlimited(1),
+    deploy_limits=CostLimits((5.0,)),
+    train_steps=95,
+    deploy_steps=5,
+    num_envs=1,
+    rollout_steps=10,
+    evaluation_episodes=0,
+    seed=0,
+)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> TrialStore:
+    return SweepStore(tmp_path, "sweep").trial(SPEC)
+
+
+def episode(index: int) -> EpisodeStats:
+    return EpisodeStats(
+        index=index,
+        phase=Phase.TRAINING,
+        end_step=10 * index,
+        length=10,
+        episode_return=0.1 * index,
+        costs=(1.0 / 3.0,),
+        limits=CostLimits.unlimited(1),
+        noise=0.0,
+    )
+
+
+def work(writer: TrialWriter, update: int) -> None:
+    """One update's rows, committed."""
+    writer.append_episode(episode(update))
+    writer.append_update({"update": update, "limit_0": float("inf"), "kl": float("nan")})
+    writer.append_event({"update": update, "end_step": 10 * update, "event": "noise"})
+    writer.commit(tree(update), update=update, env_steps=10 * update)
+
+
+def tree(update: int) -> dict[str, Any]:
+    return {"update": update, "weights": np.full(3, update, dtype=np.float32)}
+
+
+def test_committed_rows_read_back_exactly(store: TrialStore) -> None:
+    writer = store.begin(SPEC)
+    work(writer, 1)
+    work(writer, 2)
+    assert store.spec == SPEC
+    assert store.episodes()["episode_return"].tolist() == [0.1, 0.2]
+    assert store.episodes()["cost_0"].tolist() == [1.0 / 3.0] * 2
+    assert store.episodes()["limit_0"].tolist() == [float("inf")] * 2
+    assert store.updates()["update"].tolist() == [1, 2]
+    assert [event["update"] for event in store.events()] == [1, 2]
+    assert store.record().env_steps == 20
+
+
+def test_uncommitted_rows_are_invisible(store: TrialStore) -> None:
+    writer = store.begin(SPEC)
+    work(writer, 1)
+    writer.append_episode(episode(2))
+    assert len(store.episodes()) == 1
+
+
+def test_restore_cuts_rows_back_to_the_checkpoint(store: TrialStore) -> None:
+    work(store.begin(SPEC), 1)
+    with store.episodes_path.open("a") as file:
+        file.write("a row whose commit never came\n")
+    writer = store.begin(SPEC)
+    restored = writer.restore()
+    np.testing.assert_equal(restored, tree(1))
+    work(writer, 2)
+    assert store.episodes()["index"].tolist() == [1, 2]
+
+
+def test_damaged_checkpoint_falls_back_to_the_one_before(store: TrialStore) -> None:
+    writer = store.begin(SPEC)
+    for update in (1, 2, 3):
+        work(writer, update)
+    newest = store.checkpoints()[0]
+    newest.write_bytes(newest.read_bytes()[:-1])
+    writer = store.begin(SPEC)
+    np.testing.assert_equal(writer.restore(), tree(2))
+    assert store.episodes()["index"].tolist() == [1, 2]
+    assert newest.with_suffix(".damaged").exists()
+
+
+def test_without_an_intact_checkpoint_the_trial_starts_afresh(store: TrialStore) -> None:
+    work(store.begin(SPEC), 1)
+    for path in store.checkpoints():
+        path.write_bytes(b"")
+    writer = store.begin(SPEC)
+    assert writer.restore() is None
+    assert store.episodes().empty
+
+
+def test_two_checkpoints_are_kept(store: TrialStore) -> None:
+    writer = store.begin(SPEC)
+    for update in range(1, 6):
+        work(writer, update)
+    assert [path.name for path in store.checkpoints()] == [
+        "checkpoint-00000005.recrl",
+        "checkpoint-00000004.recrl",
+    ]
+
+
+def test_only_the_newest_attempt_may_write(store: TrialStore) -> None:
+    orphan = store.begin(SPEC)
+    work(orphan, 1)
+    heir = store.begin(SPEC)
+    heir.restore()
+    before = store.episodes_path.read_bytes()
+    orphan.append_episode(episode(2))
+    writes: list[Callable[[], None]] = [
+        lambda: orphan.commit(tree(2), update=2, env_steps=20),
+        lambda: orphan.heartbeat(update=2, env_steps=20, steps_per_second=1.0),
+        lambda: orphan.close(TrialState.COMPLETE),
+        lambda: orphan.write_evaluation([{"policy": "stochastic"}]),
+    ]
+    for write in writes:
+        with pytest.raises(LostLeaseError, match="another attempt runs this trial now"):
+            write()
+    assert store.episodes_path.read_bytes() == before
+    assert store.record().attempt == 2
+    work(heir, 2)
+    assert store.record().status is TrialState.RUNNING
+
+
+def test_a_commit_that_fails_leaves_the_one_before(store: TrialStore) -> None:
+    writer = store.begin(SPEC)
+    work(writer, 1)
+    writer.append_episode(episode(2))
+    with pytest.raises(TypeError):
+        writer.commit({"bad": object()}, update=2, env_steps=20)
+    assert store.episodes()["index"].tolist() == [1]
+    writer.commit(tree(2), update=2, env_steps=20)  # the rows were not lost, and are there once
+    assert store.episodes()["index"].tolist() == [1, 2]
+
+
+def test_cpu_seconds_add_up_over_attempts(store: TrialStore) -> None:
+    writer = store.begin(SPEC)
+    work(writer, 1)
+    first = store.record().cpu_seconds
+    writer = store.begin(SPEC)
+    writer.restore()
+    assert first <= writer.cpu_seconds < first + 5.0
+
+
+def test_atomic_write_leaves_no_litter(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+    write_atomically(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_state_is_strict_json(store: TrialStore) -> None:
+    store.begin(SPEC)
+
+    def refuse(token: str) -> float:
+        raise AssertionError(token)
+
+    json.loads(store.state_path.read_text(), parse_constant=refuse)
+    json.loads(store.spec_path.read_text(), parse_constant=refuse)
+
+
+def test_one_process_at_a_time_runs_a_sweep(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    with store.lock(), pytest.raises(SweepBusyError, match="already being run by process"), store.lock():
+        pass
+    with store.lock():
+        pass
+
+
+def test_who_only_looks_whether_a_sweep_runs_keeps_nobody_from_running_it(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep")
+    with store.lock():
+        pass
+    over = threading.Event()
+
+    def look_all_the_time() -> None:
+        while not over.is_set():
+            store.is_locked()
+
+    with ThreadPoolExecutor(3) as pool:
+        looking = [pool.submit(look_all_the_time) for _ in range(3)]
+        try:
+            for _ in range(200):
+                with store.lock():
+                    pass
+        finally:
+            over.set()
+        for each in looking:
+            each.result()
+
+
+def test_trials_on_disk_are_found(tmp_path: Path, store: TrialStore) -> None:
+    sweep = SweepStore(tmp_path, "sweep")
+    assert sweep.trials() == []
+    store.begin(SPEC)
+    assert [trial.spec for trial in sweep.trials()] == [SPEC]

@@ -1,0 +1,618 @@
+"""MLflow shows what the files say: nothing is lost, nothing is there twice, and nobody waits for it."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import pytest
+
+from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.tracking import mlflow_sync
+from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.mlflow_sync import run_status, sync, tracking_uri
+from recrl.orchestrator.tracking.points import (
+    Summary,
+    final_points,
+    note,
+    params,
+    points,
+    rows_after,
+    thinned,
+)
+from recrl.orchestrator.tracking.snapshot import SNAPSHOT_TAG
+from recrl.orchestrator.tracking.ui import open_ui, ui_command, ui_url
+from tests.faults.committing import commit_file
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+    from mlflow.tracking import MlflowClient
+
+# MLflow 3.17 maps its tables in a way that SQLAlchemy 2.1 calls deprecated; not ours to mend.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")
+
+ROWS = b"update,phase,noise\n1,training,0.0\n2,training,0.5\n3,training,0.0\n4,training,0.0\n"
+
+
+# What is shown, without MLflow
+
+
+def test_rows_behind_a_byte_are_read_with_the_byte_behind_each() -> None:
+    first, *_, last = rows_after(ROWS, 0)
+    assert first == (34, {"update": "1", "phase": "training", "noise": "0.0"})
+    assert last[0] == len(ROWS)
+    assert [row["update"] for _, row in rows_after(ROWS, first[0])] == ["2", "3", "4"]
+    assert list(rows_after(ROWS, len(ROWS))) == []
+    assert list(rows_after(b"", 0)) == []
+
+
+def updates_shown(num_updates: int) -> list[int]:
+    rows = ((end, {"update": str(end), "noise": "0.0"}) for end in range(1, num_updates + 1))
+    return [end for end, _ in thinned(rows, num_updates)]
+
+
+def test_a_long_trial_is_thinned_evenly_and_keeps_its_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recrl.orchestrator.tracking.points.POINTS_PER_METRIC", 4)
+    assert updates_shown(4) == [1, 2, 3, 4]
+    assert updates_shown(11) == [1, 3, 6, 9, 11]
+    assert updates_shown(1) == [1]
+
+
+def test_thinning_does_not_depend_on_when_the_file_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recrl.orchestrator.tracking.points.POINTS_PER_METRIC", 2)
+    whole = list(thinned(rows_after(ROWS, 0), 4))
+    lengths = [end for end, _ in rows_after(ROWS, 0)]
+    for cut in lengths:
+        early = list(thinned(rows_after(ROWS[:cut], 0), 4))
+        late = list(thinned(rows_after(ROWS, early[-1][0]), 4))
+        assert early + late == whole
+
+
+def test_a_burst_of_noise_is_not_thinned_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recrl.orchestrator.tracking.points.POINTS_PER_METRIC", 1)
+    assert [row["noise"] for _, row in thinned(rows_after(ROWS, 0), 4)] == ["0.0", "0.5"]
+
+
+def test_points_are_sorted_into_chart_sections(made_up_sweep: Callable[..., SweepStore]) -> None:
+    spec = first_trial(made_up_sweep(**SMALL)).spec
+    row = {
+        "update": "7",
+        "phase": "training",
+        "end_step": "2800",
+        "episodes": "3",
+        "episode_return": "-1.5",
+        "noise": "0.0",
+        "time": "1700000000.25",
+        "collect_seconds": "0.3",
+        "update_seconds": "0.1",
+        "cost_0": "nan",
+        "limit_0": "inf",
+        "kl": "0.01",
+        "cost_value_loss": "2.0",
+    }
+    assert {point.key: point.value for point in points(row, spec)} == {
+        "train/return": -1.5,
+        "train/episodes": 3.0,
+        "curriculum/noise": 0.0,
+        "perf/steps_per_second": pytest.approx(400 / 0.4),
+        "student/kl": 0.01,
+        "student/cost_value_loss": 2.0,
+    }
+    assert {(point.step, point.milliseconds) for point in points(row, spec)} == {(2800, 1700000000250)}
+    changed = {"phase": "deployment", "cost_0": "4.5", "limit_0": "5.0", "temperature": "0.25"}
+    deployed = points({**row, **changed}, spec)
+    values = {point.key: point.value for point in deployed}
+    assert values["curriculum/temperature"] == 0.25
+    assert (values["deploy/return"], values["deploy/cost_0"], values["curriculum/limit_0"]) == (
+        -1.5,
+        4.5,
+        5.0,
+    )
+
+
+def test_the_summary_weighs_updates_by_their_episodes() -> None:
+    updates = pd.DataFrame(
+        {
+            "phase": ["training", "deployment", "deployment", "deployment"],
+            "episodes": [10, 1, 3, 0],
+            "episode_return": [-9.0, 4.0, 8.0, math.nan],
+            "cost_0": [99.0, 2.0, 6.0, math.nan],
+        }
+    )
+    evaluation = pd.DataFrame({"policy": ["deterministic"], "episode_return": [9.5], "cost_0": [5.0]})
+    last_row = {"time": "1.0", "end_step": "400"}
+    assert {point.key: point.value for point in final_points(updates, evaluation, last_row)} == {
+        "summary/deploy_return": 7.0,
+        "summary/deploy_cost_0": 5.0,
+        "evaluation/deterministic_return": 9.5,
+        "evaluation/deterministic_cost_0": 5.0,
+    }
+    training = final_points(updates[:1], evaluation[:0], last_row)
+    assert training == []
+
+
+def test_the_note_has_a_line_a_group_with_means_over_seeds() -> None:
+    group = ("river", "cpo", "dynamic")
+    complete = [Summary(group, {"summary/deploy_return": value}) for value in (8.0, 9.0)]
+    text = note("demo", {"complete": 2, "failed": 0, "running": 1}, complete, charts="#/charts")
+    assert text.splitlines()[0].startswith("**demo**: 3 trials (2 complete, 1 running). [Charts")
+    assert text.splitlines()[-1] == "| river | cpo | dynamic | 2 | 8.50 |"
+
+
+def test_a_long_note_is_cut_where_mlflow_would_refuse_it() -> None:
+    complete = [
+        Summary((f"task-{index}", "cpo", "none"), {"summary/deploy_return": 0.0}) for index in range(999)
+    ]
+    text = note("demo", {"complete": 999}, complete, charts="#/charts")
+    assert len(text) < 8000
+    assert text.endswith("More groups than fit here: see the table figure.")
+
+
+def test_params_are_few_and_flat(made_up_sweep: Callable[..., SweepStore]) -> None:
+    flat = params(first_trial(made_up_sweep(**SMALL)).spec)
+    assert flat["task"] == "river-a"
+    assert flat["task.horizon"] == "10"
+    assert (flat["seed"], flat["train_limits"], flat["deploy_limits"]) == ("0", "100", "5")
+
+
+# Where and in what state
+
+
+def test_the_default_store_is_a_database_in_the_sweeps_folder(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "demo")
+    assert tracking_uri(store, None) == f"sqlite:///{tmp_path}/demo/mlflow.db"
+    assert tracking_uri(store, "sqlite:///some.db") == f"sqlite:///{Path.cwd()}/some.db"
+    assert tracking_uri(store, "http://mlflow:5000") == "http://mlflow:5000"
+
+
+@pytest.mark.parametrize("given", ["mlruns", "file:///tmp/mlruns", "http://", "sqlite:///", "databricks"])
+def test_a_place_that_mlflow_cannot_keep_a_sweep_in_is_refused(tmp_path: Path, given: str) -> None:
+    with pytest.raises(TrackingError, match=r"^the tracking address must be .*, got '"):
+        tracking_uri(SweepStore(tmp_path, "demo"), given)
+
+
+@pytest.mark.parametrize(
+    ("status", "live", "expected"),
+    [
+        (TrialState.COMPLETE, True, "FINISHED"),
+        (TrialState.FAILED, True, "FAILED"),
+        (TrialState.RUNNING, True, "RUNNING"),
+        (TrialState.WAITING, True, "SCHEDULED"),
+        (TrialState.WAITING, False, "KILLED"),
+    ],
+)
+def test_run_states_are_true(status: TrialState, live: bool, expected: str) -> None:
+    record = TrialRecord(
+        status=status, attempt=1, heartbeat=time.time(), host=socket.gethostname(), pid=os.getpid()
+    )
+    assert run_status(record, live=live) == expected
+
+
+def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    here = TrialRecord(
+        status=TrialState.RUNNING, heartbeat=time.time(), host=socket.gethostname(), pid=process.pid
+    )
+    assert run_status(here, live=True) == "KILLED"
+    elsewhere = replace(here, host="elsewhere")
+    assert run_status(elsewhere, live=True) == "RUNNING"
+    assert run_status(replace(elsewhere, heartbeat=time.time() - 301.0), live=True) == "KILLED"
+
+
+# Against a real database
+
+SMALL: dict[str, Any] = {
+    "tasks": ("river-a",),
+    "agents": ("cpo",),
+    "methods": ("none", "dynamic"),
+    "seeds": 1,
+}
+NONE, DYNAMIC = "river-a cpo none seed 0", "river-a cpo dynamic seed 0"
+
+
+@pytest.fixture
+def write(made_up_sweep: Callable[..., SweepStore], empty_database: Path) -> Callable[..., SweepStore]:
+    """A function that writes a made-up sweep with an MLflow store that is ready."""
+
+    def write(**fields: Any) -> SweepStore:
+        store = made_up_sweep(**{**SMALL, **fields})
+        shutil.copy(empty_database, store.mlflow_database)
+        return store
+
+    return write
+
+
+def first_trial(store: SweepStore) -> TrialStore:
+    return store.trials()[0]
+
+
+def trial_titled(store: SweepStore, title: str) -> TrialStore:
+    return next(trial for trial in store.trials() if trial.spec.title == title)
+
+
+def connect(store: SweepStore) -> MlflowClient:
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415  (takes seconds, and reads the environment)
+
+    return MlflowClient(tracking_uri(store, None))
+
+
+def runs(store: SweepStore) -> dict[str, Run]:
+    """The runs that MLflow shows of the sweep, by name; each name once."""
+    client = connect(store)
+    experiment = client.get_experiment_by_name(f"recrl/{store.name}")
+    assert experiment is not None
+    found = list(client.search_runs([experiment.experiment_id]))
+    assert len({run.info.run_name for run in found}) == len(found)
+    return {str(run.info.run_name): run for run in found}
+
+
+def history(store: SweepStore, run: Run) -> dict[str, list[tuple[int, int, float]]]:
+    """Every point of a run: (step, time, value) by key."""
+    client = connect(store)
+    return {
+        key: sorted((m.step, m.timestamp, m.value) for m in client.get_metric_history(run.info.run_id, key))
+        for key in run.data.metrics
+    }
+
+
+def everything(store: SweepStore) -> dict[str, Any]:
+    """All that MLflow shows of a sweep, but for names that MLflow made up itself."""
+    made_up = {"mlflow.parentRunId", SNAPSHOT_TAG}  # the snapshot has the runs' identities in it
+    return {
+        name: {
+            "points": history(store, run),
+            "params": run.data.params,
+            "tags": {key: value for key, value in run.data.tags.items() if key not in made_up},
+            "status": run.info.status,
+            "end": run.info.end_time,
+            "artifacts": sorted(file.path for file in connect(store).list_artifacts(run.info.run_id)),
+        }
+        for name, run in runs(store).items()
+    }
+
+
+def test_a_sweep_is_shown_as_a_parent_and_a_run_a_trial(write: Callable[..., SweepStore]) -> None:
+    store = write(
+        unfinished=(NONE,), failed=("river-a cpo linear seed 0",), methods=("none", "linear", "dynamic")
+    )
+    report = sync(store, tracking_uri(store, None))
+    assert (report.trials, report.behind, report.problem) == (3, 0, "")
+    shown = runs(store)
+    parent = shown.pop("made-up")
+    assert {name: run.info.status for name, run in shown.items()} == {
+        DYNAMIC: "FINISHED",
+        NONE: "RUNNING",
+        "river-a cpo linear seed 0": "FAILED",
+    }
+    assert {run.data.tags["mlflow.parentRunId"] for run in shown.values()} == {parent.info.run_id}
+    assert parent.data.metrics == {}
+    assert "3 trials (1 complete, 1 running, 1 failed)" in parent.data.tags["mlflow.note.content"]
+    assert shown["river-a cpo linear seed 0"].data.tags["recrl.error"] == "ValueError: the river froze"
+    run = shown[DYNAMIC]
+    assert (run.data.params["method"], run.data.params["seed"]) == ("dynamic", "0")
+    updates = trial_titled(store, DYNAMIC).updates()
+    points = history(store, run)
+    assert [value for _, _, value in points["student/kl"]] == updates["kl"].tolist()
+    assert [step for step, _, _ in points["student/kl"]] == updates["end_step"].tolist()
+    assert len(points["train/return"]) == 38
+    assert len(points["deploy/return"]) == 2
+    assert len(points["evaluation/deterministic_return"]) == 1
+    artifacts = {file.path for file in connect(store).list_artifacts(run.info.run_id)}
+    assert {"spec.json", "evaluation.csv", "checkpoint-00000040.recrl"} <= artifacts
+    assert store.mlflow_artifacts.is_dir()
+
+
+def test_a_pass_over_what_is_known_sends_nothing(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    assert sync(store, uri).points > 0
+    before = everything(store)
+    assert sync(store, uri).points == 0
+    assert everything(store) == before
+
+
+def grow(store: SweepStore, other: SweepStore, title: str) -> None:
+    """Replace a half-done trial's files by those of the same trial when it was done."""
+    trial = trial_titled(store, title)
+    shutil.rmtree(trial.folder)
+    shutil.copytree(other.trial(trial.spec).folder, trial.folder)
+
+
+@pytest.fixture
+def half_and_done(write: Callable[..., SweepStore], tmp_path: Path) -> tuple[SweepStore, SweepStore]:
+    """A sweep of which a trial is half done, and what it looks like when it is done."""
+    done = write()
+    kept = tmp_path / "later"
+    shutil.move(done.folder, kept / done.name)
+    return write(unfinished=(DYNAMIC,)), SweepStore(kept, done.name)
+
+
+def test_a_view_that_grew_equals_one_rebuilt_from_the_files(
+    half_and_done: tuple[SweepStore, SweepStore],
+) -> None:
+    store, done = half_and_done
+    uri = tracking_uri(store, None)
+    first = sync(store, uri)
+    grow(store, done, DYNAMIC)
+    second = sync(store, uri)
+    assert min(first.points, second.points) > 0
+    grown = everything(store)
+    assert sync(store, uri, rebuild=True).points == first.points + second.points
+    assert everything(store) == grown
+    assert grown[DYNAMIC]["status"] == "FINISHED"
+
+
+def test_killed_between_mlflows_reply_and_the_position_nothing_doubles(
+    half_and_done: tuple[SweepStore, SweepStore],
+) -> None:
+    store, done = half_and_done
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    (positions,) = store.mirror_folder.iterdir()
+    saved = {path: path.read_bytes() for path in positions.glob("trial-*.json")}
+    grow(store, done, DYNAMIC)
+    sync(store, uri)
+    shown = everything(store)
+    for path, text in saved.items():
+        path.write_bytes(text)
+    assert sync(store, uri).points > 0
+    assert everything(store) == shown
+
+
+@pytest.mark.parametrize("text", ["", '{"run_id": "0", "offset": "many"}'])
+def test_a_damaged_position_is_made_anew(write: Callable[..., SweepStore], text: str) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    shown = everything(store)
+    for path in store.mirror_folder.glob("*/trial-*.json"):
+        path.write_text(text)
+    assert sync(store, uri).behind == 0
+    assert everything(store) == shown
+
+
+def test_a_run_deleted_by_hand_is_made_again(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    shown = everything(store)
+    for run in runs(store).values():
+        connect(store).delete_run(run.info.run_id)
+    sync(store, uri)
+    assert everything(store) == shown
+
+
+def test_a_run_whose_maker_died_over_it_gets_its_params(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    shown, client = runs(store)[NONE], connect(store)
+    client.delete_run(shown.info.run_id)
+    half = client.create_run(
+        shown.info.experiment_id, run_name=NONE, start_time=shown.info.start_time, tags=shown.data.tags
+    )
+    assert sync(store, uri).is_up_to_date
+    assert runs(store)[NONE].info.run_id == half.info.run_id
+    assert runs(store)[NONE].data.params == shown.data.params
+
+
+def test_where_files_do_not_fit_the_curves_are_there(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    store.mlflow_artifacts.touch()  # where a folder should be
+    report = sync(store, uri)
+    assert (report.behind, report.points) == (2, 0)
+    assert "mlartifacts" in report.problem
+    shown = runs(store)[NONE]
+    assert shown.data.metrics.keys() >= {"train/return", "summary/deploy_return"}
+    assert shown.data.params["task"] == "river-a"
+    assert "recrl.status" not in shown.data.tags
+    store.mlflow_artifacts.unlink()
+    assert sync(store, uri).is_up_to_date
+    assert runs(store)[NONE].data.tags["recrl.status"] == "complete"
+
+
+def test_rows_that_were_cut_back_are_gone_from_mlflow_too(
+    half_and_done: tuple[SweepStore, SweepStore],
+) -> None:
+    store, done = half_and_done
+    sync(store, tracking_uri(store, None))
+    grow(store, done, DYNAMIC)
+    trial = trial_titled(store, DYNAMIC)
+    text = trial.updates_path.read_text().replace("1700000020.0", "1700009999.0")  # update 20, written anew
+    commit_file(trial, "updates.csv", text)
+    sync(store, tracking_uri(store, None))
+    points = history(store, runs(store)[DYNAMIC])["student/kl"]
+    assert len(points) == 40
+    assert points[19][:2] == (20 * 400, 1700009999000)
+
+
+def test_a_resumed_trial_runs_again_and_loses_its_error(write: Callable[..., SweepStore]) -> None:
+    store = write(failed=(DYNAMIC,))
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    trial = trial_titled(store, DYNAMIC)
+    trial.begin(trial.spec)
+    sync(store, uri)
+    run = runs(store)[DYNAMIC]
+    assert run.info.status == "RUNNING"
+    assert "recrl.error" not in run.data.tags
+    assert run.data.tags["recrl.attempt"] == "2"
+    trial.write_record(replace(trial.record(), pid=2**22 + 1))  # no process has this number
+    sync(store, uri)
+    assert runs(store)[DYNAMIC].info.status == "KILLED"
+
+
+def test_a_trial_that_mlflow_refuses_does_not_stop_the_others(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    trial_titled(store, NONE).updates_path.write_bytes(b"update\n" * 4000)
+    report = sync(store, tracking_uri(store, None))
+    assert report.behind == 1
+    assert report.problem.startswith(trial_titled(store, NONE).folder.name)
+    assert runs(store)[DYNAMIC].info.status == "FINISHED"
+
+
+def test_figures_are_artifacts_of_the_parent_and_survive_a_rebuild(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    store.figures_folder.mkdir()
+    path = store.figures_folder / "curves.png"
+    path.write_bytes(b"png")
+    sync(store, uri)
+    path.write_bytes(b"better png")
+    sync(store, uri)
+    sync(store, uri, rebuild=True)
+    parent = runs(store)["made-up"].info.run_id
+    assert [file.path for file in connect(store).list_artifacts(parent, "figures")] == ["figures/curves.png"]
+
+
+def test_what_is_filmed_after_a_trials_end_reaches_its_run(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    trial = trial_titled(store, DYNAMIC)
+    trial.videos_folder.mkdir()
+    (trial.videos_folder / "update-00000040__seed-own__stochastic.gif").write_bytes(b"gif")
+    sync(store, uri)
+    run = runs(store)[DYNAMIC].info.run_id
+    assert [file.path for file in connect(store).list_artifacts(run, "videos")] == [
+        "videos/update-00000040__seed-own__stochastic.gif"
+    ]
+
+
+# With MLflow away
+
+
+@pytest.fixture
+def closed_port() -> Iterator[int]:
+    """A port of this machine that refuses connections: bound, but nobody listens."""
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        yield holder.getsockname()[1]
+
+
+def test_a_server_that_is_away_costs_seconds_and_is_named(
+    made_up_sweep: Callable[..., SweepStore], closed_port: int
+) -> None:
+    store = made_up_sweep(**SMALL)
+    begun = time.monotonic()
+    report = sync(store, f"http://127.0.0.1:{closed_port}")
+    assert time.monotonic() - begun < 10.0
+    assert (report.trials, report.behind, report.points) == (2, 2, 0)
+    assert "Connection refused" in report.problem
+    assert not report.is_up_to_date
+
+
+def test_what_was_missed_is_sent_when_mlflow_is_back(
+    write: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    database = store.mlflow_database.rename(tmp_path / "away.db")
+    store.mlflow_database.write_text("not a database")
+    report = sync(store, uri)
+    assert report.problem == (
+        f"TrackingError: {store.mlflow_database}: not a sqlite database; delete it to have it made anew"
+    )
+    database.replace(store.mlflow_database)
+    assert sync(store, uri).is_up_to_date
+    assert mlflow_sync.last_report(store, uri) is not None
+
+
+# MLflow's pages
+
+
+def test_the_pages_of_a_database_are_served_to_this_machine_only(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "demo")
+    command = ui_command(store, tracking_uri(store, None), port=5001)
+    assert command[command.index("--host") + 1] == "127.0.0.1"
+    assert command[command.index("--port") + 1] == "5001"
+    assert "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false" in command
+
+
+def test_a_server_has_its_own_pages(tmp_path: Path) -> None:
+    assert ui_url(SweepStore(tmp_path, "demo"), "http://mlflow:5000/") == "http://mlflow:5000"
+
+
+def test_a_taken_port_is_named(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "demo")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(TrackingError) as caught:
+            open_ui(store, tracking_uri(store, None), port=port)
+    assert str(caught.value) == (f"port {port} of 127.0.0.1 is taken by another program; choose another port")
+
+
+# The process
+
+
+def wait_until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None:
+    """Look until it is so; a process of its own has no other way to tell."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never came true"
+        time.sleep(0.02)
+
+
+def test_a_killed_mirror_leaves_nothing_lost_and_nothing_twice(write: Callable[..., SweepStore]) -> None:
+    store = write(seeds=4)
+    uri = tracking_uri(store, None)
+    mirror = start_mirror(store, uri, interval_seconds=3600.0)
+    wait_until(lambda: any(store.mirror_folder.glob("*/trial-*.json")))
+    mirror.process.kill()
+    assert not mirror.stop(timeout=60.0)
+    assert sync(store, uri).is_up_to_date
+    shown = everything(store)
+    for trial in store.trials():
+        assert len(shown[trial.spec.title]["points"]["student/kl"]) == 40
+    sync(store, uri, rebuild=True)
+    assert everything(store) == shown
+
+
+def test_a_mirror_that_is_stopped_shows_everything_first(write: Callable[..., SweepStore]) -> None:
+    store = write(unfinished=(DYNAMIC,))
+    uri = tracking_uri(store, None)
+    mirror = start_mirror(store, uri, interval_seconds=3600.0)
+    wait_until(lambda: mlflow_sync.last_report(store, uri) is not None)
+    trial_titled(store, DYNAMIC).set_status(TrialState.WAITING)
+    assert mirror.stop(timeout=60.0)
+    assert {name: run.info.status for name, run in runs(store).items()} == {
+        "made-up": "KILLED",
+        NONE: "FINISHED",
+        DYNAMIC: "KILLED",
+    }
+
+
+def test_a_mirror_ends_with_its_parent_and_leaves_the_truth(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    program = (
+        "import os, sys; from pathlib import Path; "
+        "from recrl.orchestrator.files.store import SweepStore; "
+        "from recrl.orchestrator.tracking.background_sync import start_mirror; "
+        "store = SweepStore(Path(sys.argv[1]), sys.argv[2]); "
+        "print(start_mirror(store, sys.argv[3], interval_seconds=3600.0).process.pid, flush=True); "
+        "os.kill(os.getpid(), 9)"
+    )
+    parent = subprocess.run(
+        [sys.executable, "-c", program, str(store.folder.parent), store.name, uri],
+        stdout=subprocess.PIPE,
+        check=False,
+    )
+    wait_until(lambda: not Path(f"/proc/{int(parent.stdout)}").exists())
+    assert {run.info.status for run in runs(store).values()} == {"FINISHED"}

@@ -1,0 +1,284 @@
+"""A trial walks the paper's two phases, records what happened, and never depends on how it was run."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from recrl.agents.registry import AGENTS, make_agent
+from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.trial.trial import run_recorded
+from recrl.teachers.registry import TEACHERS, make_teacher
+from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
+
+SMALL = {"hidden_sizes": [16]}
+QUICK = {**SMALL, "critic_steps": 4}  # for what holds however long critics are fitted
+SPEC = TrialSpec(
+    task=Choice("two-state", {"horizon": 10}),
+    agent=Choice("ppo-lag", SMALL),
+    method=Choice("linear"),
+    train_limits=CostLimits.unlimited(1),
+    deploy_limits=CostLimits((3.0,)),
+    train_steps=19 * 60,
+    deploy_steps=60,
+    num_envs=4,
+    rollout_steps=15,  # not a multiple of the horizon: episodes span updates
+    evaluation_episodes=6,
+    seed=5,
+)
+
+
+def never() -> bool:
+    return False
+
+
+def stop_after(updates: int) -> Callable[[], bool]:
+    """Asked once before each update, it stops a trial after so many."""
+    answers = iter([False] * updates + [True])
+    return lambda: next(answers)
+
+
+def run(folder: Path, spec: TrialSpec = SPEC, stops: tuple[int, ...] = ()) -> TrialStore:
+    """The trial, stopped and resumed after the given numbers of further updates, then run to its end."""
+    store = SweepStore(folder, "sweep").trial(spec)
+    for updates in stops:
+        assert run_recorded(spec, store, should_stop=stop_after(updates)) is TrialState.WAITING
+    assert run_recorded(spec, store, should_stop=never) is TrialState.COMPLETE
+    return store
+
+
+def final_tree(store: TrialStore) -> dict[str, Any]:
+    tree = store.latest_checkpoint()
+    assert tree is not None
+    trial = tree["trial"]
+    assert isinstance(trial, dict)
+    return trial
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
+    return run(tmp_path_factory.mktemp("undisturbed"))
+
+
+def test_equal_seeds_give_equal_bytes(undisturbed: TrialStore, tmp_path: Path) -> None:
+    again = run(tmp_path)
+    assert again.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
+    assert again.evaluation_path.read_bytes() == undisturbed.evaluation_path.read_bytes()
+    np.testing.assert_equal(final_tree(again), final_tree(undisturbed))
+
+
+def assert_pieces_make_the_whole(folder: Path, spec: TrialSpec, stops: tuple[int, ...]) -> None:
+    """That a trial stopped and resumed at ``stops`` leaves the bytes of one that never was."""
+    whole = run(folder / "whole", spec)
+    pieces = run(folder / "pieces", spec, stops=stops)
+    assert pieces.record().attempt == len(stops) + 1
+    assert whole.episodes_path.stat().st_size > 0
+    assert pieces.episodes_path.read_bytes() == whole.episodes_path.read_bytes()
+    assert pieces.events() == whole.events()
+    assert pieces.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
+    np.testing.assert_equal(final_tree(pieces), final_tree(whole))
+
+
+@pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
+@pytest.mark.parametrize("method", TEACHERS)
+def test_interrupted_equals_uninterrupted(tmp_path: Path, agent: str, method: str) -> None:
+    options = {"window": 8} if method == "dynamic" else {}
+    spec = replace(SPEC, agent=Choice(agent, QUICK), method=Choice(method, options))
+    assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 0, 7, 11))
+
+
+@pytest.mark.parametrize("agent", sorted(set(AGENTS) - {"ppo-lag", "cpo"}))
+def test_every_other_student_interrupted_equals_itself_uninterrupted(tmp_path: Path, agent: str) -> None:
+    spec = replace(SPEC, agent=Choice(agent, QUICK))
+    assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 8))
+
+
+@pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
+@pytest.mark.parametrize("task", ["rivergrid-1b", "CarGoal2", "CarButton2", "CarPush2", "PointGoal1"])
+def test_physics_and_maps_interrupted_equal_themselves_uninterrupted(
+    tmp_path: Path, agent: str, task: str
+) -> None:
+    spec = replace(
+        SPEC,
+        task=Choice(task, {"horizon": 25}),
+        agent=Choice(agent, QUICK),
+        method=Choice("dynamic", {"window": 2, "start_fraction": 0.01}),
+        train_steps=7 * 60,
+    )
+    assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 3, 0))
+
+
+def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path: Path) -> None:
+    program = (
+        "import json, sys; from pathlib import Path\n"
+        "from recrl.orchestrator.spec import TrialSpec\n"
+        "from recrl.orchestrator.files.store import SweepStore\n"
+        "from recrl.orchestrator.trial.trial import run_recorded\n"
+        "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
+        "store = SweepStore(Path(sys.argv[1]), 'sweep').trial(spec)\n"
+        "run_recorded(spec, store, should_stop=lambda: False, commit_seconds=0.0)\n"
+    )
+    store = SweepStore(tmp_path, "sweep").trial(SPEC)
+    process = subprocess.Popen([sys.executable, "-c", program, str(tmp_path), json.dumps(SPEC.to_json())])
+    deadline = time.monotonic() + 60.0
+    while store.record().update < 3 and time.monotonic() < deadline:
+        os.sched_yield()
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert store.record().status is TrialState.RUNNING  # it had no time to say otherwise
+    assert 3 <= store.record().update < SPEC.num_updates
+    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
+    np.testing.assert_equal(final_tree(store), final_tree(undisturbed))
+
+
+def test_the_last_part_is_deployment_under_the_deploy_limits(undisturbed: TrialStore) -> None:
+    updates = undisturbed.updates()
+    assert updates["phase"].tolist() == ["training"] * 19 + ["deployment"]
+    assert updates["end_step"].tolist() == [60 * i for i in range(1, 21)]
+    assert updates["limit_0"].iloc[-1] == 3.0
+    assert updates["noise"].iloc[-1] == 0.0
+
+
+def test_limits_start_where_the_teacher_measured_and_never_rise(undisturbed: TrialStore) -> None:
+    limits = undisturbed.updates()["limit_0"]
+    assert np.isinf(limits.iloc[0])
+    assert limits.is_monotonic_decreasing
+    assert undisturbed.record().start_limits is not None
+    assert [event["event"] for event in undisturbed.events()] == ["start limits measured"]
+
+
+def test_a_limit_that_falls_at_once_when_training_ends_is_an_event(tmp_path: Path) -> None:
+    store = run(tmp_path, replace(SPEC, method=Choice("step"), train_limits=CostLimits((50.0,))))
+    (event,) = store.events()
+    assert event["event"] == "hard landing"
+    assert (event["limits"], event["deploy_limits"]) == ([50.0], SPEC.deploy_limits.to_json())
+    assert run(tmp_path / "soft", replace(SPEC, method=Choice("none"))).events() == []
+
+
+def test_every_episode_is_recorded_once_with_its_place(undisturbed: TrialStore) -> None:
+    episodes = undisturbed.episodes()
+    assert episodes["index"].tolist() == list(range(len(episodes)))
+    # 20 updates of 15 steps make 30 episodes of 10 steps in each of 4 environments.
+    assert len(episodes) == 120
+    assert episodes["end_step"].tolist() == [40 * i for i in range(1, 31) for _ in range(4)]
+    assert (episodes["length"] == 10).all()
+    assert undisturbed.updates()["episodes"].sum() == 120
+
+
+def test_an_update_reports_the_mean_of_its_episodes(undisturbed: TrialStore) -> None:
+    episodes = undisturbed.episodes()
+    third = episodes[(episodes["end_step"] > 120) & (episodes["end_step"] <= 180)]
+    row = undisturbed.updates().iloc[2]
+    assert row["episode_return"] == pytest.approx(third["episode_return"].mean())
+    assert row["cost_0"] == pytest.approx(third["cost_0"].mean())
+
+
+def test_methods_of_a_seed_start_alike(undisturbed: TrialStore, tmp_path: Path) -> None:
+    other = run(tmp_path, replace(SPEC, method=Choice("none")))
+    columns = ["end_step", "length", "episode_return", "cost_0"]
+    first = undisturbed.episodes()["end_step"] <= SPEC.steps_per_update
+    pd.testing.assert_frame_equal(
+        undisturbed.episodes().loc[first, columns], other.episodes().loc[first, columns]
+    )
+
+
+def test_what_entropy_was_worth_is_recorded_and_ends_with_the_heat(tmp_path: Path) -> None:
+    spec = replace(SPEC, method=Choice("cooling", {"temperature": 2.0, "cooled": 0.5}))
+    updates = run(tmp_path, spec).updates()
+    # 19 updates of training; what the teacher says after an update counts in the next. The first has none.
+    expected = [0.0, *(2.0 * max(0.0, 1.0 - update / 9.5) for update in range(1, 20))]
+    assert updates["temperature"].tolist() == pytest.approx(expected)
+    assert updates["limit_0"].tolist() == pytest.approx([7.5, *(3.0 + 2.25 * each for each in expected[1:])])
+    assert "temperature" not in run(tmp_path).updates()
+
+
+class Opaque:
+    """A user's teacher whose state has keys of our own teachers, and means other things by them."""
+
+    def __init__(self, spec: TeacherSpec) -> None:
+        self._teacher = make_teacher(spec)
+
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
+        return self._hidden(*self._teacher.start())
+
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
+        return self._hidden(*self._teacher.step(state["limits"], report))
+
+    def _hidden(self, step: CurriculumStep, state: TeacherState) -> tuple[CurriculumStep, TeacherState]:
+        return step, {"limits": state, "temperature": "warm", "start_limits": "mine", "policy_noise": 3.0}
+
+
+def test_a_teachers_state_is_opaque_to_the_trial(undisturbed: TrialStore, tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep").trial(SPEC)
+    teacher = Opaque(SPEC.teacher)
+    assert run_recorded(SPEC, store, should_stop=stop_after(5), teacher=teacher) is TrialState.WAITING
+    assert run_recorded(SPEC, store, should_stop=never, teacher=teacher) is TrialState.COMPLETE
+    assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
+    assert list(store.updates()) == list(undisturbed.updates())
+    assert store.record().start_limits == undisturbed.record().start_limits
+    assert [event["event"] for event in store.events()] == ["start limits measured"]
+
+
+def test_a_student_whose_entropy_cannot_be_rewarded_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_it(*arguments: Any) -> SimpleNamespace:
+        agent = make_agent(*arguments)
+        return SimpleNamespace(act=agent.act, update=agent.update, state_dict=agent.state_dict)
+
+    monkeypatch.setattr("recrl.orchestrator.trial.trial.make_agent", without_it)
+    spec = replace(SPEC, method=Choice("cooling"))
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=never) is TrialState.FAILED
+    assert "method cooling rewards entropy, which agent ppo-lag does not support" in store.record().error
+
+
+def test_both_frozen_policies_are_evaluated(undisturbed: TrialStore) -> None:
+    counts = undisturbed.evaluation().groupby("policy").size().to_dict()
+    assert counts == {"stochastic": 6, "deterministic": 6}
+
+
+def test_a_finite_tasks_final_policy_is_written_as_a_table(undisturbed: TrialStore) -> None:
+    table = undisturbed.policy()
+    assert list(table) == ["action_0", "action_1"]
+    assert table.sum(axis=1).tolist() == pytest.approx([1.0, 1.0])  # a row a state: camp and mine
+
+
+def test_a_task_that_is_not_finite_has_no_table(tmp_path: Path) -> None:
+    task = Choice("continuous-bandit")
+    store = run(tmp_path, replace(SPEC, task=task, train_steps=60, rollout_steps=15))
+    assert store.policy().empty
+
+
+def test_a_finished_trial_has_nothing_left_to_do(undisturbed: TrialStore, tmp_path: Path) -> None:
+    store = run(tmp_path)
+    before = store.episodes_path.read_bytes()
+    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert store.episodes_path.read_bytes() == before
+
+
+def test_a_trial_that_raises_is_failed_with_its_traceback(tmp_path: Path) -> None:
+    spec = replace(SPEC, agent=Choice("ppo-lag", {**SMALL, "hidden_sizes": ["not a number"]}))
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=never) is TrialState.FAILED
+    assert "not a number" in store.record().error
+    assert "Traceback" in store.error_path.read_text()
+    assert "failed after update 0" in store.log_path.read_text()
+
+
+def test_the_run_says_what_it_was_made_of(undisturbed: TrialStore) -> None:
+    assert '"torch"' in undisturbed.provenance_path.read_text()

@@ -1,0 +1,252 @@
+"""Files that somebody else made run no code, name no place outside, and lead nobody to other files."""
+
+import json
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from recrl.analysis import report_tables
+from recrl.analysis.data import export
+from recrl.analysis.report import draw
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.plugins import UntrustedNameError, refuse_import_paths
+from recrl.environments.registry import find_task, task_options
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.errors import RecrlError, StorageError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.spec import Choice, TrialSpec
+from tests.faults.bad_inputs import changed
+
+INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
+SPY = """\
+from pathlib import Path
+from recrl.environments.registry import Task
+from recrl.environments.finite.two_state import TwoStateOptions, make_two_state
+
+Path("RUN").touch()
+
+def make(name, num_envs, options):
+    return make_two_state("two-state", num_envs, options)
+
+TASK = Task("Leaves a trace when it is imported.", TwoStateOptions, make)
+"""
+REFUSED = "because a file that is only read must run no code"
+
+
+@pytest.fixture
+def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A working directory with a finished sweep, and its zip, whose task is named by an import path."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "spy.py").write_text(SPY)
+    (tmp_path / "grid.yaml").write_text(changed("tasks", 0, "name", to="spy:TASK"))
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    assert main(["export", "small", "--to", "small.zip"]) == ExitCode.OK
+    forget(tmp_path)
+    yield tmp_path
+    sys.modules.pop("spy", None)
+
+
+def forget(folder: Path) -> None:
+    """Let the task be imported anew, if anybody does."""
+    (folder / "RUN").unlink(missing_ok=True)
+    sys.modules.pop("spy", None)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["status", "small"],
+        ["status", "grid.yaml"],
+        ["logs", "small", "spy-TASK ppo-lag none"],
+        ["figures", "small", "--to", "drawn"],
+        ["figures", "small.zip", "--to", "drawn"],
+        ["export", "small", "--to", "again.zip"],
+        ["export", "small.zip", "--to", "again.zip"],
+        ["merge", "small.zip", "small.zip", "--to", "again.zip"],
+        ["bound", "small.zip"],
+        ["validate", "grid.yaml"],
+        ["plan", "grid.yaml"],
+        ["evaluate", "small"],
+        ["replay", "small", "--teacher", "spy:TASK"],
+    ],
+    ids=" ".join,
+)
+def test_reading_runs_nothing_that_a_file_names(foreign: Path, command: list[str]) -> None:
+    main(command)
+    assert not (foreign / "RUN").exists()
+    assert "spy" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    "command", [["validate", "grid.yaml"], ["plan", "grid.yaml"], ["evaluate", "small"]], ids=" ".join
+)
+def test_trust_runs_it(foreign: Path, command: list[str]) -> None:
+    assert main([*command, "--trust"]) == ExitCode.OK
+    assert (foreign / "RUN").exists()
+
+
+def test_what_was_not_called_is_said(foreign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sentence = f"grid.yaml: tasks.0 (spy:TASK) was not called, {REFUSED}; if you trust it, add --trust"
+    assert main(["validate", "grid.yaml"]) == ExitCode.OK
+    assert capsys.readouterr().out == f"{sentence}; all else is right\n"
+    assert main(["plan", "grid.yaml"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+    assert main(["evaluate", "small"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        f"recrl-sweep: spy:TASK ppo-lag linear seed 0: 'spy:TASK' was not imported, {REFUSED}; "
+        "if you trust it, add --trust\n"
+    )
+    assert main(["figures", "small.zip", "--to", "drawn"]) == ExitCode.OK
+    note = f"spy:TASK: the optimum is unknown here, because 'spy:TASK' was not imported, {REFUSED}"
+    assert note in (foreign / "drawn" / "report.md").read_text()
+
+
+@pytest.mark.parametrize("name", ["os:system", "spy:TASK"])
+def test_a_process_that_refuses_import_paths_follows_none_until_it_does_again(name: str) -> None:
+    with refuse_import_paths():
+        with pytest.raises(UntrustedNameError):
+            find_task(name)
+        with pytest.raises(UntrustedNameError):
+            task_options("gymnasium", {"id": "os:CartPole-v1"})
+        assert find_task("two-state").summary
+        own = "recrl.environments.registration:recrl/CarGoal2-v0"
+        assert task_options("gymnasium", {"id": own}).model_dump()["id"] == own
+    assert task_options("gymnasium", {"id": "gymnasium.envs:CartPole-v1", "costless": True})
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "/tmp/evil", "..", "", "a/b", "a\\b", "\x1b[31m", ".evil", "-evil"]
+)
+def test_a_name_from_a_file_leads_nowhere_else(tmp_path: Path, name: str, foreign: Path) -> None:
+    with zipfile.ZipFile("small.zip") as archive:
+        members = {member: archive.read(member) for member in archive.namelist()}
+    told = json.loads(members["sweep.json"])
+    members["sweep.json"] = json.dumps({**told, "name": name}).encode()
+    (foreign / "work").mkdir()
+    evil = foreign / "work" / "small.zip"
+    with zipfile.ZipFile(evil, "w") as archive:
+        for member, data in members.items():
+            archive.writestr(member, data)
+    before = sorted(foreign.rglob("*"))
+    with pytest.raises(
+        RecrlError, match=r"small\.zip: is no sweep's compact file: the sweep's name must be a"
+    ):
+        export.load(evil)
+    assert main(["export", "work/small.zip"]) == ExitCode.WRONG_INPUT
+    assert main(["figures", "work/small.zip"]) == ExitCode.WRONG_INPUT
+    assert sorted(foreign.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "mistake"),
+    [
+        ({"seed": -1}, "seed: must be at least 0, got -1"),
+        ({"seed": "0"}, "seed: must be a whole number, got '0'"),
+        ({"train_limits": ["nan"]}, "train_limits: must be numbers of at least 0, or 'inf', got 'nan'"),
+        ({"train_limits": [3.0, 4.0]}, "train_limits and deploy_limits: must have the same length"),
+        ({"task": "two-state"}, "task: must be a mapping of settings, got 'two-state'"),
+        ({"nope": 1}, "nope: unknown key"),
+        (
+            {"agent": {"name": "x", "options": {}, "label": "\x1b[2J"}},
+            r"agent.label: must hold no control characters, got '\x1b[2J'",
+        ),
+    ],
+)
+def test_a_spec_from_a_file_is_checked_like_one_from_a_grid(change: dict[str, object], mistake: str) -> None:
+    spec = TrialSpec(
+        task=Choice("two-state"),
+        agent=Choice("ppo-lag"),
+        method=Choice("linear"),
+        train_limits=CostLimits((9.0,)),
+        deploy_limits=CostLimits((3.0,)),
+        train_steps=40,
+        deploy_steps=40,
+        num_envs=4,
+        rollout_steps=10,
+        evaluation_episodes=4,
+        seed=0,
+    )
+    assert TrialSpec.from_json(spec.to_json()) == spec
+    with pytest.raises(ValueError) as caught:
+        TrialSpec.from_json({**spec.to_json(), **change})
+    assert str(caught.value) == mistake
+
+
+# Links
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "diary.txt").write_text("mine")
+    store = SweepStore(tmp_path, "sweep")
+    store.folder.mkdir()
+    (store.folder / "lock").symlink_to(tmp_path / "diary.txt")
+    sentence = r"sweep/lock: is a lock, and must be a file and no link; delete it if nothing runs there$"
+    with pytest.raises(StorageError, match=sentence), store.lock():
+        pass
+    with pytest.raises(StorageError, match=sentence):
+        store.is_locked()
+    assert (tmp_path / "diary.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", [".lock", ".reserve", "log.txt"])
+def test_no_file_of_a_trial_is_written_through_a_link(foreign: Path, name: str) -> None:
+    (foreign / "diary.txt").write_text("mine")
+    (foreign / "grid.yaml").write_text(changed("methods", to=["none"]))
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    [trial] = [it for it in SweepStore(foreign / "runs", "small").trials() if "two-state" in it.folder.name]
+    (trial.folder / "state.json").unlink()
+    (trial.folder / name).unlink(missing_ok=True)
+    (trial.folder / name).symlink_to(foreign / "diary.txt")
+    main(["launch", "grid.yaml", *INLINE])
+    assert (foreign / "diary.txt").read_text() == "mine"
+
+
+# What is written for LaTeX, Markdown and matplotlib
+
+
+def test_labels_are_text_in_latex_and_markdown() -> None:
+    frame = pd.DataFrame({"task": [r"\input{/etc/passwd} $x$ ^~ {a}"]})
+    assert r"\textbackslash{}input\{/etc/passwd\} \$x\$ \textasciicircum{}\textasciitilde{} \{a\}" in (
+        report_tables.latex(frame)
+    )
+    frame = pd.DataFrame({"task": ["<script>x</script> [a](javascript:b) | c\nd"]})
+    assert report_tables.markdown(frame).splitlines()[-1] == (
+        r"| &lt;script&gt;x&lt;/script&gt; [a]\(javascript:b) \| c d |"
+    )
+
+
+@pytest.mark.parametrize("label", [r"$\frac{", "$", "a $d_d$ $", r"\$x$y", "50% & #1_2^3"])
+def test_no_label_costs_a_figure(foreign: Path, label: str) -> None:
+    grid = changed("tasks", 0, to={"name": "two-state", "label": label, "deploy_limits": 2})
+    (foreign / "grid.yaml").write_text(grid.replace("name: small", "name: labelled"))
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    assert main(["figures", "labelled", "--to", "drawn"]) == ExitCode.OK
+    drawn = {path.stem.partition("_")[0] for path in (foreign / "drawn").glob("*.pdf")}
+    assert {"learning-curves", "curricula", "diagnostics", "return-against-cost"} <= drawn
+    assert "could not be drawn" not in (foreign / "drawn" / "report.md").read_text()
+
+
+def test_one_figure_that_cannot_be_drawn_costs_no_other_and_is_named(
+    foreign: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from recrl.analysis.figures import learning_curves  # noqa: PLC0415
+
+    def mistaken(*_: object, **__: object) -> None:
+        raise KeyError("river")
+
+    monkeypatch.setattr(learning_curves, "curricula", mistaken)
+    with pytest.raises(KeyError, match="river"):
+        draw(export.load(foreign / "small.zip"), foreign / "drawn")
+    assert "- the figure curricula could not be drawn (KeyError: 'river')" in (
+        (foreign / "drawn" / "report.md").read_text().splitlines()
+    )
+    assert (foreign / "drawn" / "learning-curves_ppo-lag.pdf").exists()

@@ -1,0 +1,170 @@
+"""Who may import whom: the order of the packages, and one adapter for each third-party system."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = ("orchestrator", "agents", "environments", "teachers", "analysis")
+FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+NAMES = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES]
+
+# For each package, what its modules may import of ours; a package's own modules are always allowed.
+ALLOWED = {
+    "environments": (),
+    "teachers": ("recrl.environments.cmdp", "recrl.environments.plugins"),
+    "agents": ("recrl.environments",),
+    "analysis": (
+        "recrl.environments",
+        "recrl.orchestrator.errors",
+        "recrl.orchestrator.files",
+        "recrl.orchestrator.redaction",
+        "recrl.orchestrator.spec",
+        "recrl.orchestrator.tracking.reader",
+        "recrl.orchestrator.trial.phase_totals",
+        "recrl.orchestrator.untrusted",
+        "recrl.orchestrator.validation",
+        "recrl.teachers",
+    ),
+    "orchestrator": ("recrl.agents", "recrl.environments", "recrl.teachers"),
+}
+# Third-party modules that only some of our modules may import.
+ADAPTERS = {
+    "PIL": r"orchestrator\.trial\.videos",
+    "av": r"orchestrator\.trial\.videos",
+    "torch": r"agents\..*|orchestrator\.(trial\.trial|ray\.executor)",
+    "gymnasium": r"environments\..*|agents\..*",
+    "minigrid": r"environments\.rivergrid\..*",
+    "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
+    "numba": r"environments\.simulation\.(machine_code|code_digest)",
+    "ray": r"orchestrator\.ray\..*",
+    "mlflow": r"orchestrator\.tracking\.(mlflow_sync|reader)",
+    "sqlalchemy": r"orchestrator\.tracking\.database",
+    "adbc_driver_sqlite": r"orchestrator\.tracking\.database",
+    "matplotlib": r"analysis\..*",
+    "yaml": r"orchestrator\.located_yaml",
+    "rich": r"orchestrator\.cli\..*",
+    "safetensors": r"orchestrator\.files\.checkpoint",
+    "fsspec": r"orchestrator\.remote\.object_store",
+}
+# The order inside the orchestrator, of its folders and of the modules beside them: nothing may import what
+# stands in a later line.
+LAYERS = (
+    ("background", "errors", "exit_codes", "located_yaml", "redaction", "spec", "untrusted", "validation"),
+    ("files",),
+    ("executors", "status", "trial"),
+    ("grid", "remote"),
+    ("tracking",),
+    ("ray", "report_refresh", "sweep"),
+    ("cli",),
+)
+
+
+def imports(tree: ast.AST, *, at_run_time: bool = False) -> Iterator[str]:
+    """Every dotted name that is imported; with ``at_run_time``, without those for type checkers only."""
+    for node in ast.iter_child_nodes(tree):
+        if at_run_time and isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module is not None
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        else:
+            yield from imports(node, at_run_time=at_run_time)
+
+
+def package(path: Path) -> str:
+    """The folder at the top that a file is in, however deep."""
+    return path.relative_to(ROOT).parts[0]
+
+
+def dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(), filename=str(path))
+
+
+def within(name: str, package: str) -> bool:
+    return name == package or name.startswith(f"{package}.")
+
+
+@pytest.mark.parametrize("path", FILES, ids=NAMES)
+def test_imports_of_ours_point_one_way(path: Path) -> None:
+    own = package(path)
+    allowed = (f"recrl.{own}", *ALLOWED[own])
+    # "from recrl.environments import plugins" yields the package too: what counts is the module
+    ours = {name for name in imports(parsed(path)) if name.count(".") >= 2 and within(name, "recrl")}
+    if dotted(path).startswith("orchestrator.cli."):
+        allowed += ("recrl.analysis",)
+    assert sorted(name for name in ours if not any(within(name, package) for package in allowed)) == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=NAMES)
+def test_each_third_party_system_has_its_adapter(path: Path) -> None:
+    name = dotted(path)
+    used = {module.partition(".")[0] for module in imports(parsed(path), at_run_time=True)}
+    wrong = [
+        system for system, allowed in ADAPTERS.items() if system in used and not re.fullmatch(allowed, name)
+    ]
+    assert wrong == []
+
+
+def test_students_do_not_know_teachers_and_nobody_below_knows_the_orchestrator() -> None:
+    for path in FILES:
+        if package(path) in ("environments", "agents", "teachers"):
+            names = set(imports(parsed(path)))
+            assert not any(within(name, "recrl.orchestrator") for name in names), path
+            assert package(path) == "teachers" or not any(within(name, "recrl.teachers") for name in names)
+
+
+def test_the_orchestrator_has_layers() -> None:
+    height = {name: level for level, names in enumerate(LAYERS) for name in names}
+    folder = ROOT / "orchestrator"
+    parts_of = {path.relative_to(folder).parts[0].removesuffix(".py") for path in folder.rglob("*.py")}
+    assert set(height) == parts_of - {"__init__"}, "every folder and module has its place in LAYERS"
+    for path in folder.rglob("*.py"):
+        own = path.relative_to(folder).parts[0].removesuffix(".py")
+        for name in imports(parsed(path), at_run_time=True):
+            parts = name.split(".")
+            if parts[:2] == ["recrl", "orchestrator"] and len(parts) > 2 and own != "__init__":
+                assert height[parts[2]] <= height[own], f"{dotted(path)} imports {name}"
+
+
+def test_no_import_is_relative() -> None:
+    for path in FILES:
+        for node in ast.walk(parsed(path)):
+            assert not (isinstance(node, ast.ImportFrom) and node.level), path
+
+
+def test_files_of_subpackages_are_checked_too() -> None:
+    assert "environments.safety_gym.native.environment_step" in NAMES
+
+
+def test_no_package_file_imports_anything() -> None:
+    for path in FILES:
+        if path.stem == "__init__":
+            assert list(imports(parsed(path))) == [], path
+
+
+def test_nothing_that_is_read_can_run_code() -> None:
+    """No pickles, no unsafe YAML, no eval; tensors are loaded as weights only."""
+    for path in FILES:
+        tree = parsed(path)
+        assert not {"pickle", "cloudpickle", "dill", "marshal", "shelve"} & set(imports(tree)), path
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                assert called not in ("eval", "exec", "yaml.load", "yaml.unsafe_load"), path
+                assert not any(keyword.arg == "allow_pickle" for keyword in node.keywords), path
+                if called == "torch.load":
+                    assert any(
+                        keyword.arg == "weights_only" and ast.unparse(keyword.value) == "True"
+                        for keyword in node.keywords
+                    ), path

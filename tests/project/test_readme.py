@@ -1,0 +1,110 @@
+"""Every measured number in the README is in a file under results/ that its section names.
+
+A section names files in links and in code spans; a folder stands for the tables and logs in it. A number is
+there if some number in such a file is equal to it at the digits that the README gives. Numbers that are no
+measurements (limits, sizes, versions, optima of the maps) are listed below, each with what it is.
+"""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+TABLES = (".csv", ".txt")
+
+# Sections that tell how to use it, not what was measured.
+MANUAL = {
+    "Install",
+    "A sweep",
+    "On a cluster",
+    "What there is",
+    "How it is built",
+    "Where this differs from the paper",
+    "Licence",
+}
+# No measurements: "number": what it is.
+DEFINITIONS = {
+    "": {"2024": "a year", "5%": "the deployment phase"},
+    "RiverGrid": {"9.5": "J*(5) of map 1a", "9.1": "J*(1) of map 1b"},
+    "Figures, statistics, theory": {"95%": "the confidence asked for"},
+    "Safety Gym": {
+        "256": "units",
+        "1.0.0": "a version",
+        "1e-5": "the tolerance",
+    },
+    "Velocity tasks": {"1.0.0": "a version", "1e-5": "the tolerance"},
+}
+NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
+MEASURED = re.compile(r"[.%,e]|\d{3}")  # small whole numbers are mostly counts of things
+
+
+def sections() -> dict[str, str]:
+    """The README's sections by title; what comes before the first has the title ""."""
+    title, found = "", {"": ""}
+    for line in README.split("\n"):
+        if line.startswith("## "):
+            title = line.removeprefix("## ")
+            found[title] = ""
+        else:
+            found[title] += line + "\n"
+    return found
+
+
+def prose(text: str) -> str:
+    """Without code blocks, code spans, link targets and pictures."""
+    text = re.sub(r"^```.*?^```", " ", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"`[^`]*`", " ", text)
+    return re.sub(r"\]\([^)]*\)", "]", text)
+
+
+def sources(text: str) -> list[Path]:
+    """The tables and logs under results/ that a section names."""
+    named = sorted({ROOT / path.rstrip("/.") for path in re.findall(r"results/[\w./-]+", text)})
+    files: list[Path] = []
+    for path in named:
+        folder = path if path.is_dir() else path.parent if path.suffix in (".md", ".png") else None
+        files += sorted(folder.rglob("*")) if folder else [path]
+    return [path for path in files if path.suffix in TABLES]
+
+
+def numbers_in(path: Path) -> set[float]:
+    text = path.read_text()
+    if path.suffix == ".csv":
+        text = text.replace(",", " ")
+    found = re.findall(r"-?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?", text)
+    return {float(number.replace(",", "")) for number in found}
+
+
+def is_in(token: str, known: set[float]) -> bool:
+    """Whether a number is among others at the digits it is given with; a percentage also as a share."""
+    digits = token.rstrip("%").replace(",", "")
+    places = len(digits.partition(".")[2])
+    value, half = float(digits), 0.5 * 10.0**-places
+    if token.endswith("%"):
+        known = known | {100.0 * number for number in known}
+    return any(abs(number - value) <= half * (1.0 + 1e-9) for number in known)
+
+
+@pytest.mark.parametrize("title", [title for title in sections() if title not in MANUAL])
+def test_every_measured_number_is_in_a_file_of_results(title: str) -> None:
+    text = sections()[title]
+    known: set[float] = set().union(*map(numbers_in, sources(text)))
+    tokens = [token.rstrip(",") for token in NUMBER.findall(prose(text))]
+    measured = [token for token in tokens if MEASURED.search(token)]
+    unknown = [
+        token for token in measured if token not in DEFINITIONS.get(title, {}) and not is_in(token, known)
+    ]
+    assert not unknown, f"{title or 'the beginning'}: in no file of results/ that it names: {unknown}"
+
+
+def test_definitions_are_still_used() -> None:
+    for title, definitions in DEFINITIONS.items():
+        tokens = {token.rstrip(",") for token in NUMBER.findall(prose(sections()[title]))}
+        assert set(definitions) <= tokens, title
+
+
+def test_numbers_are_compared_at_the_digits_given() -> None:
+    assert is_in("9.50", {9.4962}) and not is_in("9.50", {9.4949})
+    assert is_in("84%", {0.838}) and is_in("1,727", {1726.8}) and not is_in("84%", {0.83})
