@@ -7,12 +7,13 @@ import logging
 import shlex
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import say, short
+from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.plan import room, say_plan
 from recrl.orchestrator.cli.progress import say_failures
 from recrl.orchestrator.cli.requests import LaunchRequest
@@ -32,6 +33,7 @@ from recrl.orchestrator.tracking.background_sync import start_mirror
 from recrl.orchestrator.tracking.mlflow_sync import last_report, tracking_uri
 
 if TYPE_CHECKING:
+    from recrl.analysis.data.sweep_data import Sweep
     from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 
 MIRROR_INTERVAL_SECONDS = 5.0
@@ -46,6 +48,8 @@ def run_launch(request: LaunchRequest, console: Console) -> ExitCode:
 
 def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> ExitCode:
     """Work on everything in a checked grid that is not complete; ``request.grid`` is not read."""
+    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
+
     store = SweepStore(request.root, grid.name)
     only = wanted(request.only)
     storage = storage_of(store, request.storage)
@@ -56,10 +60,13 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
     at_once, where = room(grid, request)
     uri = tracking_uri(store, request.tracking_uri) if request.mlflow else None
     stop = threading.Event()
+    read: list[Sweep] = []  # at the end, if anything is complete
 
     def watch(plan: Plan) -> None:
         say_plan(plan, grid, console, at_once=at_once, where=where)
         if plan.to_do:
+            if request.executor == "ray":
+                _say_starting(request, console)
             chosen = [trial.spec for trial in plan.trials]
             shown.enter_context(display.live_progress(lambda: progress(chosen, store), console))
             if request.figures:
@@ -67,15 +74,17 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
 
     def finish(after: SweepProgress) -> None:
         shown.close()
-        if request.figures and not stop.is_set() and after.counts[Standing.COMPLETE]:
-            _draw_at_end(store, console)
+        if not stop.is_set() and after.counts[Standing.COMPLETE]:
+            read.append(sweep_data.load(store))
+            if request.figures:
+                _draw_at_end(read[0], store, console)
         if not stop.is_set():
             _film(grid, after, store, stop, console)
 
     def say_stopping() -> None:
         say(console, "Stopping: running trials save where they are. Once more to stop at once.")
 
-    with contextlib.ExitStack() as shown, stopping_on_signals(stop, say_stopping):
+    with contextlib.ExitStack() as shown, _listening(stop, say_stopping):
         result = launch(
             grid,
             store,
@@ -94,7 +103,18 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
     say(console, f"Results    {short(store.folder)}{kept}")
     if uri:
         _say_mirrored(result, store, uri, request, console)
+    for sweep in read:
+        _say_results(sweep, console)
+    report = store.figures_folder / "report.html"
+    if read and request.figures and report.exists():
+        say(console, f"Report     {short(report)}")
     return _say_result(result, store, request, console)
+
+
+def _listening(stop: threading.Event, say_stopping: Callable[[], None]) -> AbstractContextManager[None]:
+    """Stop on signals; only a process's main thread can."""
+    is_main = threading.current_thread() is threading.main_thread()
+    return stopping_on_signals(stop, say_stopping) if is_main else contextlib.nullcontext()
 
 
 def _executor(grid: GridSpec, storage: RemoteSweep | None, request: LaunchRequest) -> Executor:
@@ -125,12 +145,26 @@ def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
     return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
 
 
-def _draw_at_end(store: SweepStore, console: Console) -> None:
-    """Draw a launch's figures; a mistake in drawing them is told, as the trials are run and MLflow waits."""
-    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
+def _say_starting(request: LaunchRequest, console: Console) -> None:
+    where = f"Connecting to the Ray cluster at {request.address}" if request.address else "Starting Ray"
+    say(console, f"{where} ...")
 
+
+def _say_results(sweep: Sweep, console: Console) -> None:
+    """Print what the final policies earn and cost."""
+    from recrl.orchestrator.cli.result_table import CAPTION, result_table  # noqa: PLC0415
+
+    table = result_table(sweep)
+    if len(table):
+        say(console, "")
+        show(table, console)
+        say(console, f"{CAPTION}\n")
+
+
+def _draw_at_end(sweep: Sweep, store: SweepStore, console: Console) -> None:
+    """Draw a launch's figures; if that fails, say so and go on: the trials are done and MLflow waits."""
     try:
-        draw(sweep_data.load(store), store.figures_folder, console)
+        draw(sweep, store.figures_folder, console)
     except (RecrlError, OSError):
         raise
     except Exception as error:

@@ -47,7 +47,8 @@ def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> Sw
     if sweep.endswith((".yaml", ".yml")):
         sweep = read_name(Path(sweep))
     if sweep not in names:
-        if not storage and is_sweep(folder := Path(sweep).absolute()):
+        folder = Path(sweep).absolute()
+        if not storage and (is_sweep(folder) or (folder / "trials").is_dir()):
             return SweepStore(folder.parent, folder.name)
         listed = f" (there: {', '.join(names)})" if names else ", nothing was launched there yet"
         raise RecrlError(f"{place}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
