@@ -18,6 +18,7 @@ extensions = [
     "sphinx_copybutton",
     "math_as_mathml",
     "generated_reference",
+    "solved_table",
     "source_role",
 ]
 exclude_patterns = ["_build", "_ext", "**/.ipynb_checkpoints"]
@@ -37,6 +38,7 @@ autodoc_typehints_format = "short"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"recrl {release}"
 html_static_path = ["_static"]

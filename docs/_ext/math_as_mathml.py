@@ -26,5 +26,4 @@ def visit_math_block(translator: HTML5Translator, node: nodes.math_block) -> Non
 def setup(app: Sphinx) -> dict[str, bool]:
     """Tell Sphinx."""
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
-    app.config.html_math_renderer = "mathml"  # type: ignore[attr-defined]
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""The README's worked examples, as their readers use them: packages of their own, found by entry point."""
+"""The worked examples, as their readers use them: packages of their own, found by entry point."""
 
 import subprocess
 import sys
@@ -13,13 +13,14 @@ from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep import launch
+from recrl.orchestrator.trial.trial import run_recorded
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
-README = Path(__file__).parents[2] / "README.md"
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
 GRID = """\
 name: plugged
 tasks: [{name: corridor, deploy_limits: 3, options: {length: 6}}]
-agents: [{name: priced, options: {price: 2.0}}]
+agents: [{name: fixed-multiplier, options: {multiplier: 2.0}}]
 methods: [{name: plateau, options: {hold: 0.25}}]
 seeds: 1
 run: {num_envs: 4, rollout_steps: 20, total_steps: 1600, evaluation_episodes: 4}
@@ -28,7 +29,7 @@ run: {num_envs: 4, rollout_steps: 20, total_steps: 1600, evaluation_episodes: 4}
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the three examples, installed by pip."""
+    """A folder with the examples, installed by pip."""
     target = tmp_path_factory.mktemp("site-packages")
     sources = tmp_path_factory.mktemp("sources")
     options = ["--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
@@ -64,14 +65,49 @@ def test_options_of_ones_own_are_checked_before_anything_starts(
     installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(installed))
-    wrong = GRID.replace("price: 2.0", "prize: 2.0").replace("hold: 0.25", "hold: 1.5")
+    wrong = GRID.replace("multiplier: 2.0", "multiplyer: 2.0").replace("hold: 0.25", "hold: 1.5")
     with pytest.raises(GridError) as refusal:
         parse_grid(wrong.encode(), source="grid.yaml")
-    assert "unknown key; did you mean 'price'?" in str(refusal.value)
+    assert "unknown key; did you mean 'multiplier'?" in str(refusal.value)
     assert "methods.0.options.hold" in str(refusal.value)
 
 
+def test_a_curriculum_that_reads_episodes_lowers_its_limit(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(installed))
+    text = GRID.replace("{name: plateau, options: {hold: 0.25}}", "{name: halving, options: {episodes: 12}}")
+    text = text.replace("deploy_limits: 3", "deploy_limits: 0.5")
+    grid = parse_grid(text.encode(), source="grid.yaml")
+    store = SweepStore(tmp_path, grid.name)
+    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    (trial,) = store.trials()
+    limits = trial.updates()["limit_0"]
+    assert limits.iloc[0] == float("inf") and limits.iloc[-1] == 0.5
+    assert limits.is_monotonic_decreasing and limits.nunique() > 3
+
+
+def test_an_agent_with_a_network_of_ones_own_learns_and_goes_on_exactly(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(installed))
+    text = GRID.replace("{name: fixed-multiplier, options: {multiplier: 2.0}}", "own-network").replace(
+        "total_steps: 1600", "total_steps: 8000"
+    )
+    grid = parse_grid(text.encode(), source="grid.yaml")
+    whole, parts = SweepStore(tmp_path / "whole", grid.name), SweepStore(tmp_path / "parts", grid.name)
+    launch(grid, whole, InlineExecutor(), stop=threading.Event())
+    updates = whole.trials()[0].updates()
+    assert updates["episode_return"].iloc[-1] > updates["episode_return"].iloc[0]
+    (spec,) = grid.trials()
+    asked = iter([False] * 30)
+    run_recorded(spec, parts.trial(spec), should_stop=lambda: next(asked, True))
+    launch(grid, parts, InlineExecutor(), stop=threading.Event())
+    assert parts.trials()[0].episodes_path.read_bytes() == whole.trials()[0].episodes_path.read_bytes()
+
+
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*/*.py")), ids=lambda path: path.stem)
-def test_an_example_is_short_and_the_readme_leads_to_it(path: Path) -> None:
-    assert len(path.read_text().splitlines()) < 40
-    assert f"({path.relative_to(README.parent)})" in README.read_text()
+def test_an_example_is_short_and_the_documentation_shows_it(path: Path) -> None:
+    assert len(path.read_text().splitlines()) < 90
+    pages = "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
+    assert str(path.relative_to(ROOT)) in pages
