@@ -17,6 +17,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Width = Annotated[int, Field(ge=1, le=4096)]
+IMPORT_PATH = r"^[A-Za-z_][\w.]*:[A-Za-z_][\w.]*$"
 
 STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "hidden_sizes": (256, 256),
@@ -59,7 +60,17 @@ class StudentConfig(BaseModel):
     )
     hidden_sizes: Annotated[tuple[Width, ...], Field(max_length=8)] = Field(
         default=(64, 64),
-        description="Widths of the tanh layers of each network (ours; paper 256, 256).",
+        description="Widths of the hidden layers of each network (ours; paper 256, 256).",
+    )
+    activation: Literal["tanh", "relu", "elu", "silu", "gelu"] = Field(
+        default="tanh",
+        description="Function between the layers (paper tanh). tanh is the fastest.",
+    )
+    network: Annotated[str, Field(pattern=IMPORT_PATH)] | None = Field(
+        default=None,
+        description="Import path package.module:function of a network of your own: the function takes the "
+        "numbers of inputs and outputs and returns a torch.nn.Module from [U, inputs] to [U, outputs]; it "
+        "makes the policy and every critic. hidden_sizes, activation and initialisation are then not used.",
     )
     initialisation: Literal["orthogonal", "xavier"] = Field(
         default="orthogonal", description="How weights begin (ours; paper xavier)."

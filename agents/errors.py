@@ -12,6 +12,10 @@ class DivergedError(ArithmeticError):
     """Learning broke down: a loss, an advantage or a parameter is no longer a finite number."""
 
 
+class NetworkError(ValueError):
+    """A user's network that cannot be what the agent needs."""
+
+
 class UnsupportedSpaceError(ValueError):
     """An observation or action space that the students cannot handle."""
 

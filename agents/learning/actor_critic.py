@@ -32,13 +32,15 @@ from recrl.agents.errors import require_finite
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import generalised_advantages, next_values
 from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.distributions import mean_divergence
-from recrl.agents.learning.networks import INITIALISERS, Adam, Critics, NetworkForm
+from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.agents.learning.surrogates import surrogate
 from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CMDPSpec, Floats
+from recrl.environments.plugins import trusted_attribute
 
 
 class Stateful(Protocol):
@@ -414,7 +416,12 @@ def fresh_student(
         scales=config.proximity_scales if config.encoder == "proximity" else (),
         normalise=config.normalise_observations,
     )
-    form = NetworkForm(config.hidden_sizes, INITIALISERS[config.initialisation])
+    form = NetworkForm(
+        config.hidden_sizes,
+        INITIALISERS[config.initialisation],
+        config.activation,
+        None if config.network is None else trusted_attribute(config.network),
+    )
     policy = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
     critics = Critics(encoder.size, cmdp.num_costs, form, generator)
     order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))

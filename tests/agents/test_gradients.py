@@ -16,9 +16,10 @@ from recrl.agents.config import IPOConfig
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning import networks
 from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.gradient_ascent import Objective, with_entropy
-from recrl.agents.learning.networks import Critics, FlatParameters, NetworkForm, orthogonal
+from recrl.agents.learning.networks import FlatParameters, NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import Floats
