@@ -1,4 +1,4 @@
-"""What can go wrong in a student, named after the user's question."""
+"""What can go wrong in an agent, named after the user's question."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class NetworkError(ValueError):
 
 
 class UnsupportedSpaceError(ValueError):
-    """An observation or action space that the students cannot handle."""
+    """An observation or action space that the agents cannot handle."""
 
 
 def require_finite(what: str, values: float | npt.NDArray[np.floating]) -> None:

@@ -39,7 +39,7 @@ class Critics:
         """Multiply each critic's values by a factor, [1 + k] (van Hasselt et al. 2016, section 2.2)."""
         self._stack.scale(torch.as_tensor(factors, dtype=torch.get_default_dtype()))
 
-    def differentiate(self, rows: Tensor, row_weights: Tensor, targets: Tensor) -> Tensor:
+    def differentiate(self, rows: Tensor, observation_weights: Tensor, targets: Tensor) -> Tensor:
         """The squared errors of each critic, and their sum's gradient, which the block then holds.
 
         L_c = sum_u w_u (V_c(u) - y_cu)^2. The critics share no parameter, so the gradient of the sum is each
@@ -47,7 +47,7 @@ class Critics:
 
         Args:
             rows: [U, n].
-            row_weights: w, [U].
+            observation_weights: w, [U].
             targets: y, [1 + k, U].
 
         Returns:
@@ -57,7 +57,7 @@ class Critics:
         for block in blocks(len(rows)):
             activations = self._stack.activations(rows[block])
             errors = activations[-1][..., 0] - targets[:, block]
-            weighted = errors * row_weights[block]
+            weighted = errors * observation_weights[block]
             self._stack.pull_back(activations, (2.0 * weighted)[..., None], add=block.start > 0)
             losses += (weighted * errors).sum(dim=1)
         return losses

@@ -12,7 +12,7 @@ A layer's biases are the last row of its weights, and its inputs end in a column
 sum their slopes would each be a sweep over memory as large as the activations, and such sweeps are what a
 large update costs beside its products.
 
-Letters: C networks, U rows, n inputs, P parameters.
+Notation: C networks, U rows, n inputs, P parameters.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def blocks(num_rows: int) -> list[slice]:
 
 @dataclass(frozen=True)
 class NetworkForm:
-    """How the networks of a student are built.
+    """How the networks of an agent are built.
 
     Attributes:
         hidden_sizes: widths of the hidden layers.

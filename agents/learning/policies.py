@@ -4,7 +4,7 @@ Acting is plain NumPy, on a CPU on the parameters' own memory: at 16 observation
 cost more than the arithmetic. Learning is PyTorch. The probabilities that learning compares with are computed
 by PyTorch too, at the start of an update, so that the ratio of an unchanged policy is exactly 1.
 
-Letters: U rows, B observations, n observation components, A actions, m action components, P parameters.
+Notation: U rows, B observations, n observation components, A actions, m action components, P parameters.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from torch import Tensor
 
-from recrl.agents.learning.batch import distinct_rows
+from recrl.agents.learning.batch import find_repeated
 from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
 from recrl.agents.learning.networks import NetworkForm, Scratch, TanhStack, blocks
 from recrl.agents.learning.noise import matching_log_std, matching_scale, off_greedy_mass
@@ -207,7 +207,7 @@ class StochasticPolicy:
         return self._widen(noise, form)
 
     def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
-        distinct = distinct_rows(observations)
+        distinct = find_repeated(observations)
         weights = np.full(len(observations), 1.0 / len(observations))
         if distinct is not None:  # on a tabular task a sixteenth of them
             first, row = distinct
@@ -265,7 +265,7 @@ def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:
 class PolicyEvaluation:
     """A policy evaluated at some rows; valid until its parameters change or it is evaluated again.
 
-    The part between the network's outputs and a loss is differentiated automatically, so that a student may
+    The part between the network's outputs and a loss is differentiated automatically, so that an agent may
     write any loss of the distribution; the network itself is ``TanhStack``'s to differentiate.
 
     Attributes:
@@ -301,18 +301,20 @@ class FisherMetric:
     Args:
         policy: at the parameters of the metric; they must not change while it is used.
         rows: the distinct observations, [U, n].
-        row_weights: share of the samples at each row, [U], summing to 1.
+        observation_weights: share of the samples at each row, [U], summing to 1.
         damping: multiple of the identity added, at least 0.
     """
 
-    def __init__(self, policy: StochasticPolicy, rows: Tensor, row_weights: Tensor, damping: float) -> None:
+    def __init__(
+        self, policy: StochasticPolicy, rows: Tensor, observation_weights: Tensor, damping: float
+    ) -> None:
         self._policy = policy
         self._damping = damping
         self._blocks: list[tuple[list[Tensor], Distribution, Tensor]] = []
         for block in blocks(len(rows)):
             activations = policy.stack.activations(rows[block], Scratch())
             distribution = policy.head(activations[-1][0], policy.log_std)
-            self._blocks.append((activations, distribution, row_weights[block, None]))
+            self._blocks.append((activations, distribution, observation_weights[block, None]))
 
     def __call__(self, vector: Tensor) -> Tensor:
         """H times a vector of parameter changes, [P] -> [P]; overwrites the policy's gradient block."""

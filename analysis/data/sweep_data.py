@@ -68,7 +68,6 @@ METHOD_ORDER = (
     "cosine",
     "exponential",
     "dynamic",
-    "annealed",
     "cooling",
     "step",
     "unconstrained",

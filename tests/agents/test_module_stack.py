@@ -15,6 +15,7 @@ from recrl.agents.errors import NetworkError
 from recrl.agents.learning.module_stack import ModuleStack, checked_module
 from recrl.agents.learning.networks import FlatParameters, TanhStack, orthogonal
 from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.plugins import UntrustedNameError, refuse_import_paths
 from recrl.environments.registry import make_vector
 
@@ -98,7 +99,7 @@ def trained(agent: str, task: str, options: dict[str, Any], *, updates: int = 3)
     collector.reset(seed=1)
     for _ in range(updates):
         rollout, episodes = collector.collect(student, generator)
-        student.update(rollout, episode_costs(episodes, 1), np.array([1.0]))
+        student.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits((1.0,))))
     return student
 
 

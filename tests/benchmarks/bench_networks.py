@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_networks.py [--updates 6]
 
 For each task, agent and size two trials run in turns, one with the standard perceptron and
-one with the same layers as a ``torch.nn.Module``. Printed are the CPU milliseconds of an update with the steps
-that it learns from, and their ratio, the median over the pairs.
+one with the same layers as a ``torch.nn.Module``. Printed are the CPU milliseconds of an update with
+the steps that it learns from, and their ratio, the median over the pairs.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from torch import nn
 
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
 TASKS = {"rivergrid-1a": 5.0, "CarGoal2": 25.0}
@@ -47,7 +48,7 @@ class Trial:
 
     def __init__(self, task: str, agent: str, options: dict[str, Any]) -> None:
         environments = make_vector(task, 64)
-        self.limits = np.array([TASKS[task]])
+        self.step = CurriculumStep(CostLimits((TASKS[task],)))
         self.agent = make_agent(agent, environments.cmdp, options, np.random.SeedSequence(0))
         self.collector = Collector(environments, num_steps=64)
         self.collector.reset(seed=0)
@@ -57,7 +58,7 @@ class Trial:
         """CPU seconds of 4,096 steps and what is learnt from them."""
         start = time.process_time()
         rollout, episodes = self.collector.collect(self.agent, self.generator)
-        self.agent.update(rollout, episode_costs(episodes, 1), self.limits)
+        self.agent.update(rollout, episode_costs(episodes, 1), self.step)
         return time.process_time() - start
 
 
