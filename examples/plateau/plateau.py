@@ -1,4 +1,4 @@
-"""A teacher of one's own: hold d_t for a while, then go down in a straight line to d_d."""
+"""A curriculum of one's own: hold d_t for a while, then decay linearly to d_d."""
 
 from pydantic import BaseModel, Field
 
