@@ -40,7 +40,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from recrl.analysis import report_page, report_tables
-from recrl.analysis.data.sweep_data import GROUP, Sweep, ordered
+from recrl.analysis.data.labels import GROUP, ordered
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.validity import doubts
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
@@ -51,8 +52,9 @@ from recrl.analysis.figures.profiles import performance_profiles
 from recrl.analysis.report_page import Section
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.curves import MEAN, Averaging, interquartile
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
-from recrl.analysis.statistics.metrics import MEAN, Averaging, Measure, interquartile
+from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.spec import TrialState
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import GROUP
+from recrl.analysis.data.labels import GROUP
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.redaction import printable
 

@@ -16,7 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recrl.analysis.data.sweep_data import KEY, Sweep, occurring
+from recrl.analysis.data.labels import KEY, occurring
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.cumulative_cost import policies_of, training_runs

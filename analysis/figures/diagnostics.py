@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.metrics import mean_curve, step_grid
+from recrl.analysis.statistics.curves import mean_curve, step_grid
 from recrl.environments.cmdp import Floats
 
 BINS = 100

@@ -2,7 +2,7 @@
 
 ``learning_curves`` is Figures 3 and 4 (one a student): return and cost over training, and magnified over
 deployment. ``curricula`` is Figure 5: the limits in force. Trials are averaged on a common grid of
-environment steps (``metrics.step_grid``), about 100 bins over a whole trial and 25 over its deployment.
+environment steps (``curves.step_grid``), about 100 bins over a whole trial and 25 over its deployment.
 
 Costs begin far above the limit and end near it. Where they exceed ten limits, the cost axis is linear up to
 the deployment limit and logarithmic above it, so that the limit can be read; the axis says so.
@@ -17,10 +17,11 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from recrl.analysis.data.sweep_data import Sweep, occurring
+from recrl.analysis.data.labels import occurring
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.metrics import MEAN, Averaging, mean_curve, step_grid
+from recrl.analysis.statistics.curves import MEAN, Averaging, mean_curve, step_grid
 from recrl.environments.cmdp import Floats
 
 BINS = 100

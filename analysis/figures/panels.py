@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, MethodStyle
-from recrl.analysis.statistics.metrics import Curve
+from recrl.analysis.statistics.curves import Curve
 
 LOG_AXIS_FROM = 10.0  # times the limit
 MARKERS_A_LINE = 6

@@ -21,7 +21,8 @@ from matplotlib.colors import LogNorm, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from recrl.analysis.data.sweep_data import Sweep, occurring
+from recrl.analysis.data.labels import occurring
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.styles import TEXT_WIDTH
 from recrl.analysis.report_tables import number

@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from recrl.analysis.data import sweep_data
-from recrl.analysis.data.sweep_data import METHOD_ORDER, Sweep
+from recrl.analysis.data.labels import METHOD_ORDER
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
