@@ -22,11 +22,14 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.curves import MEAN, Averaging, mean_curve, step_grid
+from recrl.analysis.statistics.metrics import OPTIMAL_GAP
 from recrl.environments.cmdp import Floats
 
 BINS = 100
 DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
+LEAST_SHOWN = 0.2  # of a limit, above and below it
+LEAST_SHOWN_RETURN = 2.0 * OPTIMAL_GAP  # above and below J*(d_d)
 WORTH_MARKING = 0.03  # of a trial: shorter spells of infinite limits (the measuring of d_t) are not marked
 
 
@@ -113,7 +116,7 @@ def curricula(sweep: Sweep) -> Figure:
             look,
             present,
             optimum=False,
-            title="cost limits in force: every run thin, their mean thick; the student's own cost faint",
+            title="cost limits in force: every run thin, their mean thick; the agent's own cost faint",
         )
     return figure
 
@@ -156,7 +159,19 @@ def _task_row(
             limit = float(trials[f"deploy_limit_{position - 1}"].iloc[0])
             largest = float(np.nanmax(updates[quantity].to_numpy(np.float64)))
             panels.cost_axis(row[2 * position], limit, largest)
+            panels.widen(row[2 * position + 1], limit, LEAST_SHOWN * limit or LEAST_SHOWN)
+            _shade(row[2 * position : 2 * position + 2], limit)
+        else:
+            panels.widen(row[1], float(trials["optimal_return"].iloc[0]), LEAST_SHOWN_RETURN)
     row[0].set_ylabel(panels.panel_title(trials, updates, separator="\n"))
+
+
+def _shade(panels_of_cost: Sequence[Axes], limit: float) -> None:
+    """Shade what is above the limit, and keep the axes as they are."""
+    for axes in panels_of_cost:
+        low, high = axes.get_ylim()
+        panels.infeasible_region(axes, limit)
+        axes.set_ylim(low, max(high, limit * 1.05))
 
 
 def _curves(
@@ -212,6 +227,7 @@ def _curriculum_panel(
     panels.reference_lines(axes, trials, f"cost_{i}")
     panels.phase_boundary(axes, boundary, total)
     axes.set_ylim(bottom=0.0)
+    _shade([axes], float(trials[f"deploy_limit_{i}"].iloc[0]))
 
 
 def _column_titles(num_costs: int) -> list[str]:

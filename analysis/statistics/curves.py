@@ -51,7 +51,9 @@ class Averaging:
     enough_runs: int = 1
 
     def describe(self, runs: int) -> str:
-        """The description, with a warning where there are too few runs."""
+        """The description, with a warning where there are too few runs; one run has no band."""
+        if runs == 1:
+            return "one seed, no interval"
         warning = f"; {runs} seeds are too few for it: the band is too narrow"
         return self.description + (warning if runs < self.enough_runs else "")
 

@@ -1,15 +1,14 @@
 """What a trial achieved: functions from tables to tables.
 
-A trial's outcome is measured three ways, never mixed (``Measure``). The design goes on learning in
-deployment, as the paper's curves show, so the deployment phase averages over policies; the frozen policy is
-the one a user would take away.
+A trial's outcome is measured three ways, never mixed (``Measure``). Learning goes on in the deployment phase,
+so that phase averages over policies. The final policy is the one a user would take away. Its values are exact
+where the task is finite and its table was recorded; otherwise they are means over episodes.
 
-Feasible means cost_i <= d_d,i for every i, of the sample means, without tolerance. ``feasible_within_se``
-allows one standard error over the trial's episodes. At a cost of exactly d_d in expectation the first is a
-coin's toss, which is why both are reported.
+There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``: a share
+COST_TOLERANCE of the limit, or one standard error of the mean where that is more. A policy with softmax
+outputs cannot meet a limit exactly where the optimum does: each action keeps some probability.
 
-Where J*(d_d) is known, ``optimal`` says whether a trial has found it: within OPTIMAL_GAP of the return at
-costs within d_d + OPTIMAL_EXCESS.
+Solved (the column ``optimal``) means feasible and at most OPTIMAL_GAP below J*(d_d), where that is known.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialState
 
 OPTIMAL_GAP = 0.2  # of the return to J*(d_d)
-OPTIMAL_EXCESS = 0.05  # of each mean cost over d_d
+COST_TOLERANCE = 0.01  # of a limit; in episode cost where the limit is 0
 ROUNDING = 1e-9  # of a difference of two returns: 9.5 - 9.3 is more than 0.2
 
 
@@ -50,9 +49,9 @@ class Measure(StrEnum):
     def description(self) -> str:
         """What it is, for captions."""
         return {
-            Measure.DEPLOYMENT: "all episodes of the deployment phase, in which learning goes on",
-            Measure.STOCHASTIC: "the frozen final policy, sampled",
-            Measure.DETERMINISTIC: "the frozen final policy, most probable actions",
+            Measure.DEPLOYMENT: "the deployment phase (learning goes on)",
+            Measure.STOCHASTIC: "the final policy, stochastic",
+            Measure.DETERMINISTIC: "the final policy, deterministic",
         }[self]
 
 
@@ -62,19 +61,22 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     Trials that are not complete are left out: half a deployment phase is no outcome.
 
     Returns:
-        KEY, measure, episodes, episode_return, episode_return_se, cost_i, cost_i_se (standard errors over
-        the trial's episodes), deploy_limit_i, optimal_return, gap (J*(d_d) minus the return; only an
-        honest score where the trial is feasible), feasible, feasible_within_se, optimal (False where J* is
-        not known).
+        KEY, measure, episodes, exact (whether computed, not sampled), episode_return, episode_return_se,
+        cost_i, cost_i_se (standard errors over the trial's episodes, 0 where exact), deploy_limit_i,
+        optimal_return, gap (J*(d_d) minus the return; the regret of a feasible trial), excess (the largest
+        cost_i - d_d,i), feasible, optimal (solved; False where J* is not known).
     """
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
-    measured = pd.concat([_deployment(sweep, costs), _frozen(sweep, costs)], ignore_index=True)
+    final = _with_exact(_frozen(sweep, costs), sweep.exact)
+    measured = pd.concat([_deployment(sweep, costs), final], ignore_index=True)
     complete = sweep.trials[sweep.trials["status"] == TrialState.COMPLETE.value]
     limits = [f"deploy_limit_{i}" for i in range(sweep.num_costs)]
     rows = measured.merge(complete[[*KEY, *limits, "optimal_return"]], on=list(KEY))
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
+    rows["excess"] = pd.DataFrame(
+        {i: rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"] for i in _costs_of(rows)}
+    ).max(axis=1)
     rows["feasible"] = within_limits(rows)
-    rows["feasible_within_se"] = within_limits(rows, standard_errors=1.0)
     rows["optimal"] = optimal(rows)
     order = {measure.value: position for position, measure in enumerate(Measure)}
     by_measure = rows["measure"].map(order).rename("_order")
@@ -82,33 +84,39 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     return rows.drop(columns="_order")
 
 
-def within_limits(
-    rows: pd.DataFrame, *, standard_errors: float = 0.0, excess: float = 0.0
-) -> pd.Series[bool]:
-    """Whether every mean cost is at most its limit plus a tolerance; costs that a task lacks are.
+def within_limits(rows: pd.DataFrame) -> pd.Series[bool]:
+    """Whether every mean cost is at most its limit plus ``tolerance``; costs that a task lacks are.
 
     Args:
-        rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se if it is asked for.
-        standard_errors: the tolerance, in standard errors of the mean (0 where they are not known).
-        excess: more of it, in episode cost.
+        rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se where costs are sampled.
     """
     within = pd.Series(True, index=rows.index)
-    for limit in (str(name) for name in rows if str(name).startswith("deploy_limit_")):
-        cost = limit.removeprefix("deploy_limit_")
-        bounds = rows[limit] + excess
-        if standard_errors:
-            bounds = bounds + standard_errors * rows[f"cost_{cost}_se"].fillna(0.0)
-        within &= (rows[f"cost_{cost}"] <= bounds) | rows[limit].isna()
+    for i in _costs_of(rows):
+        limit = rows[f"deploy_limit_{i}"]
+        errors = rows[f"cost_{i}_se"] if f"cost_{i}_se" in rows else pd.Series(0.0, index=rows.index)
+        within &= (rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna()
     return within
 
 
+def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[float]:
+    """How far a mean cost may be above its limit: COST_TOLERANCE of it, or a standard error if that is more.
+
+    Args:
+        limits: d_d,i; at a limit of 0 the tolerance is COST_TOLERANCE itself.
+        errors: standard errors of the mean costs; NaN counts as 0.
+    """
+    share = COST_TOLERANCE * limits.where(limits > 0.0, 1.0)
+    return pd.Series(np.maximum(share, errors.fillna(0.0)) + ROUNDING * (1.0 + limits), index=limits.index)
+
+
 def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether a gap to J*(d_d) is known and small and the costs are within d_d; the module says how far.
+    """Whether a trial is solved: feasible, and at most OPTIMAL_GAP below J*(d_d), which is known.
 
     Args:
         rows: gap, and what ``within_limits`` takes.
     """
-    return (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & within_limits(rows, excess=OPTIMAL_EXCESS)
+    near = (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & np.isfinite(rows["gap"])
+    return near & within_limits(rows)
 
 
 def training_totals(sweep: Sweep) -> pd.DataFrame:
@@ -140,8 +148,8 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     Returns:
         GROUP, measure, seeds, then mean and standard error (``_se``) of episode_return, cost_i and gap,
         deploy_limit_i, optimal_return, feasible_seeds, feasible_share with Wilson's 95% interval
-        (feasible_low, feasible_high), feasible_within_se_seeds, and optimal_seeds with Wilson's interval of
-        their share (optimal_low, optimal_high).
+        (feasible_low, feasible_high), and optimal_seeds with Wilson's interval of their share (optimal_low,
+        optimal_high).
     """
     names = [str(name) for name in rows]
     averaged = [name for name in names if name in ("episode_return", "gap") or is_cost(name)]
@@ -161,7 +169,6 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
             "feasible_share": share.estimate,
             "feasible_low": share.low,
             "feasible_high": share.high,
-            "feasible_within_se_seeds": int(chosen["feasible_within_se"].sum()),
             "optimal_seeds": int(chosen["optimal"].sum()),
             "optimal_low": best.low,
             "optimal_high": best.high,
@@ -246,7 +253,7 @@ def is_cost(name: str) -> bool:
 
 def _deployment(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
     chosen = sweep.phases[sweep.phases["phase"] == Phase.DEPLOYMENT.value]
-    rows = chosen[[*KEY, "episodes"]].assign(measure=Measure.DEPLOYMENT.value)
+    rows = chosen[[*KEY, "episodes"]].assign(measure=Measure.DEPLOYMENT.value, exact=False)
     for name in ("episode_return", *costs):
         rows[name] = chosen[name]
         rows[f"{name}_se"] = chosen[f"{name}_std"] / np.sqrt(chosen["episodes"].astype(np.float64))
@@ -256,8 +263,31 @@ def _deployment(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
 def _frozen(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
     values = sweep.evaluations.rename(columns={"policy": "measure"})
     grouped = values.groupby([*KEY, "measure"], observed=True)
-    rows = grouped.size().rename("episodes").reset_index()
+    rows = grouped.size().rename("episodes").reset_index().assign(exact=False)
     for name in ("episode_return", *costs):
         statistics = grouped[name].agg(["mean", "sem"]).reset_index()
         rows[name], rows[f"{name}_se"] = statistics["mean"], statistics["sem"]
     return rows
+
+
+def _with_exact(sampled: pd.DataFrame, exact: pd.DataFrame) -> pd.DataFrame:
+    """Replace sampled means by exact values where there are some; their standard errors are 0."""
+    if not len(exact):
+        return sampled
+    key = [*KEY, "measure"]
+    rows = sampled[key].merge(exact.rename(columns={"policy": "measure"}), on=key, how="left")
+    known = rows["episode_return"].notna().to_numpy()
+    sampled = sampled.assign(exact=known)
+    for name in (str(column) for column in rows if column not in key):
+        values = rows[name].to_numpy(np.float64)
+        sampled[name] = np.where(known, values, sampled[name])
+        sampled[f"{name}_se"] = np.where(
+            known, np.where(np.isnan(values), np.nan, 0.0), sampled[f"{name}_se"]
+        )
+    return sampled
+
+
+def _costs_of(rows: pd.DataFrame) -> list[str]:
+    """Which i have a column deploy_limit_i."""
+    names = [str(name) for name in rows]
+    return [name.removeprefix("deploy_limit_") for name in names if name.startswith("deploy_limit_")]

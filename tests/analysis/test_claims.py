@@ -26,13 +26,13 @@ def held(*outcomes: dict[str, object]) -> dict[str, tuple[int, int]]:
     return dict(zip(weighed["claim"].astype(str), counts, strict=True))
 
 
-def test_a_plain_student_that_does_not_arrive_stays() -> None:
+def test_a_plain_agent_that_does_not_arrive_stays() -> None:
     found = held(
         outcome("rivergrid-1a", "none", -20.0, 0.0),
         outcome("rivergrid-1a", "none", 9.5, 5.0),
         outcome("rivergrid-1a", "dynamic", -20.0, 0.0),
     )
-    assert found["the plain student stays at the start on 1a"] == (1, 2)
+    assert found["the plain agent stays at the start on 1a"] == (1, 2)
     assert found["the dynamic curriculum finds the crossing on 1a"] == (0, 1)
 
 
@@ -48,7 +48,7 @@ def test_crossing_on_1b_violates_and_is_not_the_optimum_though_its_return_is_hig
     assert found == {
         "every static curriculum violates d_d on 1b": (1, 2),
         "the dynamic curriculum finds the optimum on 1b": (1, 3),
-        "the plain student finds the optimum on 1b": (0, 1),
+        "the plain agent finds the optimum on 1b": (0, 1),
     }
 
 

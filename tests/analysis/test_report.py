@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from recrl.analysis import report
+from recrl.analysis import report, report_files
 from recrl.analysis.data import sweep_data
 from recrl.analysis.report import NothingToDrawError
 from recrl.orchestrator.files.store import SweepStore
@@ -85,7 +85,7 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     assert pictures == {"learning-curves_cpo.png", "curricula.png"}
     assert not any(path.suffix == ".pdf" for path in sketched)
     tables = {path.name for path in sketched if path.suffix in (".csv", ".tex", ".parquet")}
-    assert tables == {path.name for path in report.write_tables(sweep, tmp_path / "tables")[0]}
+    assert tables == {path.name for path in report_files.write_tables(sweep, tmp_path / "tables")[0]}
     assert f"- {report.UNFINISHED}" in sketched[1].read_text().splitlines()
 
 
