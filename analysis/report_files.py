@@ -83,15 +83,19 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
 def _outcome_tables(averaged: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """The outcomes, those of the final policy first."""
     tables = [(measure, report_tables.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
-    return [(f"Outcome of {measure.description}", table) for measure, table in tables if len(table)]
+    return [(_heading(measure), table) for measure, table in tables if len(table)]
 
 
 def _comparison_tables(compared: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Differences to the agent without a curriculum, those of the final policy first."""
     if not len(compared):
         return []
-    heading = "against none, seed by seed [95% interval]"
     return [
-        (f"Difference of {measure.description} {heading}", report_tables.comparison_table(compared, measure))
+        (f"{_heading(measure)}, minus none", report_tables.comparison_table(compared, measure))
         for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     ]
+
+
+def _heading(measure: Measure) -> str:
+    text = measure.description.removeprefix("the ")
+    return text[0].upper() + text[1:]

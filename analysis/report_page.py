@@ -28,7 +28,7 @@ figure img { width: 100%; min-width: 42rem; height: auto; display: block; }
 figcaption { color: #555; font-size: 0.85rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: 0.2rem 0.6rem 0.2rem 0; white-space: nowrap;
+th, td { text-align: left; overflow-wrap: normal; padding: 0.2rem 0.6rem 0.2rem 0; white-space: nowrap;
          border-bottom: 1px solid #e6e6e6; }
 th { border-bottom: 2px solid #999; vertical-align: bottom; }
 pre { font-size: 0.8rem; background: #f6f6f6; padding: 0.6rem; overflow-x: auto; }
@@ -38,8 +38,12 @@ summary { cursor: pointer; }
 tr.solved td.verdict { background: #e3f1e3; }
 tr.infeasible td { background: #fbe9e7; }
 tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
-.verdicts td.verdict { white-space: normal; min-width: 10rem; }
+.verdicts td.verdict { white-space: normal; min-width: 8rem; }
 .verdicts th { white-space: normal; }
+@media screen and (max-width: 44rem) {
+  .scroll::before { content: "scroll sideways →"; position: sticky; left: 0; color: #555;
+                    font-size: 0.8rem; }
+}
 .failed { border-left: 4px solid #c0392b; padding-left: 0.6rem; }
 @media print {
   @page { margin: 14mm; }

@@ -56,8 +56,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
             line[f"limit of {title}" if len(costs) > 1 else "limit"] = number(row[f"deploy_limit_{name[5:]}"])
         line["n"] = str(row["seeds"])
         deployed = [with_error(row[f"deployment_{name}"], math.nan, digits=3) for name in costs]
-        line[f"{DEPLOYMENT}: return"] = number(row["deployment_return"])
-        line[f"{DEPLOYMENT}: cost"] = ", ".join(deployed)
+        line[DEPLOYMENT] = f"return {number(row['deployment_return'])}, cost {', '.join(deployed)}"
         lines.append(line)
     return pd.DataFrame(lines)
 
@@ -135,7 +134,7 @@ def _best(rows: pd.DataFrame, column: str) -> str:
 
 
 def _share(counts: pd.DataFrame, method: str, column: str) -> str:
-    return f"{counts.loc[method, column]} of {counts.loc[method, 'seeds']}"
+    return f"{int(counts[column][method])} of {int(counts['seeds'][method])}"
 
 
 def _violations(rows: pd.DataFrame) -> list[str]:

@@ -132,43 +132,38 @@ def _right_edge(rows: pd.DataFrame) -> float:
 
 
 def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far: float) -> None:
-    """A small point a run and an open one for the mean; what lies too far right sits on the edge.
+    """An open mark a run; what lies too far right sits on the edge.
 
-    The open marks shrink from method to method, so that equal means show as marks within each other.
+    The marks shrink from method to method, so that equal runs show as marks within each other.
     """
     for position, (method, style) in enumerate(look.items()):
         chosen = rows[rows["method"] == method]
-        if not len(chosen):
-            continue
-        costs = np.minimum(chosen[COST].to_numpy(np.float64), far)
-        returns = chosen["episode_return"].to_numpy(np.float64)
         axes.scatter(
-            costs,
-            returns,
-            s=9.0,
-            c=style.colour,
-            marker=style.marker,
-            linewidths=0.0,
-            clip_on=False,
-            zorder=3.0,
-        )
-        axes.scatter(
-            [min(far, float(chosen[COST].mean()))],
-            [returns.mean()],
-            s=(11.0 - 1.4 * min(position, 5)) ** 2,
+            np.minimum(chosen[COST].to_numpy(np.float64), far),
+            chosen["episode_return"].to_numpy(np.float64),
+            s=(9.0 - 1.3 * min(position, 5)) ** 2,
             marker=style.marker,
             facecolors="none",
             edgecolors=style.colour,
             linewidths=1.1,
             clip_on=False,
-            zorder=4.0,
+            zorder=3.0,
         )
     axes.set_xlim(-0.05 * far, far)
 
 
 def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str]) -> None:
     handles = [
-        Line2D([], [], color=look[method].colour, marker=look[method].marker, linestyle="none", label=method)
+        Line2D(
+            [],
+            [],
+            color=look[method].colour,
+            marker=look[method].marker,
+            markerfacecolor="none",
+            markersize=5.0,
+            linestyle="none",
+            label=method,
+        )
         for method in methods
     ]
     references = [
@@ -183,5 +178,5 @@ def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str]) ->
         ncols=min(len(handles), panels.METHODS_A_LINE),
         columnspacing=1.2,
         handletextpad=0.5,
-        title="final policies: a filled mark a run, an open one their mean; at the right edge: further right",
+        title="final policies, a mark a run; at the right edge: further right",
     )

@@ -90,11 +90,11 @@ def within_limits(rows: pd.DataFrame) -> pd.Series[bool]:
     Args:
         rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se where costs are sampled.
     """
-    within = pd.Series(True, index=rows.index)
+    within: pd.Series[bool] = pd.Series(True, index=rows.index)
     for i in _costs_of(rows):
         limit = rows[f"deploy_limit_{i}"]
         errors = rows[f"cost_{i}_se"] if f"cost_{i}_se" in rows else pd.Series(0.0, index=rows.index)
-        within &= (rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna()
+        within = within & ((rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna())
     return within
 
 
