@@ -38,9 +38,10 @@ summary { cursor: pointer; }
 tr.solved td.verdict { background: #e3f1e3; }
 tr.infeasible td { background: #fbe9e7; }
 tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
-.verdicts td.verdict { white-space: normal; min-width: 8rem; }
+.verdicts td.verdict { white-space: normal; min-width: 13rem; }
 .verdicts th { white-space: normal; }
 @media screen and (max-width: 44rem) {
+  .verdicts td.verdict { min-width: 7rem; }
   .scroll::before { content: "scroll sideways →"; position: sticky; left: 0; color: #555;
                     font-size: 0.8rem; }
 }

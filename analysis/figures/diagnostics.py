@@ -86,7 +86,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
         for axes, quantity in zip(grid[:, 0], rows, strict=True):
             axes.set_ylabel(_label(quantity), fontsize=7.0)
             if quantity.startswith(EXPLAINED):
-                axes.set_ylim(LEAST_EXPLAINED, 1.0)
+                axes.set_ylim(LEAST_EXPLAINED, 1.05)
             if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
                 axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
                 axes.set_ylim(bottom=-0.3)

@@ -105,6 +105,9 @@ def curricula(sweep: Sweep) -> Figure:
                 else:
                     axes.set_title(f"{task}: nothing run yet", loc="left", pad=3.0)
                     axes.set_xticks([])
+            row[0].set_ylim(bottom=0.0)
+            limits = sweep.trials.loc[sweep.trials["task"] == task, f"deploy_limit_{i}"]
+            _shade(list(row), float(limits.iloc[0]))
             row[0].set_ylabel("cost limit" if sweep.num_costs == 1 else f"limit of cost {i + 1}")
         for axes, agent in zip(grid[0], agents, strict=True):
             axes.set_title(f"{agent}\n{axes.get_title(loc='left')}", loc="left", pad=3.0)
@@ -222,12 +225,10 @@ def _curriculum_panel(
         if last >= WORTH_MARKING * total:
             edge = axes.get_xaxis_transform()
             axes.plot([0.0, last], [1.0, 1.0], **style.line, transform=edge, clip_on=False)
-            axes.text(last, 1.0, " ∞", color=style.colour, va="center", fontsize=9.0, transform=edge)
+            axes.text(last, 1.0, " ∞", color=style.colour, va="top", fontsize=9.0, transform=edge)
     panels.step_axis(axes, 0.0, total)
     panels.reference_lines(axes, trials, f"cost_{i}")
     panels.phase_boundary(axes, boundary, total)
-    axes.set_ylim(bottom=0.0)
-    _shade([axes], float(trials[f"deploy_limit_{i}"].iloc[0]))
 
 
 def _column_titles(num_costs: int) -> list[str]:

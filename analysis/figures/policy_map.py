@@ -101,7 +101,7 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
         bar = figure.colorbar(ScalarMappable(scale, VISIT_COLOURS), ax=grid, shrink=0.6, aspect=30, pad=0.01)
         gap = " " if rows > 1 else "\n"  # one row is lower than the label is long
         bar.set_label(f"expected steps{gap}on the square, an episode", fontsize=6.0)
-        title = f"{agent}: final policies, sampled; the mean over runs, exactly computed"
+        title = f"{agent}: stochastic final policies, exactly evaluated; the mean over runs"
         figure.suptitle(title, fontsize=7.0)
     return figure
 

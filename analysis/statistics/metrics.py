@@ -13,6 +13,7 @@ Solved (the column ``optimal``) means feasible and at most OPTIMAL_GAP below J*(
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from typing import Any
 
@@ -115,7 +116,7 @@ def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
     Args:
         rows: gap, and what ``within_limits`` takes.
     """
-    near = (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & np.isfinite(rows["gap"])
+    near = (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & (rows["gap"] > -math.inf)  # NaN is neither
     return near & within_limits(rows)
 
 

@@ -29,8 +29,8 @@ def test_two_state_by_hand() -> None:
     models = {"mine": finite_model("two-state", {"horizon": 10})}
     # the camp is left at once, then 9 careful steps earn 1 each, and a hasty one 2 at a cost of 1
     values = exact_values(two_state((0.0, 1.0), (0.6, 0.4)), models).set_index("policy")
-    assert values.loc["stochastic", ["episode_return", "cost_0"]].tolist() == pytest.approx([12.6, 3.6])
-    assert values.loc["deterministic", ["episode_return", "cost_0"]].tolist() == [9.0, 0.0]
+    assert list(values.loc["stochastic", ["episode_return", "cost_0"]]) == pytest.approx([12.6, 3.6])
+    assert list(values.loc["deterministic", ["episode_return", "cost_0"]]) == [9.0, 0.0]
 
 
 def test_rounded_tables_sum_to_one_again() -> None:

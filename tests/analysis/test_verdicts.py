@@ -52,11 +52,11 @@ def judged(rows: list[dict[str, object]]) -> pd.DataFrame:
 def test_seeds_are_counted_by_the_final_policy_only() -> None:
     table = judged(ROWS).set_index("method")
     counts = table[["seeds", "solved", "feasible", "infeasible"]]
-    assert counts.loc["none"].tolist() == [2, 1, 2, 0]
-    assert counts.loc["linear"].tolist() == [2, 0, 0, 2]
-    assert counts.loc["dynamic"].tolist() == [2, 2, 2, 0]
-    assert table.loc["linear", ["worst_excess", "worst_share"]].tolist() == [2.0, 0.4]
-    assert table.loc["none", ["deployment_return", "deployment_cost_0"]].tolist() == [2.0, 50.0]
+    assert list(counts.loc["none"]) == [2, 1, 2, 0]
+    assert list(counts.loc["linear"]) == [2, 0, 0, 2]
+    assert list(counts.loc["dynamic"]) == [2, 2, 2, 0]
+    assert list(table.loc["linear", ["worst_excess", "worst_share"]]) == [2.0, 0.4]
+    assert list(table.loc["none", ["deployment_return", "deployment_cost_0"]]) == [2.0, 50.0]
 
 
 def test_the_worst_cost_is_the_one_that_is_furthest_over_its_limit() -> None:
