@@ -22,7 +22,6 @@ METHOD_ORDER = (
     "cosine",
     "exponential",
     "dynamic",
-    "annealed",
     "cooling",
     "step",
     "unconstrained",

@@ -62,7 +62,6 @@ STYLES = {
     "cosine": MethodStyle("#0072b2", (5.0, 1.5, 1.2, 1.5), "^"),
     "exponential": MethodStyle("#009e73", (1.4, 1.2), "v"),
     "dynamic": MethodStyle("#d55e00", (), "D", 1.5),
-    "annealed": MethodStyle("#882255", (6.0, 1.2, 3.0, 1.2), "<"),
     "cooling": MethodStyle("#44aa99", (4.0, 1.0, 1.0, 1.0), ">"),
     "step": MethodStyle("#cc79a7", (8.0, 2.0), "P"),
     "unconstrained": MethodStyle("#7a7a7a", (3.0, 1.2, 1.0, 1.2, 1.0, 1.2), "X"),

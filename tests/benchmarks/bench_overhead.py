@@ -158,7 +158,7 @@ def bench_many(root: Path, trials: int) -> None:
 
     def command(*arguments: str) -> list[tuple[float, str]]:
         """Run it; the seconds after which each of its lines came, and its end as the last."""
-        line = [sys.executable, "-u", "-m", "recrl.orchestrator.cli.main", *arguments]
+        line = [sys.executable, "-u", "-m", "recrl.orchestrator.cli", *arguments]
         began = time.monotonic()
         with subprocess.Popen(line, cwd=root, stdout=subprocess.PIPE, text=True) as process:
             said = [(time.monotonic() - began, text.rstrip()) for text in process.stdout or ()]

@@ -556,7 +556,7 @@ def single_machine(cluster: Cluster) -> SweepStore:
     command = [
         sys.executable,
         "-m",
-        "recrl.orchestrator.cli.main",
+        "recrl.orchestrator.cli",
         "launch",
         str(cluster.folder / "grids/cluster.yaml"),
     ]

@@ -324,7 +324,7 @@ resources: {cpus_per_trial: 0.5, max_concurrent: 2, silence_seconds: 6}
 def test_a_hung_trial_starts_again_and_a_signal_to_the_group_saves_them_all(tmp_path: Path) -> None:
     """A process is stopped and does not come back: it is killed. Then ``timeout`` signals everybody."""
     (tmp_path / "grid.yaml").write_text(GRID)
-    command = [sys.executable, "-m", "recrl.orchestrator.cli.main", "launch", "grid.yaml"]
+    command = [sys.executable, "-m", "recrl.orchestrator.cli", "launch", "grid.yaml"]
     store = SweepStore(tmp_path / "runs", "small")
     process = subprocess.Popen(
         [*command, "--no-mlflow", "--no-figures"],

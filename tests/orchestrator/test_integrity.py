@@ -437,7 +437,7 @@ def test_a_row_with_other_columns_names_the_agent(
 
 
 FICKLE = """\
-from recrl.agents.config import PPOLagConfig
+from recrl.agents.algorithm_configs import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import make_ppo_lag
 from recrl.agents.registry import AgentEntry
 

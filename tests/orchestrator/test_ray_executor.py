@@ -20,7 +20,7 @@ import pytest
 import ray
 from ray.exceptions import RayActorError
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
@@ -40,7 +40,7 @@ from recrl.orchestrator.ray.teacher_service import RayTeacher, start_teacher_ser
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, TeacherSpec
+from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 
 LINEAR = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
@@ -195,12 +195,12 @@ def process_of(actor: Any) -> int:
     return process
 
 
-def lessons(teacher: Teacher, reports: Sequence[ProgressReport]) -> Iterator[Lesson]:
-    lesson, state = teacher.start()
-    yield lesson
+def lessons(teacher: Teacher, reports: Sequence[ProgressReport]) -> Iterator[CurriculumStep]:
+    step, state = teacher.start()
+    yield step
     for report in reports:
-        lesson, state = teacher.step(state, report)
-        yield lesson
+        step, state = teacher.step(state, report)
+        yield step
 
 
 def curriculum(cost: float) -> tuple[TeacherSpec, list[ProgressReport]]:
@@ -232,9 +232,9 @@ def curriculum(cost: float) -> tuple[TeacherSpec, list[ProgressReport]]:
 @pytest.mark.usefixtures("cluster")
 def test_inline_own_shared_and_killed_teachers_give_identical_limits() -> None:
     expected = [list(lessons(make_teacher(spec), reports)) for spec, reports in map(curriculum, (6.0, 4.0))]
-    assert len({lesson.limits for lesson in expected[0]}) > 2
+    assert len({step.limits for step in expected[0]}) > 2
 
-    def own(cost: float) -> list[Lesson]:
+    def own(cost: float) -> list[CurriculumStep]:
         spec, reports = curriculum(cost)
         return list(lessons(RayTeacher(spec, start_teacher_service(f"own-{cost}")), reports))
 
@@ -242,7 +242,7 @@ def test_inline_own_shared_and_killed_teachers_give_identical_limits() -> None:
 
     service = start_teacher_service("shared")
     pupils = [lessons(RayTeacher(spec, service), reports) for spec, reports in map(curriculum, (6.0, 4.0))]
-    shared: list[tuple[Lesson, ...]] = []
+    shared: list[tuple[CurriculumStep, ...]] = []
     for update, pair in enumerate(zip(*pupils, strict=True)):
         shared.append(pair)
         if update == 10:

@@ -31,7 +31,7 @@ run: {total_steps: 120, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 # A user's own student that breaks down as long as a file called "broken" is in the working directory.
 FRAGILE_STUDENT = """\
 from pathlib import Path
-from recrl.agents.config import PPOLagConfig
+from recrl.agents.algorithm_configs import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import make_ppo_lag
 from recrl.agents.registry import AgentEntry
 
