@@ -24,7 +24,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import DRAWN_METRICS, EVENT_COLUMNS, TRIAL, Sweep, TrialFacts, assemble
+from recrl.analysis.data.labels import TRIAL
+from recrl.analysis.data.sweep_data import DRAWN_METRICS, EVENT_COLUMNS, Rows, Sweep, TrialFacts, assemble
 from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.tracking.reader import History, TrackedSweep, TrackedTrial, find_sweep
 
@@ -59,11 +60,13 @@ def load(uri: str, name: str | None = None) -> Sweep:
     return assemble(
         tracked.name,
         [_facts(trial, data) for trial, data in zip(tracked.trials, provenance, strict=True)],
-        phases=_records([trial.phases for trial in tracked.trials]),
-        updates=_updates(tracked),
-        evaluations=_tables(files("evaluation.csv")),
-        events=_records([_events(data) for data in files("events.jsonl")]),
-        policies=_with_states(_tables(files("policy.csv"))),
+        Rows(
+            phases=_records([trial.phases for trial in tracked.trials]),
+            updates=_updates(tracked),
+            evaluations=_tables(files("evaluation.csv")),
+            events=_records([_events(data) for data in files("events.jsonl")]),
+            policies=_with_states(_tables(files("policy.csv"))),
+        ),
         grid=grid.decode() if grid else "",
         notes=notes,
     )

@@ -20,7 +20,8 @@ import pytest
 
 from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data import from_mlflow as mlflow_data
-from recrl.analysis.data.sweep_data import KEY, Sweep
+from recrl.analysis.data.labels import KEY
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
