@@ -52,8 +52,10 @@ from recrl.orchestrator.sweep import (
     request_stop,
     stopping_on_signals,
 )
+from recrl.orchestrator.tracking.address import checked_uri, tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
-from recrl.orchestrator.tracking.mlflow_sync import checked_uri, last_report, sync, tracking_uri
+from recrl.orchestrator.tracking.export_file import write_in_own_process
+from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 from recrl.orchestrator.tracking.ui import open_ui
 from recrl.orchestrator.validation import nearest
 from recrl.teachers.registry import teacher_config
@@ -338,7 +340,7 @@ def _tell_mlflow(store: SweepStore, arguments: argparse.Namespace, console: Cons
     uri = tracking_uri(store, arguments.tracking_uri)
     if last_report(store, uri) is None:
         return
-    report = sync(store, uri)
+    report = sync(store, uri, write_export=write_in_own_process)
     if not report.is_up_to_date:
         _say(
             console, f"MLflow     is not up to date ({report.problem}); later: recrl-sweep sync {store.name}"
@@ -536,14 +538,14 @@ def run_sync(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Bring MLflow up to the files."""
     store = _store(arguments)
     uri = tracking_uri(store, arguments.tracking_uri)
-    report = sync(store, uri, rebuild=arguments.rebuild)
+    report = sync(store, uri, rebuild=arguments.rebuild, write_export=write_in_own_process)
     if not report.is_up_to_date:
         raise TrackingError(
             f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}"
         )
     _say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:
-        _say(console, f"without a snapshot ({report.remark}): reading it from a server takes longer")
+        _say(console, f"the export file was not uploaded ({report.remark}): who reads MLflow gets the last one")
     return ExitCode.OK
 
 

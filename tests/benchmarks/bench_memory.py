@@ -24,8 +24,8 @@ from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.ray.executor import RayExecutor, local_cluster
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
-from recrl.orchestrator.tracking.mlflow_sync import tracking_uri
 from tests.benchmarks.bench_overhead import car_trial, family
 
 LOOK_SECONDS = 1.0

@@ -33,7 +33,8 @@ from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep import launch
-from recrl.orchestrator.tracking.mlflow_sync import sync, tracking_uri
+from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.trial.trial import run_recorded
 
 GRID = """\
