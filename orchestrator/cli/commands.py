@@ -39,17 +39,19 @@ from recrl.orchestrator.files.code_changes import has_other_code, no_curriculum_
 from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.grid.grid import GridSpec, read_grid, read_name
 from recrl.orchestrator.grid.plan import Plan, estimate, make_plan, select, trials_at_once
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.redaction import shown as text_shown
+from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
 from recrl.orchestrator.sweep import (
     REQUEST_SECONDS,
+    LaunchSettings,
     Mirror,
     SweepResult,
     launch,
-    request_stop,
     stopping_on_signals,
 )
 from recrl.orchestrator.tracking.address import checked_uri, tracking_uri
@@ -64,7 +66,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from recrl.analysis.data.sweep_data import Sweep
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 
 DEFAULT_ROOT = Path("runs")
 MIRROR_INTERVAL_SECONDS = 5.0
@@ -95,9 +96,7 @@ def run_validate(arguments: argparse.Namespace, console: Console) -> ExitCode:
 def run_plan(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Say what a launch would do; nothing is started, and nothing written but a mirror of what is kept."""
     grid, store = _grid_and_store(arguments)
-    storage = _storage(store, arguments.storage)
-    if storage is not None:
-        _pull(storage, store)
+    sweep_place(store, arguments.storage).refresh()
     plan = make_plan(
         grid.trials(),
         store,
@@ -124,11 +123,9 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Work on everything in the grid that is not complete."""
     grid, store = _grid_and_store(arguments)
     only = _only(arguments.only)
-    storage = _storage(store, arguments.storage)
-    if storage is not None:
-        storage.objects.probe()
-        storage.mark(store)
-    executor = _executor(grid, storage, arguments)
+    place = sweep_place(store, arguments.storage)
+    place.prepare()
+    executor = _executor(grid, place, arguments)
     at_once, where = _room(grid, arguments)
     uri = tracking_uri(store, arguments.tracking_uri) if arguments.mlflow else None
     stop = threading.Event()
@@ -152,21 +149,20 @@ def run_launch(arguments: argparse.Namespace, console: Console) -> ExitCode:
         _say(console, "Stopping: running trials save where they are. Once more to stop at once.")
 
     with contextlib.ExitStack() as shown, stopping_on_signals(stop, say_stopping):
-        result = launch(
+        settings = LaunchSettings(
             grid,
-            store,
+            place,
             executor,
-            stop=stop,
             only=only,
             retry_failed=arguments.retry_failed,
             rerun_damaged=arguments.rerun_damaged,
             rerun_changed=arguments.rerun_changed,
-            storage=storage,
             start_mirror=_mirror_to(uri) if uri else None,
             watch=watch,
             finish=finish,
         )
-    kept = f", a mirror of {storage.objects.uri}" if storage else ""
+        result = launch(settings, stop=stop)
+    kept = f", a mirror of {place.address}" if place.address else ""
     _say(console, f"Results    {_short(store.folder)}{kept}")
     if uri:
         _say_mirrored(result, store, uri, arguments, console)
@@ -228,16 +224,15 @@ def _listed(store: SweepStore) -> list[TrialSpec]:
 def run_stop(arguments: argparse.Namespace, console: Console) -> ExitCode:
     """Ask the launch that runs a sweep to save its trials and end, and wait until it has."""
     store = _store(arguments)
-    storage = _storage(store, arguments.storage)
-    still_runs = request_stop(store, storage)
+    place = sweep_place(store, arguments.storage)
+    still_runs = place.request_stop()
     if not still_runs():
         _say(console, f"{store.name}: no launch runs this sweep")
         return ExitCode.OK
     _say(console, f"{store.name}: its trials save where they are")
     while still_runs():
         time.sleep(REQUEST_SECONDS)
-    if storage is not None:
-        _pull(storage, store)
+    place.refresh()
     _say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
     return ExitCode.OK
 
@@ -249,10 +244,10 @@ def run_logs(arguments: argparse.Namespace, console: Console) -> ExitCode:
     if arguments.folder:
         _say(console, str(_short(trial.folder)))
         return ExitCode.OK
-    storage = _storage(store, arguments.storage)
     with contextlib.ExitStack() as following:
-        if arguments.follow and storage is not None and not store.is_locked():
-            following.enter_context(storage.mirrored(store, threading.Event()))
+        if arguments.follow and not store.is_locked():
+            place = sweep_place(store, arguments.storage)
+            following.enter_context(place.mirrored(threading.Event()))
         for text in display.lines_of(trial, follow=arguments.follow):
             _say(console, text)
     return ExitCode.OK
@@ -545,7 +540,7 @@ def run_sync(arguments: argparse.Namespace, console: Console) -> ExitCode:
         )
     _say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:
-        _say(console, f"the export file was not uploaded ({report.remark}): who reads MLflow gets the last one")
+        _say(console, f"without the export file ({report.remark}): readers of MLflow get the last one")
     return ExitCode.OK
 
 
@@ -581,29 +576,6 @@ def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> Sw
     return SweepStore(root, sweep)
 
 
-def _storage(store: SweepStore, given: str | None) -> RemoteSweep | None:
-    """The object store that a sweep is kept in: as given, or as its folder remembers."""
-    if not given and not store.storage_path.exists():
-        return None
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep  # noqa: PLC0415  (imports fsspec)
-
-    return RemoteSweep(given, store.name) if given else RemoteSweep.of(store)
-
-
-def _pull(storage: RemoteSweep, store: SweepStore, *, checkpoints: bool = False) -> None:
-    """Bring the sweep's folder up to what is kept, or say that it is not."""
-    if store.is_locked():
-        return  # the launch that runs here does it all the time
-    try:
-        if storage.is_there():
-            storage.mark(store)
-            storage.pull(store, checkpoints=checkpoints)
-    except StorageError as error:
-        if not store.info_path.exists():
-            raise
-        logger.warning("%s; what follows is as of the last look", error)
-
-
 def _grid_and_store(arguments: argparse.Namespace) -> tuple[GridSpec, SweepStore]:
     grid = read_grid(arguments.grid)
     return grid, SweepStore(arguments.root, grid.name)
@@ -620,14 +592,14 @@ def _only(pairs: Sequence[str]) -> dict[str, list[str]]:
     return wanted
 
 
-def _executor(grid: GridSpec, storage: RemoteSweep | None, arguments: argparse.Namespace) -> Executor:
+def _executor(grid: GridSpec, place: SweepPlace, arguments: argparse.Namespace) -> Executor:
     if arguments.ship_package and not arguments.address:
         raise RecrlError("--ship-package: needs an --address to ship to")
     if arguments.executor == "inline":
-        return InlineExecutor(storage)
-    if storage is not None and storage.uri.startswith("memory://"):
+        return InlineExecutor()
+    if place.uri.startswith("memory://"):
         raise RecrlError(
-            f"{storage.uri}: is one process's memory, which others do not see; see --executor inline"
+            f"{place.uri}: is one process's memory, which others do not see; see --executor inline"
         )
     from recrl.orchestrator.ray.executor import RayExecutor  # noqa: PLC0415  (imports ray)
 
@@ -640,7 +612,6 @@ def _executor(grid: GridSpec, storage: RemoteSweep | None, arguments: argparse.N
         max_concurrent=arguments.max_concurrent or grid.resources.max_concurrent,
         teacher=grid.resources.teacher,
         silence_seconds=grid.resources.silence_seconds,
-        storage=storage,
     )
 
 
@@ -784,9 +755,7 @@ def _say_result(
 def _store(arguments: argparse.Namespace, *, checkpoints: bool = False) -> SweepStore:
     """The folder of the sweep that is meant, up to date also where it is a mirror."""
     store = sweep_store(arguments.root, arguments.sweep, arguments.storage)
-    storage = _storage(store, arguments.storage)
-    if storage is not None:
-        _pull(storage, store, checkpoints=checkpoints)
+    sweep_place(store, arguments.storage).refresh(checkpoints=checkpoints)
     return store
 
 

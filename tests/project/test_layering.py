@@ -35,7 +35,7 @@ ALLOWED = {
 ADAPTERS = {
     "PIL": r"orchestrator\.trial\.videos",
     "av": r"orchestrator\.trial\.videos",
-    "torch": r"agents\..*|orchestrator\.(trial\.trial|ray\.executor)",
+    "torch": r"agents\..*|orchestrator\.(trial\.trial|ray\.worker)",
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\.rivergrid\..*",
     "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
@@ -53,7 +53,7 @@ ADAPTERS = {
 LAYERS = (
     ("background", "errors", "exit_codes", "located_yaml", "redaction", "spec", "untrusted", "validation"),
     ("files",),
-    ("executors", "status", "trial"),
+    ("executors", "places", "status", "trial"),
     ("grid", "remote"),
     ("tracking",),
     ("ray", "report_refresh", "sweep"),
