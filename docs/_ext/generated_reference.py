@@ -67,7 +67,12 @@ def command_line() -> str:
     top = parser()
     (commands,) = (it for it in top._actions if isinstance(it, argparse._SubParsersAction))
     summaries = {it.dest: it.help or "" for it in commands._choices_actions}
-    lines = [NOTE, "# Command line\n", f"{cell(top.description)}\n", "`recrl-sweep COMMAND --help` prints this.\n"]
+    lines = [
+        NOTE,
+        "# Command line\n",
+        f"{cell(top.description)}\n",
+        "`recrl-sweep COMMAND --help` prints this.\n",
+    ]
     lines += ["| command | what it does |", "|---|---|"]
     lines += [f"| [`{name}`](#recrl-sweep-{name}) | {cell(text)} |" for name, text in summaries.items()]
     for name, command in commands.choices.items():
@@ -133,7 +138,11 @@ def agents() -> str:
     """Every option of every agent: first those that all share."""
     models = {name: entry.config for name, entry in AGENTS.items()}
     shared = common_options(models.values())
-    lines = [NOTE, "# Agents\n", "Options are given in a grid: `agents: [{name: ppo-lag, options: {...}}]`.\n"]
+    lines = [
+        NOTE,
+        "# Agents\n",
+        "Options are given in a grid: `agents: [{name: ppo-lag, options: {...}}]`.\n",
+    ]
     lines += ["| agent | what it is |", "|---|---|"]
     lines += [f"| [`{name}`](#{anchor(name)}) | {cell(entry.summary)} |" for name, entry in AGENTS.items()]
     first = next(iter(models.values()))
@@ -146,7 +155,11 @@ def agents() -> str:
 
 def curricula() -> str:
     """Every option of every curriculum."""
-    lines = [NOTE, "# Curricula\n", "Options are given in a grid: `methods: [{name: dynamic, options: {...}}]`.\n"]
+    lines = [
+        NOTE,
+        "# Curricula\n",
+        "Options are given in a grid: `methods: [{name: dynamic, options: {...}}]`.\n",
+    ]
     lines += ["| curriculum | what it does |", "|---|---|"]
     lines += [f"| [`{name}`](#{anchor(name)}) | {cell(kind.summary)} |" for name, kind in TEACHERS.items()]
     for name, kind in TEACHERS.items():
@@ -160,7 +173,11 @@ def tasks() -> str:
     for name, task in TASKS.items():
         model = load_attribute(task.options) if isinstance(task.options, str) else task.options
         families.setdefault(model, []).append(name)
-    lines = [NOTE, "# Tasks\n", "Options are given in a grid: `tasks: [{name: rivergrid-1a, options: {...}}]`.\n"]
+    lines = [
+        NOTE,
+        "# Tasks\n",
+        "Options are given in a grid: `tasks: [{name: rivergrid-1a, options: {...}}]`.\n",
+    ]
     lines += ["| task | what it is |", "|---|---|"]
     lines += [f"| `{name}` | {cell(task.summary)} |" for name, task in TASKS.items()]
     for model, names in families.items():
@@ -176,8 +193,8 @@ def presets_page() -> str:
     return (
         f"{NOTE}# Presets\n\n"
         "`recommended` is every option's default. `preset: paper` sets the options below to the values of\n"
-        "safety-starter-agents, which the paper took over unchanged. For `focops` and `ipo` some values are those\n"
-        "of their own papers. An option given beside `preset` overrides it. The table is complete.\n\n"
+        "safety-starter-agents, which the paper took over unchanged. For `focops` and `ipo` some values are\n"
+        "those of their own papers. An option given beside `preset` overrides it. The table is complete.\n\n"
         f"{presets.table()}\n"
     )
 
@@ -221,7 +238,7 @@ def type_text(name: str, field: Mapping[str, Any], schema: Mapping[str, Any]) ->
     return words(field, schema)
 
 
-def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
+def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:  # noqa: PLR0911
     """A JSON schema in words."""
     if "$ref" in field:
         return words(schema["$defs"][field["$ref"].rsplit("/", 1)[1]], schema)

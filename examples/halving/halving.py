@@ -48,4 +48,6 @@ class Halving:
         return Lesson(limits), state
 
 
-HALVING = TeacherKind("Halve the distance to d_d when the last episodes kept the limit.", HalvingConfig, Halving)
+HALVING = TeacherKind(
+    "Halve the distance to d_d when the last episodes kept the limit.", HalvingConfig, Halving
+)

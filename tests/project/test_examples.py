@@ -11,8 +11,9 @@ from recrl.orchestrator.errors import GridError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep import launch
+from recrl.orchestrator.sweep import LaunchSettings, launch
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -33,7 +34,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sources = tmp_path_factory.mktemp("sources")
     options = ["--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
     copies = []
-    for source in sorted(it.parent for it in EXAMPLES.glob("*/pyproject.toml")):  # copies, because a build leaves its litter at the source
+    for source in sorted(
+        it.parent for it in EXAMPLES.glob("*/pyproject.toml")
+    ):  # copies, because a build leaves its litter at the source
         copies.append(sources / source.name)
         copies[-1].mkdir()
         for file in source.glob("*.*"):
@@ -50,7 +53,7 @@ def test_a_trial_of_ones_own_task_student_and_teacher_runs(
     monkeypatch.syspath_prepend(str(installed))
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
-    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    launch(LaunchSettings(grid, LocalSweep(store), InlineExecutor()), stop=threading.Event())
     (trial,) = store.trials()
     assert trial.record().status is TrialState.COMPLETE
     updates = trial.updates()
@@ -86,14 +89,14 @@ def test_a_curriculum_that_reads_episodes_lowers_its_limit(
     assert limits.is_monotonic_decreasing and limits.nunique() > 3
 
 
-def test_an_agent_learns_with_a_network_of_ones_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_agent_learns_with_a_network_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES / "residual_network"))
     own = "{name: ppo-lag, options: {network: 'residual_network:residual_network'}}"
     text = GRID.replace("{name: fixed-multiplier, options: {multiplier: 2.0}}", own)
     text = text.replace("{name: plateau, options: {hold: 0.25}}", "none")
-    text = text.replace("name: corridor", "name: two-state, options: {horizon: 20}").replace(", options: {length: 6}", "")
+    text = text.replace("name: corridor", "name: two-state, options: {horizon: 20}").replace(
+        ", options: {length: 6}", ""
+    )
     grid = parse_grid(text.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
     launch(grid, store, InlineExecutor(), stop=threading.Event())
