@@ -8,7 +8,7 @@ sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "recrl"
 author = "the recrl authors"
-copyright = "2026, the recrl authors"  # noqa: A001  (Sphinx's name)
+copyright = "2026, the recrl authors"
 version = release = installed_version("recrl")
 
 extensions = [

@@ -43,7 +43,14 @@ WRITTEN = {
     "name": "text",
 }
 BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
-TYPES = {"integer": "whole number", "number": "number", "boolean": "true or false", "string": "text"}
+TYPES = {
+    "integer": "whole number",
+    "number": "number",
+    "boolean": "true or false",
+    "string": "text",
+    "object": "mapping",
+    "null": "null",
+}
 SHOWN_NAMES = 12
 
 
@@ -67,7 +74,12 @@ def command_line() -> str:
     top = parser()
     (commands,) = (it for it in top._actions if isinstance(it, argparse._SubParsersAction))
     summaries = {it.dest: it.help or "" for it in commands._choices_actions}
-    lines = [NOTE, "# Command line\n", f"{cell(top.description)}\n", "`recrl-sweep COMMAND --help` prints this.\n"]
+    lines = [
+        NOTE,
+        "# Command line\n",
+        f"{cell(top.description)}\n",
+        "`recrl-sweep COMMAND --help` prints this.\n",
+    ]
     lines += ["| command | what it does |", "|---|---|"]
     lines += [f"| [`{name}`](#recrl-sweep-{name}) | {cell(text)} |" for name, text in summaries.items()]
     for name, command in commands.choices.items():
@@ -133,7 +145,11 @@ def agents() -> str:
     """Every option of every agent: first those that all share."""
     models = {name: entry.config for name, entry in AGENTS.items()}
     shared = common_options(models.values())
-    lines = [NOTE, "# Agents\n", "Options are given in a grid: `agents: [{name: ppo-lag, options: {...}}]`.\n"]
+    lines = [
+        NOTE,
+        "# Agents\n",
+        "Options are given in a grid: `agents: [{name: ppo-lag, options: {...}}]`.\n",
+    ]
     lines += ["| agent | what it is |", "|---|---|"]
     lines += [f"| [`{name}`](#{anchor(name)}) | {cell(entry.summary)} |" for name, entry in AGENTS.items()]
     first = next(iter(models.values()))
@@ -146,7 +162,11 @@ def agents() -> str:
 
 def curricula() -> str:
     """Every option of every curriculum."""
-    lines = [NOTE, "# Curricula\n", "Options are given in a grid: `methods: [{name: dynamic, options: {...}}]`.\n"]
+    lines = [
+        NOTE,
+        "# Curricula\n",
+        "Options are given in a grid: `methods: [{name: dynamic, options: {...}}]`.\n",
+    ]
     lines += ["| curriculum | what it does |", "|---|---|"]
     lines += [f"| [`{name}`](#{anchor(name)}) | {cell(kind.summary)} |" for name, kind in TEACHERS.items()]
     for name, kind in TEACHERS.items():
@@ -160,7 +180,11 @@ def tasks() -> str:
     for name, task in TASKS.items():
         model = load_attribute(task.options) if isinstance(task.options, str) else task.options
         families.setdefault(model, []).append(name)
-    lines = [NOTE, "# Tasks\n", "Options are given in a grid: `tasks: [{name: rivergrid-1a, options: {...}}]`.\n"]
+    lines = [
+        NOTE,
+        "# Tasks\n",
+        "Options are given in a grid: `tasks: [{name: rivergrid-1a, options: {...}}]`.\n",
+    ]
     lines += ["| task | what it is |", "|---|---|"]
     lines += [f"| `{name}` | {cell(task.summary)} |" for name, task in TASKS.items()]
     for model, names in families.items():
@@ -176,8 +200,8 @@ def presets_page() -> str:
     return (
         f"{NOTE}# Presets\n\n"
         "`recommended` is every option's default. `preset: paper` sets the options below to the values of\n"
-        "safety-starter-agents, which the paper took over unchanged. For `focops` and `ipo` some values are those\n"
-        "of their own papers. An option given beside `preset` overrides it. The table is complete.\n\n"
+        "safety-starter-agents, which the paper took over unchanged. For `focops` and `ipo` some values are\n"
+        "those of their own papers. An option given beside `preset` overrides it. The table is complete.\n\n"
         f"{presets.table()}\n"
     )
 
@@ -225,22 +249,15 @@ def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
     """A JSON schema in words."""
     if "$ref" in field:
         return words(schema["$defs"][field["$ref"].rsplit("/", 1)[1]], schema)
-    if "const" in field:
-        return f"`{field['const']}`"
-    if "enum" in field:
-        return ", ".join(f"`{value}`" for value in field["enum"])
     if "anyOf" in field:
         return " or ".join(words(each, schema) for each in field["anyOf"])
-    kind = field.get("type")
-    if kind == "null":
-        return "null"
-    if kind == "array":
+    if "const" in field or "enum" in field:
+        return ", ".join(f"`{value}`" for value in field.get("enum", [field.get("const")]))
+    if field.get("type") == "array":
         items = field.get("items") or next(iter(field.get("prefixItems", ())), {})
         return f"list of: {words(items, schema)}" if items else "list"
-    if kind == "object":
-        return "mapping"
     bounds = " ".join(f"{sign} {field[key]:g}," for key, sign in BOUNDS.items() if key in field)
-    return f"{TYPES.get(str(kind), 'any')} {bounds}".rstrip(" ,")
+    return f"{TYPES.get(str(field.get('type')), 'any')} {bounds}".rstrip(" ,")
 
 
 def default_text(field: Mapping[str, Any], *, required: bool) -> str:

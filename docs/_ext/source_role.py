@@ -3,13 +3,14 @@
     {src}`teachers/dynamic.py`                  the file
     {src}`teachers/dynamic.py:has_converged`    a function, class, method or constant that it defines
 
-A file or a name that is not there is a warning, and so an error of the build: pages cannot fall behind the code.
+A file or a name that is not there is a warning, and so an error of the build: pages cannot fall behind the
+code.
 """
 
 from __future__ import annotations
 
 import ast
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 logger = logging.getLogger(__name__)
 
 
-@lru_cache(maxsize=None)
+@cache
 def names_in(path: Path) -> frozenset[str]:
     """Everything that a module defines at its top, and ``Class.member`` of its classes."""
     found = set()

@@ -10,7 +10,9 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 GENERATED = DOCS / "reference" / "generated"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if GENERATED not in page.parents)
-FENCE = re.compile(r"^(?P<ticks>`{3,}|:{3,})(?P<info>[^\n]*)\n(?P<body>.*?)^(?P=ticks)\s*$", re.DOTALL | re.MULTILINE)
+FENCE = re.compile(
+    r"^(?P<ticks>`{3,}|:{3,})(?P<info>[^\n]*)\n(?P<body>.*?)^(?P=ticks)\s*$", re.DOTALL | re.MULTILINE
+)
 CAPTION = re.compile(r"\A(?::[\w-]+:[^\n]*\n)*?:caption: (?P<name>\S+)\n")
 OPTIONS = re.compile(r"\A(?::[\w-]+:[^\n]*\n)+\n?")
 

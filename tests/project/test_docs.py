@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from tests.project.documentation import DOCS, PAGES, ROOT, Fence, fences, label
 
-from recrl.agents.registry import AGENTS, make_agent
 from recrl.agents.collection import Collector, episode_costs
+from recrl.agents.registry import AGENTS, make_agent
 from recrl.analysis.data import sweep_data
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files import store
 from recrl.orchestrator.grid.file_models import GridFile
 from recrl.orchestrator.grid.grid import parse_grid
+from tests.project.documentation import DOCS, PAGES, ROOT, Fence, fences, label
 
 BASE: dict[str, Any] = {
     "name": "page",
@@ -59,7 +60,7 @@ def test_python_in_fences_runs(page: Path, tmp_path: Path, monkeypatch: pytest.M
     names: dict[str, Any] = {}
     for fence in fences(page):
         if fence.language == "python" and not fence.caption:
-            exec(compile(fence.text, label(page), "exec"), names)  # noqa: S102
+            exec(compile(fence.text, label(page), "exec"), names)
 
 
 def test_every_metric_of_every_agent_is_explained() -> None:
@@ -70,7 +71,7 @@ def test_every_metric_of_every_agent_is_explained() -> None:
         collector = Collector(environments, num_steps=20)
         collector.reset(seed=0)
         rollout, finished = collector.collect(agent, np.random.default_rng(0))
-        metrics = agent.update(rollout, episode_costs(finished, 1), np.array([5.0]))
+        metrics = agent.update(rollout, episode_costs(finished, 1), CurriculumStep(CostLimits((5.0,))))
         for metric in metrics:
             assert f"`{re.sub(r'_0$', '_i', metric)}`" in explained, f"{name}: {metric}"
 

@@ -8,9 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from tests.project.documentation import DOCS, PAGES, ROOT, fences, label
 
-TUTORIALS = sorted(page for page in (DOCS / "tutorials").glob("*.md") if any(f.language == "shell" for f in fences(page)))
+TUTORIALS = sorted(
+    page for page in (DOCS / "tutorials").glob("*.md") if any(f.language == "shell" for f in fences(page))
+)
 SECONDS = 600
 
 
@@ -41,7 +44,9 @@ def test_commands_of_a_tutorial(page: Path, tmp_path: Path) -> None:
 
 
 def test_only_tutorials_have_commands_that_are_executed() -> None:
-    elsewhere = [page for page in PAGES if page not in TUTORIALS and any(f.language == "shell" for f in fences(page))]
+    elsewhere = [
+        page for page in PAGES if page not in TUTORIALS and any(f.language == "shell" for f in fences(page))
+    ]
     assert not elsewhere, "mark examples console, or execute them in this test"
 
 

@@ -6,10 +6,17 @@ import re
 from pathlib import Path
 
 import pytest
+
 from tests.project.documentation import PAGES, ROOT, label
 
 MOST_WORDS = 35  # of a sentence; aim at 25
-TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "CODE_OF_CONDUCT.md", ROOT / "README.md"]
+TEXTS = [
+    *PAGES,
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "CODE_OF_CONDUCT.md",
+    ROOT / "README.md",
+]
 # Words of our own for which the field has a word; quotations stand in code spans and are not read.
 BANNED = {
     r"dry way": "safe path",
@@ -62,7 +69,10 @@ def prose(text: str) -> str:
 def sentences(text: str) -> list[str]:
     """The sentences of some Markdown."""
     paragraphs = re.split(r"\n\s*\n", prose(text))
-    found = [re.split(r"(?<=[.!?:])\s+(?=[A-Z*(]|code\b|symbol\b)|;\s", " ".join(each.split())) for each in paragraphs]
+    found = [
+        re.split(r"(?<=[.!?:])\s+(?=[A-Z*(]|code\b|symbol\b)|;\s", " ".join(each.split()))
+        for each in paragraphs
+    ]
     return [sentence for each in found for sentence in each if sentence]
 
 
@@ -85,5 +95,6 @@ def test_words_are_those_of_the_field(page: Path) -> None:
 
 
 def test_sentences_are_counted_without_code_tables_and_links() -> None:
-    text = "# Title\n\nOne `two three` four. Five\nsix [seven](eight.md).\n\n| nine |\n\n```sh\nten\n```\n- eleven\n"
+    text = "# Title\n\nOne `two three` four. Five\nsix [seven](eight.md).\n\n| nine |\n\n"
+    text += "```sh\nten\n```\n- eleven\n"
     assert sentences(text) == ["One code four.", "Five six seven.", "eleven"]

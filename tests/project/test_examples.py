@@ -33,7 +33,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sources = tmp_path_factory.mktemp("sources")
     options = ["--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
     copies = []
-    for source in sorted(it.parent for it in EXAMPLES.glob("*/pyproject.toml")):  # copies, because a build leaves its litter at the source
+    for source in sorted(
+        it.parent for it in EXAMPLES.glob("*/pyproject.toml")
+    ):  # copies, because a build leaves its litter at the source
         copies.append(sources / source.name)
         copies[-1].mkdir()
         for file in source.glob("*.*"):
@@ -86,14 +88,14 @@ def test_a_curriculum_that_reads_episodes_lowers_its_limit(
     assert limits.is_monotonic_decreasing and limits.nunique() > 3
 
 
-def test_an_agent_learns_with_a_network_of_ones_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_agent_learns_with_a_network_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES / "residual_network"))
     own = "{name: ppo-lag, options: {network: 'residual_network:residual_network'}}"
     text = GRID.replace("{name: fixed-multiplier, options: {multiplier: 2.0}}", own)
     text = text.replace("{name: plateau, options: {hold: 0.25}}", "none")
-    text = text.replace("name: corridor", "name: two-state, options: {horizon: 20}").replace(", options: {length: 6}", "")
+    text = text.replace("name: corridor", "name: two-state, options: {horizon: 20}").replace(
+        ", options: {length: 6}", ""
+    )
     grid = parse_grid(text.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
     launch(grid, store, InlineExecutor(), stop=threading.Event())
