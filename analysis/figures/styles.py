@@ -19,7 +19,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from recrl.analysis.data.sweep_data import METHOD_ORDER, ordered
+from recrl.analysis.data.labels import METHOD_ORDER, ordered
 
 # The formulas in figures: ours, and those that matplotlib makes of numbers on an axis.
 OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$")

@@ -245,7 +245,7 @@ def type_text(name: str, field: Mapping[str, Any], schema: Mapping[str, Any]) ->
     return words(field, schema)
 
 
-def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
+def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:  # noqa: PLR0911
     """A JSON schema in words."""
     if "$ref" in field:
         return words(schema["$defs"][field["$ref"].rsplit("/", 1)[1]], schema)

@@ -3,7 +3,7 @@
     {src}`teachers/dynamic.py`                  the file
     {src}`teachers/dynamic.py:has_converged`    a function, class, method or constant that it defines
 
-A file or a name that is not there is a warning, and so an error of the build: pages cannot fall behind the
+A file or a name that is not there is a warning, and so an error of the build. Pages cannot fall behind the
 code.
 """
 

@@ -51,7 +51,7 @@ def test_only_tutorials_have_commands_that_are_executed() -> None:
 
 
 def test_commands_that_are_not_executed_are_commands_that_exist() -> None:
-    from recrl.orchestrator.cli.main import parser, spread  # noqa: PLC0415
+    from recrl.orchestrator.cli.arguments import parser, spread  # noqa: PLC0415
 
     for page in PAGES:
         for fence in fences(page):

@@ -11,8 +11,9 @@ from recrl.orchestrator.errors import GridError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep import launch
+from recrl.orchestrator.sweep import LaunchSettings, launch
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -52,7 +53,7 @@ def test_a_trial_of_ones_own_task_student_and_teacher_runs(
     monkeypatch.syspath_prepend(str(installed))
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
-    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    launch(LaunchSettings(grid, LocalSweep(store), InlineExecutor()), stop=threading.Event())
     (trial,) = store.trials()
     assert trial.record().status is TrialState.COMPLETE
     updates = trial.updates()
