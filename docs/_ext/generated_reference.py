@@ -26,7 +26,7 @@ from recrl.agents import presets
 from recrl.agents.registry import AGENTS
 from recrl.environments.plugins import load_attribute
 from recrl.environments.registry import TASKS
-from recrl.orchestrator.cli.main import parser
+from recrl.orchestrator.cli.arguments import parser
 from recrl.orchestrator.grid.file_models import Entry, Exclusion, GridFile, Resources, Run, TaskEntry
 from recrl.teachers.registry import TEACHERS
 
@@ -245,7 +245,7 @@ def type_text(name: str, field: Mapping[str, Any], schema: Mapping[str, Any]) ->
     return words(field, schema)
 
 
-def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:  # noqa: PLR0911
+def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
     """A JSON schema in words."""
     if "$ref" in field:
         return words(schema["$defs"][field["$ref"].rsplit("/", 1)[1]], schema)
