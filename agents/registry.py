@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from recrl.agents.agent import Agent
-from recrl.agents.algorithm_configs import (
+from recrl.agents.algorithms.configs import (
     CPOConfig,
     CRPOConfig,
     FOCOPSConfig,

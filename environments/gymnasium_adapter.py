@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -33,7 +32,7 @@ from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
-from recrl.environments.plugins import require_trust
+from recrl.environments.plugins import import_module, require_trust
 from recrl.environments.vector import CMDPVectorEnv
 
 Environment = gymnasium.Env[Any, Any]
@@ -296,7 +295,7 @@ class GymnasiumOptions(BaseModel):
             require_trust(identifier)
         try:
             if separator:
-                importlib.import_module(module)
+                import_module(module)
             gymnasium.spec(registered)
         except (gymnasium.error.Error, ImportError, ValueError) as error:
             raise ValueError(str(error)) from error

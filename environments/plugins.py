@@ -12,10 +12,14 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 
@@ -35,6 +39,7 @@ class UntrustedNameError(Exception):
 
 
 IMPORT_PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
+MODULES = "RECRL_MODULES"  # in the environment: a folder of modules, looked at last
 _refused = False  # of the whole process: threads must not be let off
 
 
@@ -62,6 +67,36 @@ def require_trust(path: str) -> None:
         raise UntrustedNameError(path)
 
 
+@contextmanager
+def modules_in(folder: Path) -> Iterator[None]:
+    """Let import paths lead to modules in a folder until the end of the block, also in child processes.
+
+    The folder is looked at last, so that nothing in it takes the place of an installed package.
+    """
+    before, found = os.environ.get(MODULES), list(sys.path)
+    os.environ[MODULES] = str(folder.absolute())
+    try:
+        yield
+    finally:
+        sys.path[:] = found
+        if before is None:
+            del os.environ[MODULES]
+        else:
+            os.environ[MODULES] = before
+
+
+def import_module(name: str) -> ModuleType:
+    """A module by its dotted name, also from the folder of ``modules_in``.
+
+    Raises:
+        ImportError: it cannot be imported.
+    """
+    folder = os.environ.get(MODULES)
+    if folder and folder not in sys.path and not name.startswith("recrl."):
+        sys.path.append(folder)
+    return importlib.import_module(name)
+
+
 def load_attribute(path: str) -> Any:
     """The object at ``package.module:attribute``.
 
@@ -70,7 +105,14 @@ def load_attribute(path: str) -> Any:
     """
     module_name, _, attribute = path.partition(":")
     try:
-        return getattr(importlib.import_module(module_name), attribute)
+        return getattr(import_module(module_name), attribute)
+    except ModuleNotFoundError as error:
+        if error.name != module_name.partition(".")[0]:
+            raise UnknownNameError(f"cannot import {path!r}: {error}") from error
+        raise UnknownNameError(
+            f"cannot import {path!r}: there is no module {error.name}; start the command in the folder that "
+            "holds it, name that folder in PYTHONPATH, or install the module's package"
+        ) from error
     except (ImportError, AttributeError) as error:
         raise UnknownNameError(f"cannot import {path!r}: {error}") from error
     except SystemExit as error:

@@ -189,8 +189,17 @@ def task_options(name: str, options: Mapping[str, Any]) -> BaseModel:
         UnknownNameError: nobody provides the task.
         pydantic.ValidationError: all mistakes in the options at once.
     """
+    return options_model(name).model_validate(dict(options))
+
+
+def options_model(name: str) -> type[BaseModel]:
+    """The pydantic model of a task's options.
+
+    Raises:
+        UnknownNameError: nobody provides the task.
+    """
     model: type[BaseModel] = _loaded(find_task(name).options)
-    return model.model_validate(dict(options))
+    return model
 
 
 def make_vector(name: str, num_envs: int, *, options: Mapping[str, Any] | None = None) -> CMDPVectorEnv:

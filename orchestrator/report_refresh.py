@@ -51,7 +51,7 @@ def sketch_command(store: SweepStore) -> list[str]:
     return [
         sys.executable,
         "-m",
-        "recrl.orchestrator.cli",
+        "recrl",
         "figures",
         store.name,
         "--sketch",

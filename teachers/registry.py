@@ -69,7 +69,13 @@ TEACHERS: dict[str, TeacherKind] = {
 }
 
 
-def _kind(name: str) -> TeacherKind:
+def find_teacher(name: str) -> TeacherKind:
+    """The curriculum called ``name``.
+
+    Raises:
+        UnknownNameError: nobody provides it; the message names the nearest known one.
+        TypeError: what the name leads to is not a TeacherKind.
+    """
     kind = resolve(name, kind="teacher", group="recrl.teachers", ours=TEACHERS)
     if not isinstance(kind, TeacherKind):
         raise TypeError(f"teacher {name!r} must be a recrl.teachers.registry.TeacherKind, got {kind!r}")
@@ -83,7 +89,7 @@ def teacher_config(name: str, options: Mapping[str, Any]) -> BaseModel:
         UnknownNameError: nobody provides a teacher of that name.
         pydantic.ValidationError: an option is unknown or out of its range.
     """
-    return _kind(name).config.model_validate(dict(options))
+    return find_teacher(name).config.model_validate(dict(options))
 
 
 def make_teacher(spec: TeacherSpec) -> Teacher:
@@ -93,6 +99,6 @@ def make_teacher(spec: TeacherSpec) -> Teacher:
         UnknownNameError: nobody provides a teacher of that name.
         pydantic.ValidationError: an option is unknown or out of its range.
     """
-    kind = _kind(spec.name)
+    kind = find_teacher(spec.name)
     kind.config.model_validate(dict(spec.options))
     return kind.make(spec)

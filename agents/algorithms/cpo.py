@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.algorithm_configs import CPOConfig
+from recrl.agents.algorithms.configs import CPOConfig
 from recrl.agents.config import TrustRegionConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience

@@ -32,7 +32,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from recrl.agents.algorithm_configs import CRPOConfig
+from recrl.agents.algorithms.configs import CRPOConfig
 from recrl.agents.algorithms.cpo import LocalModel, linearise, to_parameter_step
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from recrl.agents.algorithm_configs import TRPOConfig
+from recrl.agents.algorithms.configs import TRPOConfig
 from recrl.agents.algorithms.cpo import LocalModel
 from recrl.agents.config import TrustRegionConfig
 from recrl.agents.errors import require_finite

@@ -21,10 +21,9 @@ task lacks are NaN. All returns and costs are undiscounted sums over an episode.
     events       a row an event: KEY, update, end_step, event
     policies     a row a state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
 
-Three sources give the same frames: the trials' files (``load``, here), MLflow alone
-(``recrl.analysis.data.from_mlflow``) and the compact file of a finished sweep
-(``recrl.analysis.data.export``). Each tells ``assemble`` the trials and, for each of the other frames, its
-rows.
+Two sources give the same frames: the trials' files (``load``, here) and the export file of a sweep
+(``recrl.analysis.data.export``), which MLflow has as well (``recrl.analysis.data.from_mlflow``). Each tells
+``assemble`` the trials and, for each of the other frames, its rows.
 
 Episode files can hold 500,000 rows a trial. ``load`` reads them one at a time and keeps their sums
 (``phases``); ``load_episodes`` gives the rows themselves to whoever wants them.

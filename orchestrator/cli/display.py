@@ -237,6 +237,16 @@ def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     return table
 
 
+def folded_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, width: int) -> Table:
+    """A table of finished text whose cells are folded, so that it fits a width in characters."""
+    table = Table(box=None, header_style="bold", pad_edge=False, width=width, padding=(0, 2, 0, 0))
+    for index, column in enumerate(columns):
+        table.add_column(column, overflow="fold", no_wrap=index == 0, ratio=None if index < 3 else 1)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table
+
+
 def _table(*columns: str) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     for column in columns:

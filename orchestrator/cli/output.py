@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
+from recrl.orchestrator.cli import display
 from recrl.orchestrator.redaction import printable, shown
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class TextConsole(Console):
@@ -42,3 +49,20 @@ class _Sentence(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The record's message."""
         return shown(record.getMessage())
+
+
+def short(path: Path) -> Path:
+    """The path as seen from here, where it is below."""
+    with contextlib.suppress(ValueError):
+        return path.relative_to(Path.cwd())
+    return path
+
+
+def say(console: Console, sentence: str) -> None:
+    """One line as it is, but for secrets and control characters: no markup, no colours, no wrapping."""
+    console.print(shown(sentence), markup=False, highlight=False, soft_wrap=True)
+
+
+def show(table: pd.DataFrame, console: Console) -> None:
+    """A table of finished text."""
+    console.print(display.text_table(list(map(str, table)), table.to_numpy().tolist()))

@@ -8,9 +8,18 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    WithJsonSchema,
+    model_validator,
+)
 
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.untrusted import PlainText, ShortText
@@ -95,13 +104,36 @@ def _read_name(value: Any) -> str:
     return value
 
 
-SweepName = Annotated[str, PlainValidator(_read_name)]
-Whole = Annotated[int, BeforeValidator(_not_a_truth_value)]
+def _one_or_list(value: Mapping[str, Any], **others: Any) -> WithJsonSchema:
+    """The JSON schema of a value, of a list of such values, or of something else."""
+    listed = {"type": "array", "items": value, "minItems": 1}
+    return WithJsonSchema({"anyOf": [value, listed, *([others] if others else [])]})
+
+
+# For editors. Digits grouped by _ are a number in YAML 1.1, which recrl reads, and a text in YAML 1.2.
+_AMOUNT = {"type": "number", "minimum": 0}
+_TEXT = {"type": "string"}
+_COUNT = {"anyOf": [{"type": "integer"}, {"type": "string", "pattern": "^[0-9][0-9_]*$"}]}
+
+SweepName = Annotated[
+    str,
+    PlainValidator(_read_name),
+    WithJsonSchema({"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"}),
+]
+Whole = Annotated[int, BeforeValidator(_not_a_truth_value), WithJsonSchema(_COUNT)]
 Number = Annotated[float, BeforeValidator(_not_a_truth_value), Field(allow_inf_nan=False)]
-TrainLimits = Annotated[tuple[float, ...], PlainValidator(_read_train_limits)]
-DeployLimits = Annotated[tuple[float, ...], PlainValidator(_read_deploy_limits)]
-Seeds = Annotated[tuple[int, ...], PlainValidator(_read_seeds)]
-CustomResources = Annotated[dict[str, float], PlainValidator(_read_custom)]
+TrainLimits = Annotated[
+    tuple[float, ...], PlainValidator(_read_train_limits), _one_or_list(_AMOUNT, const="auto")
+]
+DeployLimits = Annotated[tuple[float, ...], PlainValidator(_read_deploy_limits), _one_or_list(_AMOUNT)]
+Seeds = Annotated[
+    tuple[int, ...], PlainValidator(_read_seeds), _one_or_list({"type": "integer", "minimum": 0})
+]
+CustomResources = Annotated[
+    dict[str, float],
+    PlainValidator(_read_custom),
+    WithJsonSchema({"type": "object", "additionalProperties": {"type": "number"}}),
+]
 
 
 class _Written(BaseModel):
@@ -203,10 +235,10 @@ class Resources(_Written):
 class Exclusion(_Written):
     """Trials to leave out: those that match everything given here; labels, and seeds."""
 
-    task: Annotated[list[str], BeforeValidator(_listed)] | None = None
-    agent: Annotated[list[str], BeforeValidator(_listed)] | None = None
-    method: Annotated[list[str], BeforeValidator(_listed)] | None = None
-    seed: Annotated[list[Whole], BeforeValidator(_listed)] | None = None
+    task: Annotated[list[str], BeforeValidator(_listed), _one_or_list(_TEXT)] | None = None
+    agent: Annotated[list[str], BeforeValidator(_listed), _one_or_list(_TEXT)] | None = None
+    method: Annotated[list[str], BeforeValidator(_listed), _one_or_list(_TEXT)] | None = None
+    seed: Annotated[list[Whole], BeforeValidator(_listed), _one_or_list(_COUNT)] | None = None
 
     def matches(self, spec: TrialSpec) -> bool:
         """Whether the trial is to be left out."""

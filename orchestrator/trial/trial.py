@@ -54,6 +54,8 @@ from recrl.teachers.teacher import ProgressReport, Teacher
 
 COMMIT_SECONDS = 20.0
 HEARTBEAT_SECONDS = 2.0
+LOGGED_UPDATES = 50
+"""Of a trial, about so many are logged."""
 HARD_LANDING = 0.1
 """By what share of d_d (of 1, where d_d is less) the last training limit may exceed it without an event."""
 
@@ -152,6 +154,8 @@ class Trial:
             **_temperature(step),
         }
         self._writer.append_update({**row, **self._own_metrics(metrics, row)})
+        if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
+            logger.info("%s", self._told(row))
         self._next_step(episodes, rollout.observations)
 
     def save(self) -> None:
@@ -234,6 +238,17 @@ class Trial:
         ):
             self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
 
+    def _told(self, row: Mapping[str, Any]) -> str:
+        """Return and costs of an update as a line for the log."""
+        head = f"update {self.update} of {self.spec.num_updates}, {row['phase']}:"
+        if not row["episodes"]:
+            return f"{head} no episode ended"
+        costs = [
+            f"{name} {row[f'cost_{i}']:.2f} of limit {row[f'limit_{i}']:.2f}"
+            for i, name in enumerate(self._cmdp.cost_names)
+        ]
+        return f"{head} return {row['episode_return']:.2f}, {', '.join(costs)}"
+
     def _own_metrics(self, metrics: Mapping[str, float], row: Mapping[str, Any]) -> Mapping[str, float]:
         """The agent's metrics, none of which may be called like a column of every trial."""
         if taken := sorted(metrics.keys() & row.keys()):
@@ -246,7 +261,8 @@ class Trial:
     def _event(self, name: str, **details: Any) -> None:
         event = {"update": self.update, "end_step": self.env_steps, "event": name, **details}
         self._writer.append_event(event)
-        logger.info("%s", event)
+        told = ", ".join(f"{key} {value}" for key, value in details.items())
+        logger.info("update %d: %s%s", self.update, name, f" ({told})" if told else "")
 
     def _state_dict(self) -> dict[str, Any]:
         return {

@@ -6,7 +6,7 @@ import sys
 import pytest
 from pydantic import ValidationError
 
-from recrl.agents.algorithm_configs import CPOConfig, PPOLagConfig
+from recrl.agents.algorithms.configs import CPOConfig, PPOLagConfig
 from recrl.agents.config import ActorCriticConfig
 from recrl.agents.registry import AGENTS, agent_config, find_agent
 from recrl.environments.plugins import UnknownNameError

@@ -7,7 +7,7 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 
-from recrl.agents.algorithm_configs import FOCOPSConfig, IPOConfig, P3OConfig
+from recrl.agents.algorithms.configs import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.algorithms.focops import FirstOrderConstrainedOptimisation, projection_objective
 from recrl.agents.algorithms.ipo import (
     InteriorPointPolicyOptimisation,

@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.algorithm_configs import IPOConfig
+from recrl.agents.algorithms.configs import IPOConfig
 from recrl.agents.algorithms.focops import projection_objective
 from recrl.agents.algorithms.ipo import barrier_surrogate_objective
 from recrl.agents.algorithms.p3o import penalised_surrogate_objective

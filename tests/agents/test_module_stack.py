@@ -15,6 +15,7 @@ from recrl.agents.errors import NetworkError
 from recrl.agents.learning.module_stack import ModuleStack, checked_module
 from recrl.agents.learning.networks import FlatParameters, TanhStack, orthogonal
 from recrl.agents.registry import make_agent
+from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.plugins import UntrustedNameError, refuse_import_paths
 from recrl.environments.registry import make_vector
@@ -115,7 +116,8 @@ def test_agents_learn_with_other_networks_and_resume_exactly(
     fresh = trained(agent, task, options, updates=0)
     assert not np.array_equal(fresh.state_dict()["policy"], state["policy"])
     fresh.load_state_dict(state)
-    observations = np.zeros((2, *make_vector(task, 1).cmdp.observation_space.shape), np.float32)
+    size = observation_size(make_vector(task, 1).cmdp.observation_space)
+    observations = np.zeros((2, size), np.float32)
     np.testing.assert_array_equal(fresh.act_greedily(observations), once.act_greedily(observations))
     noisy = once.add_noise(0.5, observations)
     assert noisy["randomness_after"] >= noisy["randomness_before"]

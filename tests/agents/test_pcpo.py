@@ -9,7 +9,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 from scipy.optimize import nnls
 
-from recrl.agents.algorithm_configs import CRPOConfig, PCPOConfig, TRPOLagConfig
+from recrl.agents.algorithms.configs import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.algorithms.crpo import (
     ConstraintRectifiedPolicyOptimisation,
     most_violated,

@@ -30,11 +30,11 @@ from typing import Any
 import torch
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.cli.commands import MIRROR_INTERVAL_SECONDS
+from recrl.orchestrator.cli.launch import MIRROR_INTERVAL_SECONDS
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
-from recrl.orchestrator.tracking.mlflow_sync import tracking_uri
 from recrl.orchestrator.trial.trial import run_trial
 from recrl.teachers.registry import make_teacher
 
@@ -158,7 +158,7 @@ def bench_many(root: Path, trials: int) -> None:
 
     def command(*arguments: str) -> list[tuple[float, str]]:
         """Run it; the seconds after which each of its lines came, and its end as the last."""
-        line = [sys.executable, "-u", "-m", "recrl.orchestrator.cli", *arguments]
+        line = [sys.executable, "-u", "-m", "recrl", *arguments]
         began = time.monotonic()
         with subprocess.Popen(line, cwd=root, stdout=subprocess.PIPE, text=True) as process:
             said = [(time.monotonic() - began, text.rstrip()) for text in process.stdout or ()]

@@ -91,7 +91,7 @@ class Chaos:
         print(line, file=self.log, flush=True)
 
     def command(self, name: str, *arguments: str) -> list[str]:
-        return [sys.executable, "-m", "recrl.orchestrator.cli", name, *arguments]
+        return [sys.executable, "-m", "recrl", name, *arguments]
 
     def start_driver(self) -> subprocess.Popen[bytes]:
         command = self.command("launch", "grid.yaml", "--root", "disturbed", "--retry-failed", "--no-figures")

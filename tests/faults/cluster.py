@@ -556,7 +556,7 @@ def single_machine(cluster: Cluster) -> SweepStore:
     command = [
         sys.executable,
         "-m",
-        "recrl.orchestrator.cli",
+        "recrl",
         "launch",
         str(cluster.folder / "grids/cluster.yaml"),
     ]

@@ -24,7 +24,7 @@ seeds: 1
 run: {total_steps: 160, deploy_fraction: 0.5, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
 UNLUCKY_STUDENT = """\
-from recrl.agents.algorithm_configs import PPOLagConfig
+from recrl.agents.algorithms.configs import PPOLagConfig
 from recrl.agents.registry import AgentEntry
 
 def make(cmdp, config, seed):
@@ -69,7 +69,7 @@ sys.exit(code)
 def test_help_imports_nothing_but_the_parser(folder: Path) -> None:
     code = """
 import sys
-from recrl.orchestrator.cli.main import parser
+from recrl.orchestrator.cli.arguments import parser
 parser().format_help()
 assert not {"numpy", "pandas", "pydantic", "gymnasium", "rich", "yaml"} & set(sys.modules)
 """
@@ -254,7 +254,7 @@ def test_what_cannot_be_parsed_is_wrong_input(arguments: list[str]) -> None:
 def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
     long = GRID.replace("total_steps: 160", "total_steps: 1e9")
     (folder / "grid.yaml").write_text(long)
-    command = [sys.executable, "-m", "recrl.orchestrator.cli", "launch", "grid.yaml", *INLINE]
+    command = [sys.executable, "-m", "recrl", "launch", "grid.yaml", *INLINE]
     with subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -273,7 +273,7 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
 
 
 def test_the_module_runs_like_the_script(folder: Path) -> None:
-    command = [sys.executable, "-m", "recrl.orchestrator.cli", "--version"]
+    command = [sys.executable, "-m", "recrl", "--version"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("recrl ")
 
@@ -283,7 +283,7 @@ LONG = GRID.replace("total_steps: 160", "total_steps: 1e9")
 
 def test_stop_ends_a_launch_from_another_terminal(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "grid.yaml").write_text(LONG)
-    command = [sys.executable, "-m", "recrl.orchestrator.cli", "launch", "grid.yaml", *INLINE]
+    command = [sys.executable, "-m", "recrl", "launch", "grid.yaml", *INLINE]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "small: 2 trials: 2 new\n"

@@ -25,7 +25,7 @@ run: {total_steps: 16_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 
 COMMAND = [
     sys.executable,
     "-m",
-    "recrl.orchestrator.cli",
+    "recrl",
     "launch",
     "grid.yaml",
     "--no-figures",

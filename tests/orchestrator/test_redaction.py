@@ -114,7 +114,7 @@ def test_a_failed_trial_keeps_no_secret_of_an_error(tmp_path: Path) -> None:
         f"def make():\n    raise RuntimeError('no http://me:{CANARY}@host and \\x1b[31m')\n"
     )
     (tmp_path / "grid.yaml").write_text(changed("tasks", 0, "name", to="leaky:make"))
-    command = [sys.executable, "-m", "recrl.orchestrator.cli", "validate", "grid.yaml", "--trust"]
+    command = [sys.executable, "-m", "recrl", "validate", "grid.yaml", "--trust"]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == ExitCode.WRONG_INPUT

@@ -1,0 +1,90 @@
+"""What the command line accepts as a folder, a file or a number; anything else is one sentence."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from pathlib import Path
+
+
+def folder(text: str) -> Path:
+    """A path that is a folder, or can become one."""
+    from recrl.orchestrator.redaction import redacted  # noqa: PLC0415
+
+    if "://" in text:  # trials append to their files and hold locks, which object stores know nothing of
+        raise argparse.ArgumentTypeError(
+            "must be a folder, on a file system that all nodes share where there are several; an object "
+            f"store is given by --storage, got {redacted(text)!r}"
+        )
+    path = path_of(text)
+    try:
+        files = [each for each in (path, *path.parents) if each.exists() and not each.is_dir()]
+        if files and files[0] == path:
+            raise argparse.ArgumentTypeError(f"must be a folder, got the file {text!r}")
+        if files:
+            raise argparse.ArgumentTypeError(
+                f"must be a folder, but {str(files[0])!r} is a file, got {text!r}"
+            )
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(_nopath_of(text, error)) from error
+    return path
+
+
+def path_of(text: str) -> Path:
+    """A path that the system accepts."""
+    if "\0" in text:
+        raise argparse.ArgumentTypeError("must hold no NUL character")
+    return Path(text)
+
+
+def _nopath_of(text: str, error: OSError | ValueError) -> str:
+    reason = getattr(error, "strerror", None) or error
+    return f"cannot be used ({reason}), got {text[:60]!r}{'...' if len(text) > 60 else ''}"
+
+
+def zip_file(text: str) -> Path:
+    """A file that ends with ``.zip``, by which all commands tell it from a sweep's name."""
+    path = path_of(text)
+    try:
+        if path.suffix != ".zip" or path.is_dir():
+            raise argparse.ArgumentTypeError(f"must be a file that ends with .zip, got {text!r}")
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(_nopath_of(text, error)) from error
+    return path
+
+
+def at_least_one(text: str) -> int:
+    """A whole number from 1."""
+    return _whole(text, least=1)
+
+
+def at_least_zero(text: str) -> int:
+    """A whole number from 0."""
+    return _whole(text, least=0)
+
+
+def port(text: str) -> int:
+    """A port's number."""
+    return _whole(text, least=1, most=65535)
+
+
+def _whole(text: str, *, least: int, most: int = 2**63 - 1) -> int:
+    if not re.fullmatch(r"[+-]?[0-9]{1,20}", text):
+        raise argparse.ArgumentTypeError(f"must be a whole number, written with digits only, got {text!r}")
+    number = int(text)
+    if not least <= number <= most:
+        limit = f"at least {least}" if number < least else f"at most {most}"
+        raise argparse.ArgumentTypeError(f"must be {limit}, got {number}")
+    return number
+
+
+def cost(text: str) -> float:
+    """A finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"must be a finite number, got {text!r}")
+    return number

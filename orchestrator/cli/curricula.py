@@ -1,0 +1,118 @@
+"""``bound`` and ``replay``: what relaxed training cost, and what other limits there would have been."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+from pydantic import ValidationError
+from rich.console import Console
+
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
+from recrl.orchestrator.cli.output import say, short, show
+from recrl.orchestrator.cli.requests import BoundRequest, ReplayRequest
+from recrl.orchestrator.cli.results import say_warnings, source
+from recrl.orchestrator.cli.sweeps import open_store, wanted
+from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.grid.plan import select
+from recrl.orchestrator.spec import Choice, TrialState
+from recrl.teachers.registry import teacher_config
+
+
+def run_bound(request: BoundRequest, console: Console) -> ExitCode:
+    """Say what training cost beside its bounds, and which d_t a budget would have allowed."""
+    from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415  (imports pandas and SciPy)
+
+    sweep, _ = source(request)
+    say_warnings(sweep, console)
+    if request.cost > sweep.num_costs:
+        raise RecrlError(f"--cost: {sweep.name} has {sweep.num_costs} costs, got {request.cost}")
+    rows = cumulative_cost.cumulative_costs(sweep, cost=request.cost - 1)
+    if not len(rows):
+        raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
+    show(cumulative_cost.bound_table(rows), console)
+    say(
+        console, "Summed over policies, one expected episode each; means over runs; undiscounted but for one."
+    )
+    if request.budget is not None:
+        allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
+        say(console, f"\nThe largest d_t within {request.budget:g} of cost above d_d over all episodes:")
+        show(cumulative_cost.admissible_table(allowed), console)
+    return ExitCode.OK
+
+
+def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
+    """Say what limits another teacher would have set on the recorded episodes."""
+    import pandas as pd  # noqa: PLC0415  (commands that do not need it are quick to start)
+
+    from recrl.analysis.figures import styles  # noqa: PLC0415
+    from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits  # noqa: PLC0415
+    from recrl.analysis.report_tables import write_csv  # noqa: PLC0415
+    from recrl.analysis.statistics.curriculum_replay import replay, replay_summary  # noqa: PLC0415
+
+    store = open_store(request)
+    specs = select(store.specs(), wanted(request.only))
+    method = _teacher(store, request)
+    called = re.sub("[^A-Za-z0-9.+-]+", "-", method.label)
+    folder, runs, summaries = store.folder / "replays", [], []
+    damaged = []
+    for trial in (store.trial(spec) for spec in specs):
+        record = trial.record()
+        if record.status is TrialState.DAMAGED:
+            damaged.append(f"{trial.title}: {record.error}")
+        elif record.update:
+            try:
+                rows = replay(trial, method)
+            except DamagedError as error:
+                damaged.append(str(error))
+                continue
+            write_csv(rows, folder / f"{trial.folder.name}__{called}.csv")
+            runs.append(Replayed(trial.spec, rows))
+            summaries.append(replay_summary(trial, rows))
+    for sentence in damaged:
+        say(console, f"damaged: {sentence}")
+    if not runs:
+        raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials has a policy update yet")
+    say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
+    show(pd.concat(summaries), console)
+    for i in range(max(len(run.spec.deploy_limits) for run in runs)):
+        figure = replayed_limits(runs, method.label, cost=i)
+        _, picture = styles.save(figure, folder, called if i == 0 else f"{called}_cost-{i + 1}")
+        say(console, f"Figure        {short(picture)}")
+    say(console, f"Every update  {short(folder)}")
+    return ExitCode.OK
+
+
+def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
+    """The teacher to ask: a method of the sweep by its label, or any teacher by its name."""
+    known = {spec.method.label: spec.method for spec in store.specs()}
+    method = known.get(request.teacher, Choice(request.teacher))
+    options = dict(method.options)
+    for pair in request.option:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise RecrlError(f"--option: must look like window=8, got {pair!r}")
+        options[key] = _parsed(value)
+    try:
+        teacher_config(method.name, options)
+    except ValidationError as error:
+        mistakes = "; ".join(f"{'.'.join(map(str, it['loc']))}: {it['msg']}" for it in error.errors())
+        raise RecrlError(f"teacher {method.name}: {mistakes}, got {options}") from error
+    except UntrustedNameError as error:
+        raise RecrlError(f"{error}; if you trust it, add --trust") from error
+    except UnknownNameError as error:
+        raise RecrlError(str(error)) from error
+    except USERS_ERRORS as error:
+        raise RecrlError(f"teacher {method.name!r} cannot be used: {described(error)}") from error
+    return Choice(method.name, options, method.label)
+
+
+def _parsed(text: str) -> Any:
+    """A JSON value, or the text itself."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text

@@ -1,0 +1,92 @@
+"""``evaluate``: the policies of trials, evaluated without learning, and filmed."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from recrl.orchestrator.cli.output import say, short, show
+from recrl.orchestrator.cli.requests import EvaluateRequest
+from recrl.orchestrator.cli.sweeps import open_store, wanted
+from recrl.orchestrator.errors import RecrlError, StorageError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.code_changes import has_other_code, other_code_sentence
+from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.grid.plan import select
+from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.export_file import write_in_own_process
+from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
+
+DEFAULT_EPISODES = 100  # of an evaluation, for trials that make none themselves
+
+
+def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
+    """Run the frozen policies of trials for whole episodes, and film them where that is asked for."""
+    import pandas as pd  # noqa: PLC0415
+
+    from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415  (imports gymnasium)
+    from recrl.orchestrator.trial.saved_policy import FrozenTrial, summary  # noqa: PLC0415  (imports torch)
+    from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
+
+    store = open_store(request, checkpoints=True)
+    policies = tuple(FrozenPolicy) if request.policy == "both" else (FrozenPolicy(request.policy),)
+    thawed, left_out = [], []
+    for trial in _chosen(store, request):
+        try:
+            trial.require_whole()
+            thawed.append(FrozenTrial.thaw(trial))
+        except RecrlError as error:
+            left_out.append(error)
+    if not thawed:
+        raise left_out[0]
+    rows, written = [], []
+    for frozen in thawed:
+        num_episodes = request.episodes or frozen.spec.evaluation_episodes or DEFAULT_EPISODES
+        episodes, path = frozen.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
+        rows += summary(episodes, frozen)
+        written.append(path)
+    show(pd.DataFrame(rows), console)
+    say(console, "Means and standard errors; within: episodes in which no cost exceeded its d_d.")
+    for path in written:
+        say(console, f"Episodes   {short(path)}")
+    for reason in left_out:
+        say(console, f"left out   {reason}")
+    changed = [frozen for frozen in thawed if has_other_code(frozen.store, frozen.spec)]
+    complete = sum(frozen.store.record().status is TrialState.COMPLETE for frozen in changed)
+    if sentence := other_code_sentence(complete, len(changed) - complete):
+        say(console, f"warning: {sentence}; here their policies met the present code")
+    if request.video:
+        for frozen in thawed:
+            for policy in policies:
+                video = frozen.film(policy, VideoFormat(request.video), seed=request.seed)
+                say(console, f"Video      {short(video)}")
+    _tell_mlflow(store, request, console)
+    return ExitCode.OK
+
+
+def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
+    """The trials on disk whose name begins so, and that ``--only`` leaves."""
+    text = " ".join(request.trial)
+    found = store.find(text)
+    only = wanted(request.only)
+    specs, damaged = [], set()
+    for trial in found:
+        try:
+            specs.append(trial.spec)
+        except StorageError:
+            damaged.add(trial.folder.name)
+    kept = {spec.folder_name for spec in select(specs, only)} | (set() if only else damaged)
+    if not kept:
+        begin = f" begin with {text!r}" if text else ""
+        raise RecrlError(f"{store.name}: no trials on disk{begin}; status names them")
+    return [trial for trial in found if trial.folder.name in kept]
+
+
+def _tell_mlflow(store: SweepStore, request: EvaluateRequest, console: Console) -> None:
+    """Bring MLflow up to the files, if it was ever told of the sweep."""
+    uri = tracking_uri(store, request.tracking_uri)
+    if last_report(store, uri) is None:
+        return
+    report = sync(store, uri, write_export=write_in_own_process)
+    if not report.is_up_to_date:
+        say(console, f"MLflow     is not up to date ({report.problem}); later: recrl-sweep sync {store.name}")

@@ -1,0 +1,41 @@
+"""``init``: writes a grid file with comments to start from, and never overwrites one."""
+
+from __future__ import annotations
+
+import shlex
+from importlib.resources import files
+from pathlib import Path
+
+from rich.console import Console
+
+from recrl.orchestrator.cli.output import say
+from recrl.orchestrator.cli.requests import InitRequest
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
+
+OWN_TASK = "own-task"
+MODULE = "my_task.py"
+
+
+def run_init(request: InitRequest, console: Console) -> ExitCode:
+    """Write the template, and say what comes next."""
+    grid = request.file or Path(f"{request.template}.yaml")
+    if grid.suffix not in (".yaml", ".yml"):
+        raise RecrlError(f"{grid}: the name of a grid file must end with .yaml")
+    texts = {grid: _template(f"{request.template}.yaml").replace(f"{request.template}.yaml", str(grid))}
+    if request.template == OWN_TASK:
+        texts[grid.with_name(MODULE)] = _template(f"{MODULE}.txt")
+    for path in texts:
+        if path.exists():
+            raise RecrlError(f"{path}: exists already and is not overwritten; give another name or folder")
+    grid.parent.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+        say(console, f"Wrote {path}")
+    say(console, f"Next: {shlex.join(['recrl-sweep', 'launch', str(grid)])}")
+    return ExitCode.OK
+
+
+def _template(name: str) -> str:
+    return (files("recrl.orchestrator.cli") / "templates" / name).read_text(encoding="utf-8")

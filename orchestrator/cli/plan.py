@@ -1,0 +1,89 @@
+"""``validate`` and ``plan``: what a grid is, and what a launch of it would do."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from recrl.orchestrator.cli import display
+from recrl.orchestrator.cli.output import say, short
+from recrl.orchestrator.cli.requests import GridRequest, LaunchRequest, PlanRequest, ValidateRequest
+from recrl.orchestrator.cli.sweeps import wanted
+from recrl.orchestrator.errors import UncalledError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.code_changes import other_code_sentence
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.grid.grid import GridSpec, read_grid
+from recrl.orchestrator.grid.plan import Plan, estimate, make_plan, trials_at_once
+from recrl.orchestrator.remote.opening import sweep_place
+from recrl.orchestrator.spec import TrialState
+
+
+def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
+    """Check a grid file; nothing is started or written."""
+    try:
+        grid = read_grid(request.grid)
+    except UncalledError as error:
+        say(console, f"{error}; all else is right")
+        return ExitCode.OK
+    sizes = (len(grid.tasks), len(grid.agents), len(grid.methods), len(grid.seeds))
+    product = " x ".join(str(size) for size in sizes)
+    say(
+        console,
+        f"{request.grid}: {grid.name} is right: {len(grid.trials())} trials, from "
+        f"tasks x agents x methods x seeds = {product}",
+    )
+    return ExitCode.OK
+
+
+def run_plan(request: PlanRequest, console: Console) -> ExitCode:
+    """Say what a launch would do; nothing is started, and nothing written but a mirror of what is kept."""
+    grid = read_grid(request.grid)
+    store = SweepStore(request.root, grid.name)
+    sweep_place(store, request.storage).refresh()
+    plan = make_plan(
+        grid.trials(),
+        store,
+        only=wanted(request.only),
+        retry_failed=request.retry_failed,
+        rerun_damaged=request.rerun_damaged,
+        rerun_changed=request.rerun_changed,
+    )
+    at_once, where = room(grid, request)
+    console.print(display.plan_table(plan))
+    say(console, "")
+    say_plan(plan, grid, console, at_once=at_once, where=where)
+    for line in display.damages_of_plan(plan):
+        say(console, line)
+    say_other_code(plan, console)
+    for problem in store.damages():
+        say(console, f"damaged: {problem}")
+    for orphan in plan.orphans:
+        say(console, f"not in the grid any more, left alone: {short(orphan.folder)}")
+    return ExitCode.TRIALS_LEFT if request.check and plan.to_do else ExitCode.OK
+
+
+def room(grid: GridSpec, request: GridRequest) -> tuple[int, str]:
+    """How many trials run at once, and where that is so: on a cluster if there is an address, else here."""
+    inline = isinstance(request, LaunchRequest) and request.executor == "inline"
+    most = 1 if inline else request.max_concurrent or grid.resources.max_concurrent
+    if request.address and not inline:
+        from recrl.orchestrator.ray.executor import room_on_cluster  # noqa: PLC0415  (imports ray)
+
+        return most or max(1, room_on_cluster(request.address, grid.resources)), "on the cluster as it is now"
+    cores = request.cores if isinstance(request, PlanRequest) else None
+    fitting = trials_at_once(cpus_per_trial=grid.resources.cpus_per_trial, max_concurrent=most, cores=cores)
+    return fitting, f"on {cores} cores" if cores else "on this machine"
+
+
+def say_plan(plan: Plan, grid: GridSpec, console: Console, *, at_once: int, where: str) -> None:
+    """Say what a launch would do, and about what it takes."""
+    say(console, f"{grid.name}: {display.plan_sentence(plan)}")
+    say(console, display.estimate_sentence(estimate(plan, concurrent=at_once), where))
+
+
+def say_other_code(plan: Plan, console: Console) -> None:
+    """Say how many trials ran other code than is installed now."""
+    changed = plan.other_code
+    complete = sum(trial.record.status is TrialState.COMPLETE for trial in changed)
+    if sentence := other_code_sentence(complete, len(changed) - complete):
+        say(console, f"warning: {sentence}")

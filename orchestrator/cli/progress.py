@@ -1,0 +1,137 @@
+"""``status``, ``check``, ``stop`` and ``logs``: how far a sweep is, and what its trials say."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+
+from rich.console import Console
+
+from recrl.orchestrator.cli import display
+from recrl.orchestrator.cli.output import say, short
+from recrl.orchestrator.cli.plan import say_other_code
+from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
+from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.errors import RecrlError, StorageError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.code_changes import no_curriculum_sentence
+from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.grid.plan import make_plan
+from recrl.orchestrator.remote.opening import sweep_place
+from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
+from recrl.orchestrator.sweep import REQUEST_SECONDS
+
+
+def run_status(request: StatusRequest, console: Console) -> ExitCode:
+    """Say how far a sweep is, from its files alone."""
+    store = open_store(request)
+    specs = store.specs()
+    now = progress(specs, store)
+    if not request.brief:
+        console.print(display.status_table(now))
+        say(console, "")
+    say(console, f"{store.name}: {display.status_sentence(now)}")
+    say_failures(now, store, console)
+    for problem in store.damages():
+        say(console, f"damaged: {problem}")
+    say_other_code(make_plan(specs, store), console)
+    none = [
+        trial.spec.title for trial in now.trials if trial.spec.is_no_curriculum(trial.record.start_limits)
+    ]
+    if sentence := no_curriculum_sentence(none):
+        say(console, f"warning: {sentence}")
+    return ExitCode.OK
+
+
+def run_check(request: CheckRequest, console: Console) -> ExitCode:
+    """Check every file of a sweep against what was committed; print a line for each that is wrong."""
+    store = open_store(request)
+    problems = [f"{store.name}: {problem}" for problem in store.damages()]
+    with contextlib.suppress(StorageError):  # said above
+        for spec in store.specs():
+            problems += [f"{spec.title}: {problem}" for problem in store.trial(spec).damages()]
+    listed = {spec.folder_name for spec in _listed(store)}
+    orphans = [trial for trial in store.trials() if trial.folder.name not in listed]
+    problems += [f"{trial.title}: {problem}" for trial in orphans for problem in trial.damages()]
+    for problem in problems:
+        say(console, problem)
+    trials = len(listed | {trial.folder.name for trial in orphans})
+    say(
+        console,
+        f"{store.name}: {trials} trials checked, {len(problems) or 'no'} wrong "
+        f"file{'' if len(problems) == 1 else 's'}",
+    )
+    if problems:
+        say(console, "launch goes on with damaged trials from what is whole; complete ones: --rerun-damaged")
+    return ExitCode.TRIALS_FAILED if problems else ExitCode.OK
+
+
+def _listed(store: SweepStore) -> list[TrialSpec]:
+    """The trials of the last launch, none where the file that lists them is damaged."""
+    try:
+        return store.specs()
+    except StorageError:
+        return []
+
+
+def run_stop(request: StopRequest, console: Console) -> ExitCode:
+    """Ask the launch that runs a sweep to save its trials and end, and wait until it has."""
+    store = open_store(request)
+    place = sweep_place(store, request.storage)
+    still_runs = place.request_stop()
+    if not still_runs():
+        say(console, f"{store.name}: no launch runs this sweep")
+        return ExitCode.OK
+    say(console, f"{store.name}: its trials save where they are")
+    while still_runs():
+        time.sleep(REQUEST_SECONDS)
+    place.refresh()
+    say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
+    return ExitCode.OK
+
+
+def run_logs(request: LogsRequest, console: Console) -> ExitCode:
+    """Print a trial's log, or say where its folder is."""
+    store = open_store(request)
+    trial = _trial(store, " ".join(request.trial))
+    if request.folder:
+        say(console, str(short(trial.folder)))
+        return ExitCode.OK
+    with contextlib.ExitStack() as following:
+        if request.follow and not store.is_locked():
+            place = sweep_place(store, request.storage)
+            following.enter_context(place.mirrored(threading.Event()))
+        for text in display.lines_of(trial, follow=request.follow):
+            say(console, text)
+    return ExitCode.OK
+
+
+def _trial(store: SweepStore, text: str) -> TrialStore:
+    """The trial that a person means; the one that runs if they do not say."""
+    found = store.find(text)
+    if not text:
+        now = time.time()
+        found = [trial for trial in found if standing_of(trial.record(), now=now) is Standing.RUNNING]
+    if len(found) == 1:
+        return found[0]
+    titles = [f"{trial.trial_id} {trial.title}" for trial in found[:10]]
+    more = f" and {len(found) - 10} more" if len(found) > 10 else ""
+    which = f"say which one, by its id or title: {', '.join(titles)}{more}" if found else "status names them"
+    what = f"trials on disk begin with {text!r}" if text else "trials are running"
+    raise RecrlError(f"{store.name}: {len(found) or 'no'} {what}; {which}")
+
+
+def say_failures(now: SweepProgress, store: SweepStore, console: Console) -> None:
+    """Say which trials broke off, why, and where their logs are."""
+
+    def folder_of(trial: TrialProgress) -> str:
+        return str(short(store.trial(trial.spec).folder))
+
+    broken = [
+        *now.standing(Standing.FAILED, Standing.DAMAGED),
+        *(t for t in now.standing(Standing.STOPPED) if t.record.error),
+    ]
+    for line in display.failures(broken, folder_of):
+        say(console, line)

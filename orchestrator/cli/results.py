@@ -1,0 +1,103 @@
+"""``figures``, ``export`` and ``merge``: what is made of a sweep's results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from recrl.orchestrator.cli.output import say, short
+from recrl.orchestrator.cli.requests import ExportRequest, FiguresRequest, MergeRequest, SourceRequest
+from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.errors import RecrlError, described
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.grid.grid import read_name
+from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.tracking.address import checked_uri
+
+if TYPE_CHECKING:
+    from recrl.analysis.data.sweep_data import Sweep
+
+
+def run_figures(request: FiguresRequest, console: Console) -> ExitCode:
+    """Draw the figures and tables of what is on disk, in a compact file or in MLflow."""
+    sweep, folder = source(request)
+    say_warnings(sweep, console)
+    folder = request.to or folder
+    try:
+        draw(sweep, folder, console, band=request.band, whole=not request.sketch)
+    except (RecrlError, OSError):
+        raise
+    except Exception as error:
+        if not str(request.sweep).endswith(".zip"):
+            raise
+        raise RecrlError(
+            f"{request.sweep}: not all figures could be drawn ({described(error)}); the others are in "
+            f"{folder}"
+        ) from error
+    return ExitCode.OK
+
+
+def run_export(request: ExportRequest, console: Console) -> ExitCode:
+    """Write the compact file of a sweep."""
+    from recrl.analysis.data import export  # noqa: PLC0415  (imports pandas)
+
+    sweep, _ = source(request)
+    _say_file(export.save(sweep, request.to or Path(f"{sweep.name}{export.SUFFIX}")), sweep, console)
+    say_warnings(sweep, console)
+    return ExitCode.OK
+
+
+def run_merge(request: MergeRequest, console: Console) -> ExitCode:
+    """Join compact files into one."""
+    from recrl.analysis.data import export, merging  # noqa: PLC0415  (imports pandas)
+
+    for path in request.parts:
+        if path.suffix != export.SUFFIX:
+            raise RecrlError(f"{path}: merge joins files that export wrote (.zip): recrl-sweep export SWEEP")
+    sweep = merging.merge([export.load(path) for path in request.parts])
+    _say_file(export.save(sweep, request.to), sweep, console)
+    for note in sweep.notes:
+        say(console, note)
+    say_warnings(sweep, console)
+    return ExitCode.OK
+
+
+def say_warnings(sweep: Sweep, console: Console) -> None:
+    """Say which trials nothing was made of, and what else speaks against the numbers."""
+    from recrl.analysis.data.validity import damages, doubts  # noqa: PLC0415  (imports pandas)
+
+    for sentence in damages(sweep):
+        say(console, f"damaged: {sentence}")
+    for sentence in doubts(sweep):
+        say(console, f"warning: {sentence}")
+
+
+def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
+    complete = sum(trial.status is TrialState.COMPLETE for trial in sweep.facts)
+    size = f"{path.stat().st_size / 1000:,.0f} kB"
+    say(console, f"{short(path)}: {len(sweep.facts)} trials, {complete} of them complete, {size}")
+
+
+def source(request: SourceRequest) -> tuple[Sweep, Path]:
+    """The sweep that is meant, from its files, a compact file or MLflow; and a place for figures."""
+    from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415  (imports pandas and SciPy)
+
+    given: str | None = request.sweep
+    if request.tracking_uri is not None:
+        name = read_name(Path(given)) if given and given.endswith((".yaml", ".yml")) else given
+        sweep = from_mlflow.load(checked_uri(request.tracking_uri), name)
+        return sweep, Path(f"{sweep.name}-figures")
+    if given and given.endswith(export.SUFFIX):
+        return export.load(Path(given)), Path(given).with_name("figures")
+    store = open_store(request)
+    return sweep_data.load(store), store.figures_folder
+
+
+def draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True) -> None:
+    """Draw a sweep's figures, tables and report, and say where they are."""
+    from recrl.analysis.report import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
+
+    (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])
+    say(console, f"Figures    {short(folder)}")

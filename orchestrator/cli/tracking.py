@@ -1,0 +1,48 @@
+"""``ui`` and ``sync``: MLflow's view of a sweep."""
+
+from __future__ import annotations
+
+import signal
+
+from rich.console import Console
+
+from recrl.orchestrator.cli.output import say
+from recrl.orchestrator.cli.requests import SyncRequest, UIRequest
+from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.export_file import write_in_own_process
+from recrl.orchestrator.tracking.mlflow_sync import sync
+from recrl.orchestrator.tracking.ui import open_ui
+
+
+def run_ui(request: UIRequest, console: Console) -> ExitCode:
+    """Open MLflow's pages about a sweep, on this machine only."""
+    store = open_store(request)
+    ui = open_ui(store, tracking_uri(store, request.tracking_uri), port=request.port)
+    say(console, f"Open {ui.url}")
+    if ui.process is not None:
+        say(console, "Ctrl-C ends it.")
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
+        try:
+            ui.process.wait()
+        except KeyboardInterrupt:
+            ui.close()
+    return ExitCode.OK
+
+
+def run_sync(request: SyncRequest, console: Console) -> ExitCode:
+    """Bring MLflow up to the files."""
+    store = open_store(request)
+    uri = tracking_uri(store, request.tracking_uri)
+    report = sync(store, uri, rebuild=request.rebuild, write_export=write_in_own_process)
+    if not report.is_up_to_date:
+        raise TrackingError(
+            f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}"
+        )
+    say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
+    if report.remark:
+        say(console, f"without the export file ({report.remark}): readers of MLflow get the last one")
+    return ExitCode.OK

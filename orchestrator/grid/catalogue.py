@@ -1,0 +1,222 @@
+"""What a grid file can name: tasks, agents and curricula, with a summary and all options of each.
+
+What an installed package adds by an entry point is there too.
+"""
+
+from __future__ import annotations
+
+import json
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import PydanticUndefined
+
+from recrl.agents.registry import AGENTS, find_agent
+from recrl.environments.plugins import UnknownNameError
+from recrl.environments.registry import TASKS, find_task, options_model
+from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.validation import nearest
+from recrl.teachers.registry import TEACHERS, find_teacher
+
+REQUIRED = "required"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One of the three things that a grid names.
+
+    Attributes:
+        singular: ``task``, ``agent`` or ``curriculum``.
+        plural: what ``recrl-sweep list`` calls it.
+        section: its key in a grid file.
+        group: of entry points.
+        ours: the names that recrl itself knows.
+        summary: of a name, one sentence.
+        model: of a name, the pydantic model of its options.
+    """
+
+    singular: str
+    plural: str
+    section: str
+    group: str
+    ours: tuple[str, ...]
+    summary: Callable[[str], str]
+    model: Callable[[str], type[BaseModel]]
+
+    @property
+    def names(self) -> list[str]:
+        """Every name that is known here, recrl's own first."""
+        return list(dict.fromkeys((*self.ours, *(point.name for point in entry_points(group=self.group)))))
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a task, an agent or a curriculum.
+
+    Attributes:
+        name: its key; of an option in an option, ``outer.inner``.
+        type: what is allowed, in words.
+        default: as JSON, or ``required``.
+        description: one sentence.
+    """
+
+    name: str
+    type: str
+    default: str
+    description: str
+
+
+KINDS: Mapping[str, Kind] = {
+    kind.plural: kind
+    for kind in (
+        Kind(
+            "task",
+            "tasks",
+            "tasks",
+            "recrl.tasks",
+            tuple(TASKS),
+            lambda name: find_task(name).summary,
+            options_model,
+        ),
+        Kind(
+            "agent",
+            "agents",
+            "agents",
+            "recrl.agents",
+            tuple(AGENTS),
+            lambda name: find_agent(name).summary,
+            lambda name: find_agent(name).config,
+        ),
+        Kind(
+            "curriculum",
+            "curricula",
+            "methods",
+            "recrl.teachers",
+            tuple(TEACHERS),
+            lambda name: find_teacher(name).summary,
+            lambda name: find_teacher(name).config,
+        ),
+    )
+}
+
+
+def listed(kind: Kind) -> Iterator[tuple[str, str]]:
+    """Every known name of a kind and its summary; of what cannot be loaded, why."""
+    for name in kind.names:
+        try:
+            yield name, kind.summary(name)
+        except USERS_ERRORS as error:
+            yield name, f"cannot be used: {described(error)}"
+
+
+def kinds_of(name: str) -> list[Kind]:
+    """The kinds that a name stands for; those of an import path are found by importing it.
+
+    Raises:
+        RecrlError: nobody provides it.
+        UntrustedNameError: it is an import path, and this process follows none.
+    """
+    if ":" not in name:
+        found = [kind for kind in KINDS.values() if name in kind.names]
+        if not found:
+            known = [known for kind in KINDS.values() for known in kind.names]
+            raise RecrlError(
+                f"no task, agent or curriculum is called {name!r}{nearest(name, known)}; "
+                "see recrl-sweep list tasks, list agents, list curricula"
+            )
+        return found
+    return [_kind_of_path(name)]
+
+
+def _kind_of_path(path: str) -> Kind:
+    for plural in ("agents", "curricula", "tasks"):  # any callable can be a task
+        try:
+            KINDS[plural].model(path)
+        except UnknownNameError as error:
+            raise RecrlError(str(error)) from error
+        except (TypeError, ValueError) as error:
+            reason = error
+        else:
+            return KINDS[plural]
+    raise RecrlError(f"{path!r} is no task, agent or curriculum: {reason}")
+
+
+def options_of(kind: Kind, name: str) -> list[Option]:
+    """Every option of a task, an agent or a curriculum, in the order of its model."""
+    model = kind.model(name)
+    try:
+        defaults: BaseModel | None = model.model_validate({})
+    except ValidationError:  # something is required
+        defaults = None
+    return list(_options(model, defaults, ""))
+
+
+def _options(model: type[BaseModel], defaults: BaseModel | None, prefix: str) -> Iterator[Option]:
+    for name, field in model.model_fields.items():
+        value = (
+            getattr(defaults, name) if defaults is not None else field.get_default(call_default_factory=True)
+        )
+        default = REQUIRED if value is PydanticUndefined else _json(value)
+        yield Option(f"{prefix}{name}", type_text(field.annotation), default, field.description or "")
+        inner = _inner_model(field.annotation)
+        if inner is not None:
+            shown = value if isinstance(value, BaseModel) else None
+            yield from _options(inner, shown, f"{prefix}{name}.")
+
+
+def _json(value: Any) -> str:
+    if isinstance(value, BaseModel):
+        return value.model_dump_json()
+    try:
+        return json.dumps(value, ensure_ascii=False)
+    except TypeError:
+        return str(value)
+
+
+def _inner_model(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for part in typing.get_args(annotation):
+        found = _inner_model(part)
+        if found is not None:
+            return found
+    return None
+
+
+_WORDS: Mapping[Any, str] = {
+    bool: "true or false",
+    int: "whole number",
+    float: "number",
+    str: "text",
+    type(None): "null",
+    Any: "any value",
+    dict: "mapping",
+    list: "list",
+    tuple: "list",
+}
+
+
+def type_text(annotation: Any) -> str:
+    """What an option may be, in words.
+
+    >>> type_text(Literal["mean", "cvar"]), type_text(int | None), type_text(tuple[float, ...])
+    ("'mean' or 'cvar'", 'whole number or null', 'list of number')
+    """
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return type_text(arguments[0])
+    if origin is Literal:
+        return " or ".join(repr(value) for value in arguments)
+    if origin in (types.UnionType, typing.Union):
+        return " or ".join(dict.fromkeys(type_text(each) for each in arguments))
+    if origin in (list, tuple):
+        inner = dict.fromkeys(type_text(each) for each in arguments if each is not Ellipsis)
+        return f"list of {' and '.join(inner)}"
+    if (origin is not None and issubclass(origin, Mapping)) or _inner_model(annotation):
+        return "mapping"
+    return _WORDS.get(annotation) or str(getattr(annotation, "__name__", annotation))

@@ -1,0 +1,281 @@
+"""Training and sweeps from Python: the same checks, files and results as ``recrl-sweep launch``."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from recrl._results import Policy, following, load_sweep, policy_of
+from recrl.environments.plugins import modules_in
+from recrl.orchestrator.errors import GridError, RecrlError
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.grid.grid import GridSpec, parse_grid, read_grid
+from recrl.orchestrator.spec import TrialState
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from recrl.analysis.data.sweep_data import Sweep
+    from recrl.orchestrator.cli.requests import LaunchRequest
+
+Grid: TypeAlias = str | Path | Mapping[str, Any]
+Chosen: TypeAlias = str | Mapping[str, Any]
+SOURCE = "grid"
+
+
+def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
+    """Check a grid whole, without running it.
+
+    Args:
+        grid: the path of a grid file, or its content as a dictionary.
+        trust: whether to import and call what the grid names by an import path. Do so only with grids whose
+            author you trust.
+
+    Returns:
+        The checked grid, every default filled in; ``trials()`` has its trials.
+
+    Raises:
+        GridError: one sentence for every mistake, also in ``problems``.
+        RecrlError: no mistake was found, but something was not called; see ``trust``.
+
+    Example:
+        >>> import recrl
+        >>> grid = {"name": "g", "tasks": [{"name": "two-state", "deploy_limits": 2}], "agents": ["cpo"],
+        ...         "methods": ["none"], "seeds": 3, "run": {"total_steps": 10_000}}
+        >>> len(recrl.validate(grid).trials())
+        3
+    """
+    with following(trust):
+        return _checked(grid)
+
+
+def launch(
+    grid: Grid,
+    *,
+    root: str | Path = "runs",
+    executor: str = "ray",
+    address: str | None = None,
+    max_concurrent: int | None = None,
+    mlflow: bool = True,
+    figures: bool = True,
+    progress: bool = True,
+) -> Sweep:
+    """Run every trial of a grid that is not complete, as ``recrl-sweep launch`` does.
+
+    The same call goes on after a crash or Ctrl-C. It imports what the grid names by an import path.
+
+    Args:
+        grid: the path of a grid file, or its content as a dictionary.
+        root: the folder of all sweeps.
+        executor: ``ray``, side by side on all cores or a cluster; or ``inline``, one after the other in this
+            process.
+        address: of an existing Ray cluster; by default one is started here.
+        max_concurrent: trials at once, at most.
+        mlflow: whether to show the sweep in MLflow.
+        figures: whether to draw figures and the report at the end.
+        progress: whether to print progress and results.
+
+    Returns:
+        The sweep, as ``load_sweep`` reads it. Its frame ``trials`` says which trials are complete.
+
+    Raises:
+        GridError: the grid is wrong; nothing was started.
+        RecrlError: the sweep is run by another process, or Ray, MLflow or the disk cannot be used.
+    """
+    from recrl.orchestrator.cli.requests import LaunchRequest  # noqa: PLC0415
+
+    if executor not in ("ray", "inline"):
+        raise RecrlError(f"executor: must be 'ray' or 'inline', got {executor!r}")
+    request = LaunchRequest(
+        given=("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml"),
+        root=Path(root),
+        storage=None,
+        grid=Path(),
+        only=(),
+        retry_failed=False,
+        rerun_damaged=False,
+        rerun_changed=False,
+        max_concurrent=max_concurrent,
+        address=address,
+        tracking_uri=None,
+        executor=executor,
+        ship_package=False,
+        mlflow=mlflow,
+        figures=figures,
+    )
+    with modules_in(Path.cwd()):
+        checked = _checked(grid)
+        _launch(checked, request, quiet=not progress)
+        return load_sweep(Path(root) / checked.name, trust=True)
+
+
+def train(
+    task: Chosen,
+    agent: Chosen = "ppo-lag",
+    method: Chosen = "none",
+    *,
+    total_steps: int,
+    deploy_limits: float | list[float],
+    train_limits: float | list[float] | str = "auto",
+    seed: int = 0,
+    folder: str | Path | None = None,
+    progress: bool = True,
+    **run: Any,
+) -> Training:
+    """Train one agent on one task under one curriculum, in this process and on one core.
+
+    PyTorch uses one thread meanwhile, which is much faster for small networks; then its setting is restored.
+    The result is the same as that of a sweep's trial with these settings, byte for byte.
+
+    Args:
+        task: its name, or a mapping with ``name`` and ``options``.
+        agent: likewise.
+        method: the curriculum, likewise; ``none`` trains under the deployment limits from the start.
+        total_steps: environment steps of both phases, over all environments.
+        deploy_limits: deployment limits d_d, undiscounted cost per episode: one number for every cost, or a
+            list with one number a cost.
+        train_limits: training limits d_t at the start, at least d_d, likewise; ``auto`` measures them.
+        seed: of the trial, at least 0.
+        folder: where to keep the files, as a sweep of one trial; the same call goes on from there. None keeps
+            none.
+        progress: whether to print a line that shows return and cost.
+        **run: other settings of a grid's section ``run``: ``deploy_fraction``, ``num_envs``,
+            ``rollout_steps``, ``evaluation_episodes``.
+
+    Returns:
+        The data frames and the policy.
+
+    Raises:
+        GridError: an argument is wrong; one sentence for every mistake.
+        RecrlError: the trial failed; its traceback is a note of the error.
+
+    Example:
+        >>> import recrl
+        >>> training = recrl.train("two-state", "cpo", total_steps=2_000, deploy_limits=2, num_envs=8,
+        ...                        rollout_steps=20, evaluation_episodes=8, progress=False)
+        >>> list(training.updates["cost_0"].round(1).head(1))           # doctest: +SKIP
+        >>> training.policy.act([1.0, 0.0], deterministic=True) in (0, 1)
+        True
+    """
+    with ExitStack() as stack:
+        place = Path(folder) if folder is not None else _scratch(stack)
+        grid = {
+            "name": place.name,
+            "tasks": [task],
+            "agents": [agent],
+            "methods": [method],
+            "seeds": [seed],
+            "train_limits": train_limits,
+            "deploy_limits": deploy_limits,
+            "run": {"total_steps": total_steps, **run},
+        }
+        with modules_in(Path.cwd()), one_thread(), shown_progress(progress):
+            sweep = launch(
+                grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False
+            )
+        store = SweepStore(place.parent, place.name)
+        (spec,) = store.specs()
+        trial = store.trial(spec)
+        record = trial.record()
+        if record.status in (TrialState.FAILED, TrialState.DAMAGED):
+            failed = RecrlError(f"{spec.title}: {record.error}")
+            if trial.error_path.exists():
+                failed.add_note(trial.error_path.read_text())
+            raise failed
+        return Training(sweep, policy_of(trial, seed=seed), folder=None if folder is None else trial.folder)
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """What ``train`` returns.
+
+    Attributes:
+        sweep: the data frames, as ``load_sweep`` describes them.
+        policy: the final policy.
+        folder: the trial's folder, or None where no files were kept.
+    """
+
+    sweep: Sweep
+    policy: Policy
+    folder: Path | None
+
+    @property
+    def updates(self) -> pd.DataFrame:
+        """A row a policy update: end_step, episode_return, cost_i, limit_i, and the agent's metrics."""
+        return self.sweep.updates
+
+    @property
+    def evaluations(self) -> pd.DataFrame:
+        """A row an episode of the final policy, stochastic and deterministic: episode_return, cost_i."""
+        return self.sweep.evaluations
+
+
+def _scratch(stack: ExitStack) -> Path:
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="recrl-"))) / "trial"
+
+
+def _checked(grid: Grid) -> GridSpec:
+    """The grid of a file or of a dictionary; the mistakes in a dictionary have no lines."""
+    if isinstance(grid, str | Path):
+        return read_grid(Path(grid))
+    try:
+        data = json.dumps(dict(grid)).replace("Infinity", ".inf").replace("NaN", ".nan").encode()
+    except (TypeError, ValueError) as error:
+        raise GridError([f"{SOURCE}: must hold plain values only: {error}"]) from error
+    try:
+        return parse_grid(data, source=SOURCE)
+    except GridError as error:
+        problems = [re.sub(rf"^{SOURCE}:\d+: ", "", problem) for problem in error.problems]
+        raise GridError(problems) from error
+
+
+def _launch(grid: GridSpec, request: LaunchRequest, *, quiet: bool) -> None:
+    from recrl.orchestrator.cli.launch import launch_grid  # noqa: PLC0415
+    from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
+
+    launch_grid(grid, request, TextConsole(quiet=quiet))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let PyTorch use one thread until the end of the block."""
+    import torch  # noqa: PLC0415
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class _Line(logging.Handler):
+    """Shows the newest line of a trial's log in place."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        sys.stderr.write(f"\r{record.getMessage():<79.79}")
+        sys.stderr.flush()
+
+
+@contextmanager
+def shown_progress(wanted: bool) -> Iterator[None]:
+    """Show how far a trial in this process is, on one line of the standard error."""
+    if not wanted:
+        yield
+        return
+    trial, line = logging.getLogger("recrl.trial"), _Line()
+    line.addFilter(lambda record: record.levelno == logging.INFO)
+    trial.addHandler(line)
+    try:
+        yield
+    finally:
+        trial.removeHandler(line)
+        sys.stderr.write("\n")

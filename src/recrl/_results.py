@@ -1,0 +1,165 @@
+"""Sweeps and policies in Python: reading what a sweep left, and acting with a policy that it learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.plugins import refuse_import_paths
+from recrl.orchestrator.errors import RecrlError
+
+if TYPE_CHECKING:
+    from recrl.agents.agent import Agent
+    from recrl.analysis.data.sweep_data import Sweep
+    from recrl.environments.cmdp import CMDPSpec
+    from recrl.orchestrator.files.store import TrialStore
+    from recrl.orchestrator.spec import TrialSpec
+
+
+def load_sweep(
+    source: str | Path, name: str | None = None, *, root: str | Path = "runs", trust: bool = False
+) -> Sweep:
+    """Read a finished or running sweep as tidy data frames.
+
+    Args:
+        source: the sweep's folder (``runs/demo``), its name below ``root``, its grid file, a file that
+            ``recrl-sweep export`` wrote (``demo.zip``), or an MLflow address (``http://host:port``,
+            ``sqlite:///file.db``).
+        name: of the sweep; needed with an MLflow address that holds several.
+        root: the folder of all sweeps, for a name.
+        trust: whether to run code that the sweep names by an import path, to compute the optimum of a task.
+            Do so only with files whose author you trust.
+
+    Returns:
+        An object with the data frames ``trials``, ``phases``, ``updates``, ``evaluations``, ``events`` and
+        ``policies``. Each begins with the columns task, agent, method, seed. Returns and costs are
+        undiscounted sums over an episode; ``recrl.analysis.data.sweep_data`` lists all columns.
+
+    Raises:
+        RecrlError: there is no such sweep, or it cannot be read.
+
+    Example:
+        >>> import recrl
+        >>> sweep = recrl.load_sweep("runs/demo")                      # doctest: +SKIP
+        >>> sweep.evaluations.groupby(["task", "method"])["cost_0"].mean()  # doctest: +SKIP
+    """
+    from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415
+    from recrl.orchestrator.cli.sweeps import sweep_store  # noqa: PLC0415
+    from recrl.orchestrator.tracking.address import checked_uri  # noqa: PLC0415
+
+    with following(trust):
+        if "://" in str(source):
+            return from_mlflow.load(checked_uri(str(source)), name)
+        if str(source).endswith(export.SUFFIX):
+            return export.load(Path(source))
+        return sweep_data.load(sweep_store(Path(root), str(source)))
+
+
+def load_policy(trial: str | Path, *, seed: int | None = 0, trust: bool = False) -> Policy:
+    """Load the policy of a trial's newest checkpoint.
+
+    Args:
+        trial: the trial's folder, which ``recrl-sweep logs demo 3f2a --folder`` prints.
+        seed: of the policy's random numbers; None for a different one each time.
+        trust: whether to run code that the trial names by an import path. Do so only with files whose author
+            you trust.
+
+    Returns:
+        The policy, which does not learn.
+
+    Raises:
+        RecrlError: there is no such trial, it has no intact checkpoint, or its code is not installed.
+
+    Example:
+        >>> import recrl
+        >>> policy = recrl.load_policy("runs/demo/trials/...")          # doctest: +SKIP
+        >>> policy.act(observation, deterministic=True)                 # doctest: +SKIP
+    """
+    from recrl.orchestrator.files.store import TrialStore  # noqa: PLC0415
+
+    folder = Path(trial)
+    if not (folder / "spec.json").exists():
+        raise RecrlError(f"{folder}: is not the folder of a trial; see recrl-sweep logs SWEEP TRIAL --folder")
+    with following(trust):
+        return policy_of(TrialStore(folder), seed=seed)
+
+
+def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:
+    """The policy in a trial's files."""
+    from recrl.orchestrator.trial.saved_policy import FrozenTrial  # noqa: PLC0415
+
+    trial.require_whole()
+    frozen = FrozenTrial.thaw(trial)
+    return Policy(frozen.agent, frozen.cmdp, frozen.spec, frozen.update, np.random.default_rng(seed))
+
+
+@contextmanager
+def following(trust: bool) -> Iterator[None]:
+    """Follow the import paths of files only where their author is trusted; errors say how."""
+    try:
+        with nullcontext() if trust else refuse_import_paths():
+            yield
+    except RecrlError as error:
+        if "add --trust" not in str(error):
+            raise
+        raise RecrlError(str(error).replace("add --trust", "pass trust=True")) from error
+
+
+@dataclass(eq=False)
+class Policy:
+    """A trained policy pi(a | s) that does not learn.
+
+    Attributes:
+        agent: the agent whose policy it is.
+        cmdp: what the task fixes: ``observation_space``, ``action_space``, ``cost_names``, ``horizon``.
+        spec: the trial that trained it.
+        update: policy updates that it has learnt for.
+        generator: where ``act`` draws its random numbers.
+    """
+
+    agent: Agent
+    cmdp: CMDPSpec
+    spec: TrialSpec
+    update: int
+    generator: np.random.Generator = field(repr=False)
+
+    def act(self, observation: npt.ArrayLike, deterministic: bool = False) -> Any:
+        """Choose actions.
+
+        Args:
+            observation: one observation [n], or a batch [B, n], as ``recrl.make`` and ``recrl.make_env``
+                give them.
+            deterministic: whether to take the mode of the policy instead of a sample.
+
+        Returns:
+            Of a batch int64 [B] (discrete actions) or float32 [B, m] (continuous ones, within the task's
+            bounds); of one observation an int or float32 [m].
+
+        Raises:
+            ValueError: the observation has another shape.
+        """
+        from recrl.agents.spaces import environment_actions, observation_size  # noqa: PLC0415
+
+        rows = np.asarray(observation, np.float32)
+        size = observation_size(self.cmdp.observation_space)
+        if rows.ndim not in (1, 2) or rows.shape[-1] != size:
+            raise ValueError(
+                f"an observation of {self.cmdp.name} must have shape ({size},), or (B, {size}) for a batch, "
+                f"got {rows.shape}"
+            )
+        batch = np.atleast_2d(rows)
+        chosen = self.agent.act_greedily(batch) if deterministic else self.agent.act(batch, self.generator)
+        actions = environment_actions(self.cmdp.action_space, chosen)
+        if rows.ndim == 2:
+            return actions
+        return int(actions[0]) if actions.ndim == 1 else actions[0]
+
+    def seed(self, seed: int) -> None:
+        """Start the policy's random numbers anew."""
+        self.generator = np.random.default_rng(seed)

@@ -1,0 +1,143 @@
+"""First steps without a clone: templates, lists, options and the schema for editors."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+
+from recrl.agents.registry import AGENTS
+from recrl.environments.registry import TASKS
+from recrl.orchestrator.cli.command_arguments import TEMPLATES
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.grid.schema import grid_schema
+from recrl.teachers.registry import TEACHERS
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory; modules that are imported from it are forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delitem(sys.modules, "my_task", raising=False)
+    return tmp_path
+
+
+def output(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(arguments) == ExitCode.OK
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_every_template_is_a_right_grid(
+    folder: Path, capsys: pytest.CaptureFixture[str], template: str
+) -> None:
+    out = output(capsys, "init", "--template", template)
+    assert out.endswith(f"Next: recrl-sweep launch {template}.yaml\n")
+    assert f"{template} is right" in output(capsys, "validate", f"{template}.yaml", "--trust")
+
+
+def test_the_demo_is_that_of_the_repository() -> None:
+    main(["init"])
+    assert read_grid(Path("demo.yaml")).trials() == read_grid(ROOT / "grids/demo.yaml").trials()
+
+
+def test_a_file_of_ones_own_is_named_in_the_comments(capsys: pytest.CaptureFixture[str]) -> None:
+    output(capsys, "init", "first/try.yaml")
+    text = Path("first/try.yaml").read_text()
+    assert "recrl-sweep launch first/try.yaml" in text
+    assert "demo.yaml" not in text
+
+
+@pytest.mark.parametrize("there", ["own-task.yaml", "my_task.py"])
+def test_nothing_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str], there: str) -> None:
+    (folder / there).write_text("mine")
+    assert main(["init", "--template", "own-task"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        f"recrl-sweep: {there}: exists already and is not overwritten; give another name or folder\n"
+    )
+    assert {path.name: path.read_text() for path in folder.iterdir()} == {there: "mine"}
+
+
+def test_a_grid_file_has_the_right_ending(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", "demo.yml.txt"]) == ExitCode.WRONG_INPUT
+    assert "must end with .yaml" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("kind", "names"), [("tasks", TASKS), ("agents", AGENTS), ("curricula", TEACHERS)])
+def test_everything_is_listed_with_its_summary(
+    capsys: pytest.CaptureFixture[str], kind: str, names: dict[str, Any]
+) -> None:
+    lines = output(capsys, "list", kind).splitlines()
+    for name, entry in names.items():
+        assert any(re.match(rf"{re.escape(name)} +{re.escape(entry.summary)}", line) for line in lines), name
+
+
+@pytest.mark.parametrize("name", [*AGENTS, *TEACHERS, *TASKS])
+def test_every_option_is_described(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    from recrl.orchestrator.grid.catalogue import kinds_of, options_of  # noqa: PLC0415
+
+    (kind,) = kinds_of(name)
+    for option in options_of(kind, name):
+        assert option.description, f"{name}: {option.name}"
+        assert not re.search(r"[<\[]|typing|None", option.type), f"{name}: {option.name}: {option.type}"
+
+
+def test_options_show_type_default_and_description(capsys: pytest.CaptureFixture[str]) -> None:
+    out = output(capsys, "options", "cpo")
+    assert re.search(r"^discount +number +0.99 +gamma of the critics", out, re.MULTILINE)
+    out = output(capsys, "options", "rivergrid")
+    assert re.search(r"^generate.seed +whole number +required +Seed of the map", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("cpoo", "no task, agent or curriculum is called 'cpoo'; did you mean 'cpo'?; see recrl-sweep list"),
+        (
+            "my_task:make",
+            "'my_task:make' was not imported, because a file that is only read must run no code; if you "
+            "trust it, add --trust",
+        ),
+    ],
+)
+def test_options_of_nobody_and_of_a_stranger(
+    capsys: pytest.CaptureFixture[str], name: str, sentence: str
+) -> None:
+    assert main(["options", name]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
+
+
+def test_the_schema_accepts_every_grid_of_ours(capsys: pytest.CaptureFixture[str]) -> None:
+    schema = json.loads(output(capsys, "schema"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    grids = [*ROOT.glob("grids/*.yaml"), *ROOT.glob("orchestrator/cli/templates/*.yaml")]
+    assert len(grids) > len(TEMPLATES)
+    for path in grids:
+        jsonschema.validate(yaml.safe_load(path.read_text()), schema)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "place"),
+    [
+        ({"agents": ["cpx"]}, "$.agents[0]"),
+        ({"agents": [{"name": "cpo", "options": {"discont": 0.9}}]}, "$.agents[0]"),
+        ({"agents": [{"name": "cpo", "options": {"discount": 1.5}}]}, "$.agents[0]"),
+        ({"train_limits": "automatic"}, "$.train_limits"),
+        ({"seeds": -1}, "$.seeds"),
+        ({"run": {"total_stepz": 100}}, "$.run"),
+        ({"name": "a/b"}, "$.name"),
+    ],
+)
+def test_the_schema_marks_mistakes(wrong: dict[str, Any], place: str) -> None:
+    grid = yaml.safe_load((ROOT / "grids/demo.yaml").read_text())
+    errors = list(jsonschema.Draft202012Validator(grid_schema()).iter_errors({**grid, **wrong}))
+    assert {error.json_path for error in errors} == {place}

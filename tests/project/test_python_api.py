@@ -1,0 +1,240 @@
+"""The Python API: quick to import, the same checks and results as the command line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import recrl
+from recrl.analysis.data import export
+from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.store import SweepStore
+
+RUN = {"total_steps": 160, "deploy_fraction": 0.5, "num_envs": 4, "rollout_steps": 10}
+GRID = {
+    "name": "small",
+    "tasks": [{"name": "two-state", "deploy_limits": 2}],
+    "agents": ["ppo-lag"],
+    "methods": ["none", "linear"],
+    "seeds": 1,
+    "run": {**RUN, "evaluation_episodes": 2},
+}
+OWN_TASK = """\
+import gymnasium
+import numpy as np
+
+class Room(gymnasium.Env):
+    observation_space = gymnasium.spaces.Dict({"at": gymnasium.spaces.Box(0.0, 9.0, (2,), np.float32)})
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return {"at": np.zeros(2, np.float32)}, {}
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.steps += 1
+        return {"at": np.ones(2, np.float32)}, 1.0, False, self.steps == 5, {"cost": 1.0}
+
+def make(render_mode=None):
+    return Room()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def train(**changes: Any) -> recrl.Training:
+    settings: dict[str, Any] = {
+        "deploy_limits": 2,
+        "evaluation_episodes": 2,
+        "progress": False,
+        **RUN,
+        **changes,
+    }
+    return recrl.train(settings.pop("task", "two-state"), **settings)
+
+
+def test_importing_it_imports_nothing_else() -> None:
+    code = (
+        "import sys, recrl; assert recrl.__version__; assert 'train' in dir(recrl); "
+        "print({'numpy', 'torch', 'pandas', 'pydantic', 'ray', 'gymnasium'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
+
+
+def test_every_name_is_there_and_documented() -> None:
+    for name in recrl.__all__:
+        assert getattr(recrl, name).__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'trian'"):
+        recrl.trian  # noqa: B018
+
+
+def test_training_returns_frames_and_a_policy_and_keeps_nothing(folder: Path) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        training = train(method="linear")
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert training.updates["end_step"].tolist() == [40, 80, 120, 160]
+    assert len(training.evaluations) == 4
+    assert training.sweep.trials["status"].tolist() == ["complete"]
+    assert training.folder is None
+    assert list(folder.iterdir()) == []
+
+
+def test_training_equals_the_sweeps_trial(folder: Path) -> None:
+    one = train(method="linear", folder="one")
+    sweep = recrl.launch(GRID, executor="inline", mlflow=False, figures=False, progress=False)
+    assert one.folder is not None
+    (other,) = SweepStore(folder / "runs", "small").find("two-state ppo-lag linear")
+    for name in ("evaluation.csv", "episodes.csv"):
+        assert (one.folder / name).read_bytes() == (other.folder / name).read_bytes()
+    assert len(sweep.trials) == 2
+    again = train(method="linear", folder="one")
+    assert again.updates.equals(one.updates)
+
+
+def test_progress_is_one_line_with_return_and_cost(capsys: pytest.CaptureFixture[str]) -> None:
+    train(progress=True)
+    err = capsys.readouterr().err
+    assert err.endswith("\n")
+    lines = err.strip().split("\r")
+    assert any(line.startswith("update 4 of 4, deployment: return ") for line in lines)
+    assert any(" of limit 2.00" in line for line in lines)
+    assert {len(line) for line in err.rstrip("\n").split("\r")} == {0, 79}
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"task": "two-stat"}, "tasks.0: no task is called 'two-stat'; did you mean 'two-state'?"),
+        ({"agent": {"name": "cpo", "options": {"discont": 1}}}, "unknown key; did you mean 'discount'?"),
+        ({"deploy_limits": -1}, "deploy_limits: must be numbers of at least 0 (cost per episode), got -1"),
+        ({"train_limits": 1}, "train_limits: must be at least the deploy_limits of two-state"),
+        ({"rolout_steps": 3}, "run.rolout_steps: unknown key; did you mean 'rollout_steps'?"),
+        ({"seed": -1}, "seeds: must be whole numbers from 0"),
+        ({"deploy_limits": {1, 2}}, "must hold plain values only"),
+    ],
+)
+def test_wrong_arguments_get_the_sentences_of_a_grid(changes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(recrl.GridError) as error:
+        train(**changes)
+    assert sentence in str(error.value)
+
+
+def test_a_trial_that_fails_raises_with_its_traceback(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "broken_room.py").write_text(
+        OWN_TASK.replace('"cost": 1.0', '"cost": 1.0 / max(0, 3 - self.steps)')
+    )
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(recrl.RecrlError, match="ZeroDivisionError") as error:
+        train(task="broken_room:make")
+    assert "Traceback" in error.value.__notes__[0]
+
+
+def test_sweeps_are_loaded_from_a_folder_and_an_export(finished_sweep: SweepStore, tmp_path: Path) -> None:
+    sweep = recrl.load_sweep(finished_sweep.folder)
+    assert len(sweep.trials) == 36
+    path = export.save(sweep, tmp_path / "made-up.zip")
+    assert recrl.load_sweep(path).trials.equals(sweep.trials)
+
+
+def test_a_policy_acts_on_one_and_on_many_alike(folder: Path) -> None:
+    training = train(task="continuous-bandit", folder="bandit")
+    assert training.folder is not None
+    policy = recrl.load_policy(training.folder, seed=3)
+    envs = recrl.make("continuous-bandit", 5)
+    observations, _ = envs.reset(seed=0)
+    many = policy.act(observations, deterministic=True)
+    assert many.shape == envs.action_space.shape
+    np.testing.assert_allclose(policy.act(observations[0], deterministic=True), many[0])
+    np.testing.assert_array_equal(training.policy.act(observations, deterministic=True), many)
+    first = policy.act(observations)
+    policy.seed(3)
+    np.testing.assert_array_equal(policy.act(observations), first)
+    assert (policy.act(observations) != first).any()
+    with pytest.raises(ValueError, match=r"must have shape \(1,\), or \(B, 1\) for a batch, got \(5, 2\)"):
+        policy.act(np.zeros((5, 2)))
+
+
+def test_a_loaded_policy_repeats_the_trials_evaluation(folder: Path) -> None:
+    """Rolled out by hand on fresh environments, it earns about what evaluation.csv says."""
+    training = train(total_steps=4000, num_envs=8, evaluation_episodes=200, agent="cpo")
+    told = training.evaluations.query("policy == 'deterministic'")["episode_return"].mean()
+    envs = recrl.make("two-state", 64)
+    observations, _ = envs.reset(seed=1)
+    total = np.zeros(64)
+    assert envs.cmdp.horizon is not None
+    for _ in range(envs.cmdp.horizon):
+        observations, rewards, *_ = envs.step(training.policy.act(observations, deterministic=True))
+        total += rewards
+    assert total.mean() == pytest.approx(told, rel=0.05)
+
+
+def test_folders_that_hold_no_trial_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(recrl.RecrlError, match="is not the folder of a trial"):
+        recrl.load_policy(tmp_path)
+
+
+def test_files_run_no_code_unless_they_are_trusted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "own_room.py").write_text(OWN_TASK)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    training = train(task="own_room:make", folder="room")
+    monkeypatch.delitem(sys.modules, "own_room")
+    assert training.folder is not None
+    with pytest.raises(recrl.RecrlError, match="if you trust it, pass trust=True"):
+        recrl.load_policy(training.folder)
+    with pytest.raises(recrl.RecrlError, match="if you trust it, pass trust=True"):
+        recrl.validate({**GRID, "tasks": [{"name": "own_room:make", "deploy_limits": 2}]})
+    assert "own_room" not in sys.modules
+    recrl.load_sweep("room", root=".")
+    assert "own_room" not in sys.modules
+    sys.path.append(str(folder))
+    assert recrl.load_policy(training.folder, trust=True).act([0.0, 0.0]).shape == (2,)
+    env = recrl.make_env("own_room:make")
+    observation, _ = env.reset(seed=0)
+    _, _, _, _, info = env.step(training.policy.act(observation))
+    assert info["cost"] == 1.0
+
+
+def test_tasks_say_what_is_wrong() -> None:
+    with pytest.raises(recrl.RecrlError, match="no task is called 'rivergrid-1'; did you mean 'rivergrid-1"):
+        recrl.make("rivergrid-1")
+    with pytest.raises(recrl.RecrlError, match="rivergrid-1a: horizon: must be at least 1, got 0"):
+        recrl.make("rivergrid-1a", horizon=0)
+    with pytest.raises(recrl.RecrlError, match=r"no single environment; use recrl.make\('two-state'\)"):
+        recrl.make_env("two-state")
+
+
+def test_validate_takes_a_file_or_a_dictionary(folder: Path) -> None:
+    (folder / "grid.json.yaml").write_text(json.dumps(GRID))
+    assert recrl.validate("grid.json.yaml").trials() == recrl.validate(GRID).trials()
+    with pytest.raises(recrl.GridError) as error:
+        recrl.validate({**GRID, "agents": ["cpx"], "seeds": 0})
+    assert len(error.value.problems) == 2
+
+
+def test_a_launch_prints_what_the_command_prints(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recrl.launch(GRID, executor="inline", mlflow=False, figures=False)
+    out = capsys.readouterr().out
+    assert "small: 2 trials: 2 new" in out
+    assert "task       agent    method  n  return" in out
+    assert main(["status", "--brief", "runs/small"]) == ExitCode.OK
+    assert len(recrl.load_sweep("small").trials) == len(recrl.load_sweep("runs/small").trials) == 2
+    with pytest.raises(recrl.RecrlError, match="holds no sweep 'smal'; did you mean 'small'"):
+        recrl.load_sweep("smal")
+    with pytest.raises(recrl.RecrlError, match="executor: must be 'ray' or 'inline', got 'slurm'"):
+        recrl.launch(GRID, executor="slurm")
