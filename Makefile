@@ -1,14 +1,15 @@
 # make install   a virtual environment in .venv with everything at tested versions
 # make demo      install, run 20 RiverGrid trials, draw the figures: minutes on two cores
 # make test      install, run the tests, two at a time
-# make lint      install, check style and types
+# make lint      install, check style, types and spelling
+# make docs      install, build the documentation into build/docs, with warnings as errors
 # make chaos     install, kill whatever a sweep is made of for ten minutes: SECONDS=600 SEED=0
 # make storage-test   install, run a sweep on a cluster that shares an S3 server and no folder, and harm it: needs root, says so
 # make cluster-test   install, run docker/compose.yaml's cluster in network namespaces and harm it: needs root, says so
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test lint chaos cluster-test storage-test clean
+.PHONY: install demo test lint docs chaos cluster-test storage-test clean
 .DEFAULT_GOAL := install
 
 install: .venv/installed
@@ -30,6 +31,11 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/codespell
+
+docs: install
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -d build/doctrees -b html docs build/docs
 
 chaos: install
 	$(BIN)/python tests/faults/chaos.py --seconds $(or $(SECONDS),600) --seed $(or $(SEED),0) --log results/chaos/seed-$(or $(SEED),0).txt

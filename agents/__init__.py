@@ -1,4 +1,4 @@
-"""Constrained learners (the paper's students). Know tensors, never teachers.
+"""Constrained learners (the paper's agents). Know tensors, never teachers.
 
 Import the modules by name; this file imports nothing.
 """

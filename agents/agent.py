@@ -1,21 +1,22 @@
-"""The seam between a trial and its student, and what crosses it.
+"""The seam between a trial and its agent, and what crosses it.
 
-An agent is any CRL algorithm. **The cost limit is an argument of ``update``, never agent state**: it is a
-vector [k], it may be infinite, and it changes between updates. NumPy crosses the seam, tensors do not.
+An agent is any CRL algorithm. **What a curriculum asks for is an argument of ``update``, never agent state**:
+the cost limits are a vector [k], may be infinite, and change between updates. NumPy crosses the seam, tensors
+do not.
 
-Letters: T steps, B environments, k costs, E episodes finished in the rollout, M of its steps truncated.
+Notation: T steps, B environments, k costs, E episodes finished in the rollout, M of its steps truncated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from recrl.environments.cmdp import Floats
+from recrl.environments.cmdp import CurriculumStep, Floats
 
 
 @dataclass(frozen=True)
@@ -97,16 +98,14 @@ class InvertedPolicy(Policy, Protocol):
 
 
 @runtime_checkable
-class EntropySeeker(Protocol):
-    """A student to whom the entropy of its policy can be made worth something; agents may be it."""
+class EntropyRewarded(Protocol):
+    """An agent whose ``update`` obeys ``CurriculumStep.entropy_coefficient``; agents may be it.
 
-    def reward_entropy(self, temperature: float) -> None:
-        """Count entropy as reward in the next update, and in that one alone.
+    Attributes:
+        learns_rewarded_entropy: any value; that the attribute is there says so.
+    """
 
-        Args:
-            temperature: what a nat is worth, in the task's reward per step, above 0.
-        """
-        ...
+    learns_rewarded_entropy: ClassVar[bool]
 
 
 class Agent(Policy, Protocol):
@@ -116,14 +115,15 @@ class Agent(Policy, Protocol):
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         ...
 
-    def update(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
-        """Learn from one rollout under the given limits.
+    def update(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
+        """Learn from one rollout under the limits of a curriculum's step.
 
         Args:
             rollout: T x B steps collected with the current policy.
             episode_costs: undiscounted costs of the episodes that finished in it, [E, k]; E may be 0,
                 and then nothing is known about the constraints: what depends on them waits.
-            limits: the cost limits d in force, [k], each >= 0, possibly infinite.
+            step: what the curriculum asks for this update. Its limits may be infinite. Its policy noise is in
+                the policy already (``add_noise``). ``EntropyRewarded`` agents obey its entropy coefficient.
 
         Returns:
             Metrics, finite or NaN; every update of an agent returns the same keys.

@@ -9,7 +9,7 @@ rollouts would finish no episode, and each would see one part of an episode only
 episodes are cut short at evenly spread lengths, each at the end of a rollout, so that from then on every
 rollout finishes its share of the episodes. A cut episode is learnt from but is not a finished episode.
 
-Letters: T steps, B environments, k costs, n observation components, E finished episodes, M truncated steps.
+Notation: T steps, B environments, k costs, n observation components, E finished episodes, M truncated steps.
 """
 
 from __future__ import annotations

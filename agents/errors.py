@@ -1,4 +1,4 @@
-"""What can go wrong in a student, named after the user's question."""
+"""What can go wrong in an agent, named after the user's question."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ class DivergedError(ArithmeticError):
     """Learning broke down: a loss, an advantage or a parameter is no longer a finite number."""
 
 
+class NetworkError(ValueError):
+    """A user's network that cannot be what the agent needs."""
+
+
 class UnsupportedSpaceError(ValueError):
-    """An observation or action space that the students cannot handle."""
+    """An observation or action space that the agents cannot handle."""
 
 
 def require_finite(what: str, values: float | npt.NDArray[np.floating]) -> None:

@@ -3,7 +3,7 @@
 Episodes are counted per environment, not in the order in which they end: taking the first that end would
 favour short ones, and on RiverGrid short means good.
 
-Letters: B environments, k costs, n observation components.
+Notation: B environments, k costs, n observation components.
 """
 
 from __future__ import annotations

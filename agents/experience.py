@@ -1,6 +1,6 @@
-"""What a student knows after a rollout: its samples, what they were worth, and how the constraints stand.
+"""What an agent knows after a rollout: its samples, what they were worth, and how the constraints stand.
 
-Letters: N samples, B environments, k costs, D decisions, E finished episodes, j of the k limits are finite.
+Notation: N samples, k costs, D unique pairs, E finished episodes, j of the k limits are finite.
 """
 
 from __future__ import annotations
@@ -27,19 +27,16 @@ class Constraints:
 
     Attributes:
         limits: d, [k], possibly infinite.
-        gaps: constrained value of the episodes (their mean undiscounted cost, with a margin where one is
-            asked for, or its CVaR) minus limit, [k]; -inf where the limit is infinite, NaN where it is
-            finite and no episode finished.
+        gaps: constrained value of the episodes (their mean undiscounted cost, or its CVaR) minus limit, [k];
+            -inf where the limit is infinite, NaN where it is finite and no episode finished.
         standard_errors: of the episodes' mean costs, [k], at least 0; 0 of fewer than two episodes.
         episode_length: mean steps of these episodes, at least 1; NaN if none finished.
-        noisy: whether the teacher added noise to the policy that collected them, or rewards its entropy.
     """
 
     limits: Floats
     gaps: Floats
     standard_errors: Floats
     episode_length: float
-    noisy: bool = False
 
     @classmethod
     def measure(
@@ -48,8 +45,6 @@ class Constraints:
         lengths: npt.NDArray[np.int64],
         values: Floats,
         limits: Floats,
-        *,
-        noisy: bool = False,
     ) -> Constraints:
         """Compare the constrained values of E episodes with the limits.
 
@@ -58,11 +53,10 @@ class Constraints:
             lengths: their steps, [E].
             values: what is constrained, [k]; NaN if E is 0.
             limits: d, [k].
-            noisy: see the attribute.
         """
         gaps = np.where(np.isfinite(limits), values - limits, -np.inf)
         length = float(lengths.mean()) if len(lengths) else float("nan")
-        return cls(limits, gaps, standard_errors(costs), length, noisy)
+        return cls(limits, gaps, standard_errors(costs), length)
 
     @property
     def known(self) -> bool:
@@ -95,11 +89,10 @@ class Experience:
 
     Attributes:
         batch: the samples, or a minibatch of them.
-        old: pi_old(. | s), of the policy that collected them, at the batch's rows.
-        old_log_probs: log pi_old(a | s) of the batch's decisions, [D].
+        old: pi_old(. | s), of the policy that collected them, at the batch's unique observations.
+        old_log_probs: log pi_old(a | s) of the batch's pairs, [D].
         advantages: raw estimates for the reward, then each cost, of all samples of the rollout, [N, 1 + k].
         constraints: limits and gaps.
-        num_envs: B; sample i of the rollout is of environment i mod B.
     """
 
     batch: LearningBatch
@@ -107,7 +100,6 @@ class Experience:
     old_log_probs: Tensor
     advantages: Floats
     constraints: Constraints
-    num_envs: int
 
     @classmethod
     def of(
@@ -116,12 +108,11 @@ class Experience:
         batch: LearningBatch,
         advantages: Floats,
         constraints: Constraints,
-        num_envs: int,
     ) -> Experience:
         """The experience of a policy that has not moved since it collected the samples."""
-        old = policy.distribution(batch.rows)
-        log_probs = old.log_prob(batch.actions, batch.decision_rows)
-        return cls(batch, old, log_probs, advantages, constraints, num_envs)
+        old = policy.distribution(batch.unique_observations)
+        log_probs = old.log_prob(batch.actions, batch.pair_observations)
+        return cls(batch, old, log_probs, advantages, constraints)
 
     def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
         """Minibatches without end, as ``LearningBatch.parts`` makes them; itself where there is one part."""
@@ -134,26 +125,26 @@ class Experience:
             yield replace(self, batch=part, old=self.old.at(index), old_log_probs=log_probs)
 
     def ratios(self, now: Distribution) -> Tensor:
-        """The probability ratios pi(a | s) / pi_old(a | s) of the decisions, [D]; exactly 1 for pi_old."""
-        log_probs = now.log_prob(self.batch.actions, self.batch.decision_rows)
+        """The probability ratios pi(a | s) / pi_old(a | s) of the pairs, [D]; exactly 1 for pi_old."""
+        log_probs = now.log_prob(self.batch.actions, self.batch.pair_observations)
         return torch.exp(log_probs - self.old_log_probs)
 
-    def with_entropy(self, temperature: float) -> Experience:
+    def with_entropy(self, coefficient: float) -> Experience:
         """The same, where the policy's entropy at every observation it saw is worth a reward.
 
         At the policy that collected the samples, the gradient of the entropy is that of a surrogate whose
         advantages are -log pi(a | s) - H(pi(. | s)): what was less likely than it might be is worth more.
-        They are added to the reward's, so that every student climbs both, whatever it makes of advantages.
+        They are added to the reward's, so that every agent climbs both, whatever it makes of advantages.
 
         Args:
-            temperature: reward per nat, at least 0.
+            coefficient: reward per nat, at least 0.
         """
         log_probs = self.old_log_probs.numpy(force=True).astype(np.float64)
         entropies = self.old.entropy().numpy(force=True).astype(np.float64)
         batch, advantages = self.batch, self.advantages.copy()
-        if batch.decision_of_sample is not None:
-            log_probs = log_probs[batch.decision_of_sample]
-        advantages[:, 0] -= temperature * (log_probs + batch.per_sample(entropies))
+        if batch.pair_of_sample is not None:
+            log_probs = log_probs[batch.pair_of_sample]
+        advantages[:, 0] -= coefficient * (log_probs + batch.per_sample(entropies))
         return replace(self, advantages=advantages)
 
     def in_reward_spreads(self) -> tuple[Floats, Floats, Floats]:

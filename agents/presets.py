@@ -1,4 +1,4 @@
-"""How the two presets differ: every option of every student whose value in ``paper`` is not ours.
+"""How the two presets differ: every option of every agent whose value in ``paper`` is not ours.
 
 python -m recrl.agents.presets     prints the table of the README
 """
@@ -20,37 +20,37 @@ class Deviation:
         option: the field that switches it.
         recommended: its value there, as JSON.
         paper: likewise.
-        students: who have it with these values.
+        agents: who have it with these values.
     """
 
     option: str
     recommended: str
     paper: str
-    students: tuple[str, ...]
+    agents: tuple[str, ...]
 
 
 def deviations() -> tuple[Deviation, ...]:
     """All of them, in the order of the options."""
     found: dict[tuple[str, str, str], list[str]] = {}
-    for student in AGENTS:
-        ours, theirs = (options_of(student, preset) for preset in ("recommended", "paper"))
+    for agent in AGENTS:
+        ours, theirs = (options_of(agent, preset) for preset in ("recommended", "paper"))
         for option, value in ours.items():
             if value != theirs[option]:
-                found.setdefault((option, json.dumps(value), json.dumps(theirs[option])), []).append(student)
-    return tuple(Deviation(*values, tuple(students)) for values, students in found.items())
+                found.setdefault((option, json.dumps(value), json.dumps(theirs[option])), []).append(agent)
+    return tuple(Deviation(*values, tuple(agents)) for values, agents in found.items())
 
 
-def options_of(student: str, preset: str) -> dict[str, Any]:
-    """Every option of a student under a preset but the preset itself, as JSON values."""
-    return agent_config(student, {"preset": preset}).model_dump(mode="json", exclude={"preset"})
+def options_of(agent: str, preset: str) -> dict[str, Any]:
+    """Every option of an agent under a preset but the preset itself, as JSON values."""
+    return agent_config(agent, {"preset": preset}).model_dump(mode="json", exclude={"preset"})
 
 
 def table() -> str:
     """The deviations as a Markdown table."""
-    rows = ["| field | `recommended` | `paper` | students |", "|---|---|---|---|"]
+    rows = ["| field | `recommended` | `paper` | agents |", "|---|---|---|---|"]
     for each in deviations():
-        students = "all" if set(each.students) == set(AGENTS) else ", ".join(each.students)
-        rows.append(f"| `{each.option}` | {each.recommended} | {each.paper} | {students} |")
+        agents = "all" if set(each.agents) == set(AGENTS) else ", ".join(each.agents)
+        rows.append(f"| `{each.option}` | {each.recommended} | {each.paper} | {agents} |")
     return "\n".join(rows)
 
 

@@ -1,8 +1,8 @@
-"""Every student by name: its settings, and how to build it.
+"""Every agent by name: its settings, and how to build it.
 
 A name is one of ``AGENTS``, an entry point in the group ``recrl.agents``, or an import path
 ``package.module:attribute``; what the last two lead to is an ``AgentEntry``. Importing this imports no torch:
-a student's own module is loaded when one is made.
+an agent's own module is loaded when one is made.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from recrl.agents.agent import Agent
-from recrl.agents.config import (
+from recrl.agents.algorithms.configs import (
     CPOConfig,
     CRPOConfig,
     FOCOPSConfig,
@@ -33,10 +33,10 @@ from recrl.environments.plugins import load_attribute, resolve
 
 @dataclass(frozen=True)
 class AgentEntry:
-    """How to build one student.
+    """How to build one agent.
 
     Attributes:
-        summary: one sentence for people who choose a student.
+        summary: one sentence for people who choose an agent.
         config: a frozen pydantic model of its options.
         make: callable (cmdp, config, seed) -> Agent, or the import path of one.
     """
@@ -101,10 +101,10 @@ AGENTS: dict[str, AgentEntry] = {
 
 
 def find_agent(name: str) -> AgentEntry:
-    """The student called ``name``.
+    """The agent called ``name``.
 
     Raises:
-        UnknownNameError: nobody provides it; the message names the nearest known student.
+        UnknownNameError: nobody provides it; the message names the nearest known agent.
         ValueError: what the name leads to is not an AgentEntry.
     """
     found = resolve(name, kind="agent", group="recrl.agents", ours=AGENTS)
@@ -114,22 +114,22 @@ def find_agent(name: str) -> AgentEntry:
 
 
 def agent_config(name: str, options: Mapping[str, Any]) -> BaseModel:
-    """The validated options of a student, preset and defaults filled in; ``model_dump`` of it is canonical.
+    """The validated options of an agent, preset and defaults filled in; ``model_dump`` of it is canonical.
 
     Raises:
-        UnknownNameError: nobody provides the student.
+        UnknownNameError: nobody provides the agent.
         pydantic.ValidationError: all mistakes in the options at once.
     """
     return find_agent(name).config.model_validate(dict(options))
 
 
 def make_agent(name: str, cmdp: CMDPSpec, options: Mapping[str, Any], seed: np.random.SeedSequence) -> Agent:
-    """A fresh student for a task; the same seed gives every student with the same networks the same policy.
+    """A fresh agent for a task; the same seed gives every agent with the same networks the same policy.
 
     Args:
         name: a name of ours, an entry point's name, or ``package.module:attribute``.
         cmdp: what the task fixes.
-        options: the student's settings.
+        options: the agent's settings.
         seed: of its initial parameters and of whatever randomness it needs later.
     """
     entry = find_agent(name)

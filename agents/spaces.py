@@ -1,9 +1,9 @@
-"""What spaces students can handle, and how observations and actions cross between them and tasks.
+"""What spaces agents can handle, and how observations and actions cross between them and tasks.
 
 Observations become float32 rows: ``Discrete`` one-hot, ``Box``, ``MultiBinary`` and whatever else is an
 array of numbers flattened. Actions are ``Discrete`` (categorical policies) or ``Box`` (Gaussian policies).
 
-Letters: B environments, n observation components, m action components.
+Notation: B environments, n observation components, m action components.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def action_size(space: gymnasium.Space[Any]) -> int:
 
 
 def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """What the task is given for B actions of a student, int64 [B] or float32 [B, m].
+    """What the task is given for B actions of an agent, int64 [B] or float32 [B, m].
 
     Discrete actions are shifted to the space's first one; Gaussian ones are clipped to the bounds of the
-    Box. The student learns from the unclipped actions, whose density it knows.
+    Box. The agent learns from the unclipped actions, whose density it knows.
     """
     if isinstance(space, Discrete):
         shifted: npt.NDArray[np.int64] = actions + space.start

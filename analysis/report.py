@@ -1,21 +1,22 @@
 """All figures and tables of a sweep in one call, from a finished or a running one.
 
-    report.html                 all of it on one self-contained page, with settings and provenance
-    report.md                   what is missing, the tables, the list of the rest
+    report.html                 the answer, the verdicts, and all of what follows on one self-contained page
+    report.md                   the same as text, with links to the figures
+    return-against-cost         final policies, the infeasible region, and the frontier J*(d) (PDF and PNG)
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
-    bounds_<agent>              cumulative cost of training beside Proposition 1 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
-    diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence a method (PDF and PNG)
+    diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence of each curriculum (PDF and PNG)
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
-    return-against-cost         final policies under the frontier J*(d), where it is known (PDF and PNG)
-    performance-profiles        share of runs above each return, frozen policies (PDF and PNG)
+    bounds_<agent>              cumulative cost of training against Proposition 1 (PDF and PNG)
+    performance-profiles        fraction of final policies that are feasible and return more (PDF and PNG)
+    verdicts.csv                a row a task, agent and curriculum: what the report begins with
     outcomes.csv                a row a trial and measure
     summary.csv                 averaged over seeds, with interquartile means
-    comparisons.csv             paired differences to the student without a curriculum
+    comparisons.csv             paired differences to the agent without a curriculum
     training.csv                what relaxed training cost, a row a trial
     claims.csv                  the paper's claims about RiverGrid's maps, counted, where a grid has these
-    bounds.csv                  the same beside Proposition 1, a row a trial and cost
-    outcomes.tex                the first table for LaTeX (booktabs)
+    bounds.csv                  the cumulative cost against Proposition 1, a row a trial and cost
+    outcomes.tex                the first tables for LaTeX (booktabs)
     outcomes.parquet            outcomes.csv with its types, for programs
 
 Of a sweep that runs, ``sketch`` draws SKETCHED, as PNGs, and all tables and pages: that takes a fraction of
@@ -30,7 +31,7 @@ import dataclasses
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -39,8 +40,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from recrl.analysis import report_page, report_tables
-from recrl.analysis.data.sweep_data import GROUP, Sweep, ordered
+from recrl.analysis import report_page, report_tables, report_verdicts
+from recrl.analysis.data.labels import GROUP, ordered
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.validity import doubts
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
@@ -48,29 +50,30 @@ from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import return_against_cost
 from recrl.analysis.figures.policy_map import policy_maps
 from recrl.analysis.figures.profiles import performance_profiles
+from recrl.analysis.report_files import BOOTSTRAP_SEED, Tables, write_tables
 from recrl.analysis.report_page import Section
-from recrl.analysis.statistics import claims, metrics
-from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.curves import MEAN, Averaging, interquartile
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
-from recrl.analysis.statistics.metrics import MEAN, Averaging, Measure, interquartile
+from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.spec import TrialState
 
-BOOTSTRAP_SEED = 0
 RELOAD_SECONDS = 120  # of the page of a sweep that runs
-NO_TABLE = "No trial is complete yet: no table."
 CAPTIONS = {
-    "learning-curves": "Return and cost over training and over deployment",
-    "bounds": "Cumulative cost of training beside its bounds",
+    "return-against-cost": "Final policies: return against cost. Left of the limit is feasible, the shaded "
+    "region is not",
+    "learning-curves": "Return and cost while training, and magnified in the deployment phase (learning goes "
+    "on). Costs in the shaded region are above the limit",
+    "bounds": "Cumulative cost of training against its bounds",
     "curricula": "Cost limits in force",
     "diagnostics": "Limit, cost, multiplier and KL divergence",
     "policies": "Final policies and their visits",
-    "return-against-cost": "Final policies under the best return for each limit, J*(d)",
-    "performance-profiles": "Share of runs above each return",
+    "performance-profiles": "Fraction of final policies that are feasible and return more than the value "
+    "below; an infeasible one counts as the worst",
 }
 
 
-SKETCHED = re.compile(r"learning-curves_.*|curricula")
+SKETCHED = re.compile(r"return-against-cost|learning-curves_.*|curricula")
 UNFINISHED = "A sketch: the other figures come at the end of the launch, or by recrl-sweep figures"
 
 
@@ -152,24 +155,42 @@ def _noted(sweep: Sweep, notes: list[str]) -> Sweep:
 
 def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
     """Write the tables and the two reports that show the figures drawn; all files, the reports first."""
-    written, shown = write_tables(sweep, folder)
+    written, tables = write_tables(sweep, folder)
     pictures = [path for path in drawn if path.suffix == ".png"]
-    text = [f"![{path.stem}]({path.name})" for path in pictures]
-    for heading, table in shown:
-        text += ["", f"## {heading}", "", report_tables.markdown(table)]
-    if not shown:
-        text += ["", NO_TABLE]
-    state = [
-        _count(sweep),
-        "",
-        *(f"- {report_tables.markdown_text(sentence)}" for sentence in missing(sweep)),
-    ]
-    title = f"# {report_tables.markdown_text(sweep.name)}"
     reports = [
-        report_tables.write_text(_html(sweep, pictures, shown), folder / "report.html"),
-        report_tables.write_text("\n".join([title, "", *state, "", *text]), folder / "report.md"),
+        report_tables.write_text(_html(sweep, pictures, tables), folder / "report.html"),
+        report_tables.write_text(_markdown(sweep, pictures, tables), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
+
+
+def _markdown(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
+    """The report as text: answers, verdicts, warnings, figures, tables, provenance."""
+    judged = tables.verdicts
+    lines = [f"# {report_tables.markdown_text(sweep.name)}", ""]
+    if len(judged):
+        lines += [*_list(report_verdicts.answers(judged)), ""]
+        lines += [report_tables.markdown(_marked(report_verdicts.verdict_table(judged))), ""]
+        lines += _list(report_verdicts.explanation(judged))
+    else:
+        lines.append(report_verdicts.NO_VERDICT)
+    lines += ["", "## Warnings", "", _count(sweep), "", *_list(missing(sweep)), "", "## Figures", ""]
+    for path in pictures:
+        lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
+    for heading, table in tables.shown:
+        lines += [f"## {heading}", "", report_tables.markdown(table), ""]
+    provenance = "\n".join(_provenance(sweep)).splitlines()
+    return "\n".join([*lines, "## Provenance", "", *(f"    {line}" for line in provenance)])
+
+
+def _list(sentences: Sequence[str]) -> list[str]:
+    return [f"- {report_tables.markdown_text(sentence)}" for sentence in sentences]
+
+
+def _marked(table: pd.DataFrame) -> pd.DataFrame:
+    """The verdict table with violators in bold."""
+    texts = [f"**{text}**" if report_verdicts.INFEASIBLE in text else text for text in table["verdict"]]
+    return table.assign(verdict=texts)
 
 
 def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable[[], Figure | None]]:
@@ -189,7 +210,9 @@ def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable
         )
     agents = ordered(list(sweep.updates["agent"]), list(sweep.trials["agent"].cat.categories))
     cells = sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist()
-    made: dict[str, Callable[[], Figure | None]] = {}
+    made: dict[str, Callable[[], Figure | None]] = {
+        "return-against-cost": partial(return_against_cost, sweep)
+    }
     for agent in agents:
         made[f"learning-curves_{_safe(agent)}"] = partial(
             learning_curves.learning_curves, sweep, agent, averaging=averaging
@@ -205,7 +228,6 @@ def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable
         for i in range(sweep.num_costs):
             which = f"_cost-{i + 1}" if i else ""
             made[f"bounds_{_safe(agent)}{which}"] = partial(cumulative_bounds, sweep, agent, cost=i)
-    made["return-against-cost"] = partial(return_against_cost, sweep)
     made["performance-profiles"] = partial(performance_profiles, sweep, Measure.STOCHASTIC)
     return made
 
@@ -240,11 +262,12 @@ def missing(sweep: Sweep) -> list[str]:
             sentences.append(f"{title}: {what}, {done:.0%} of its steps done{reason}")
     seeds = sweep.trials.groupby(list(GROUP), observed=True)["seed"].nunique()
     few = sorted({int(count) for count in seeds if count < ENOUGH_RUNS})
-    if few:
+    if few == [1]:
+        sentences.append("One seed: there are no intervals, and another seed may give another verdict")
+    elif few:
         sentences.append(
-            f"{' or '.join(map(str, few))} seed{'s' if few[-1] > 1 else ''}: bootstrap intervals "
-            f"are too short below {ENOUGH_RUNS} seeds (marked {report_tables.TOO_FEW}); Student's "
-            "and Wilson's hold"
+            f"{' or '.join(map(str, few))} seeds: bootstrap intervals are too short below {ENOUGH_RUNS} "
+            f"seeds (marked {report_tables.TOO_FEW}); Student's and Wilson's hold"
         )
     return sentences
 
@@ -256,94 +279,52 @@ def _count(sweep: Sweep) -> str:
     return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
-def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], list[tuple[str, pd.DataFrame]]]:
-    """Write the tables of a sweep, as far as it has come.
-
-    Args:
-        sweep: its frames.
-        folder: where the files go.
-
-    Returns:
-        The files, and the tables for people, as text, with their headings.
-    """
-    rows = metrics.outcomes(sweep)
-    bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
-    written = [
-        report_tables.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
-        report_tables.write_csv(pd.concat(bounds), folder / "bounds.csv"),
-    ]
-    if not len(rows):
-        return written, []
-    generator = np.random.default_rng(BOOTSTRAP_SEED)
-    averaged = metrics.summary(rows)
-    robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
-    compared = metrics.comparisons(rows, generator)
-    outcomes = {measure: report_tables.outcome_table(averaged, measure) for measure in Measure}
-    latex = [
-        f"% Outcome of {measure.description}.\n{report_tables.latex(table)}\n"
-        for measure, table in outcomes.items()
-        if len(table)
-    ]
-    shown = [
-        (f"Outcome of {measure.description}", table) for measure, table in outcomes.items() if len(table)
-    ]
-    if len(compared):
-        against = report_tables.comparison_table(compared, Measure.DEPLOYMENT)
-        shown.append(("Deployment phase against `none`, seed by seed [95% interval]", against))
-    weighed = claims.weigh(rows)
-    if len(weighed):
-        written.append(report_tables.write_csv(weighed, folder / "claims.csv"))
-        shown.append(("What the paper says of these maps, in deployment", claims.claims_table(weighed)))
-    for i, costs in enumerate(bounds):
-        which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
-        if len(costs):
-            shown.append((f"Cumulative cost of training beside its bounds{which}", bound_table(costs)))
-    whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
-    written += [
-        report_tables.write_csv(rows, folder / "outcomes.csv"),
-        report_tables.write_parquet(rows, folder / "outcomes.parquet"),
-        report_tables.write_csv(whole, folder / "summary.csv"),
-        report_tables.write_csv(compared, folder / "comparisons.csv"),
-        report_tables.write_text("\n".join(latex), folder / "outcomes.tex"),
-    ]
-    return written, shown
-
-
-def _html(sweep: Sweep, pictures: list[Path], shown: list[tuple[str, pd.DataFrame]]) -> str:
-    """The page: what is missing, figures, tables, settings, provenance."""
+def _html(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
+    """The page: answers, verdicts, warnings, figures, tables, settings, provenance."""
     failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
-    sections = []
-    if sentences := missing(sweep):
-        sections.append(Section("To be known", report_page.items(sentences, failed=failed)))
-    sections.append(
-        Section("Figures", "\n".join(report_page.figure(path, _caption(path)) for path in pictures))
+    sentences = [_count(sweep), *missing(sweep)]
+    sections = [
+        Section("Warnings", report_page.items(sentences, kind="failed" if failed else "plain")),
+        Section("Figures", "\n".join(report_page.figure(path, _caption(path)) for path in pictures)),
+        *(Section(heading, report_page.table(table)) for heading, table in tables.shown),
+        Section("Settings", report_page.verbatim(sweep.grid) + report_page.verbatim(_settings(sweep))),
+        Section("Provenance", report_page.verbatim("\n".join(_provenance(sweep)))),
+    ]
+    goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
+    return report_page.page(
+        sweep.name, _opening(tables.verdicts), sections, reload_seconds=RELOAD_SECONDS if goes_on else None
     )
-    sections += [Section(heading.replace("`", ""), report_page.table(table)) for heading, table in shown]
-    if not shown:
-        sections.append(Section("Tables", report_page.items([NO_TABLE])))
+
+
+def _opening(judged: pd.DataFrame) -> str:
+    """The answers and the verdict table."""
+    if not len(judged):
+        return report_page.items([report_verdicts.NO_VERDICT], kind="answers")
+    return "\n".join(
+        [
+            report_page.items(report_verdicts.answers(judged), kind="answers"),
+            report_page.verdict_table(
+                report_verdicts.verdict_table(judged), report_verdicts.verdict_kinds(judged)
+            ),
+            report_page.items(report_verdicts.explanation(judged), kind="notes"),
+        ]
+    )
+
+
+def _settings(sweep: Sweep) -> str:
+    """Every task, agent and curriculum with its options, a line each."""
     settings = {
         f"{kind} {choice['label']}": choice
         for trial in sweep.facts
         for kind, choice in trial.spec.to_json().items()
         if kind in ("task", "agent", "method")
     }
-    sections.append(
-        Section(
-            "Settings",
-            report_page.verbatim(sweep.grid)
-            + report_page.verbatim("\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)),
-        )
-    )
-    sections.append(Section("Provenance", report_page.verbatim("\n".join(_provenance(sweep)))))
-    goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
-    return report_page.page(
-        sweep.name, _count(sweep), sections, reload_seconds=RELOAD_SECONDS if goes_on else None
-    )
+    return "\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)
 
 
 def _caption(path: Path) -> str:
     kind, _, of = path.stem.partition("_")
-    return " ".join([CAPTIONS[kind], *(["for", of.replace("_", ", ")] if of else [])])
+    return f"{of.replace('_', ', ')}: {CAPTIONS[kind]}" if of else CAPTIONS[kind]
 
 
 def _provenance(sweep: Sweep) -> list[str]:

@@ -28,11 +28,23 @@ figure img { width: 100%; min-width: 42rem; height: auto; display: block; }
 figcaption { color: #555; font-size: 0.85rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: 0.2rem 0.6rem 0.2rem 0; white-space: nowrap;
+th, td { text-align: left; overflow-wrap: normal; padding: 0.2rem 0.6rem 0.2rem 0; white-space: nowrap;
          border-bottom: 1px solid #e6e6e6; }
 th { border-bottom: 2px solid #999; vertical-align: bottom; }
 pre { font-size: 0.8rem; background: #f6f6f6; padding: 0.6rem; overflow-x: auto; }
 summary { cursor: pointer; }
+.answers { font-size: 1.1rem; padding-left: 1.2rem; }
+.notes { color: #555; font-size: 0.85rem; padding-left: 1.2rem; }
+tr.solved td.verdict { background: #e3f1e3; }
+tr.infeasible td { background: #fbe9e7; }
+tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
+.verdicts td.verdict { white-space: normal; min-width: 13rem; }
+.verdicts th { white-space: normal; }
+@media screen and (max-width: 44rem) {
+  .verdicts td.verdict { min-width: 7rem; }
+  .scroll::before { content: "scroll sideways →"; position: sticky; left: 0; color: #555;
+                    font-size: 0.8rem; }
+}
 .failed { border-left: 4px solid #c0392b; padding-left: 0.6rem; }
 @media print {
   @page { margin: 14mm; }
@@ -40,6 +52,8 @@ summary { cursor: pointer; }
   nav { display: none; }
   .scroll, pre { overflow: visible; }
   figure img { min-width: 0; }
+  .verdicts td.verdict { min-width: 0; }
+  tr { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
   table { font-size: 6.5pt; width: 100%; }
   th, td { white-space: normal; padding-right: 0.3rem; }
   pre { white-space: pre-wrap; font-size: 7pt; }
@@ -62,13 +76,13 @@ class Section:
     body: str
 
 
-def page(title: str, lead: str, sections: Sequence[Section], *, reload_seconds: int | None = None) -> str:
+def page(title: str, opening: str, sections: Sequence[Section], *, reload_seconds: int | None = None) -> str:
     """The whole page.
 
     Args:
         title: of the page.
-        lead: one sentence below it.
-        sections: its parts, listed at the top.
+        opening: HTML below it.
+        sections: its other parts, listed below the opening.
         reload_seconds: an open page loads itself again so often; None if nothing will change.
     """
     links = "".join(f'<a href="#s{index}">{escape(it.heading)}</a> ' for index, it in enumerate(sections))
@@ -83,7 +97,7 @@ def page(title: str, lead: str, sections: Sequence[Section], *, reload_seconds: 
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<link rel="icon" href="data:,">{reload}',
             f"<title>{escape(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>",
-            f"<h1>{escape(title)}</h1>\n<p>{escape(lead)}</p>\n<nav>{links}</nav>",
+            f"<h1>{escape(title)}</h1>\n{opening}\n<nav>{links}</nav>",
             *parts,
             "</body>\n</html>",
         ]
@@ -102,22 +116,45 @@ def figure(png: Path, caption: str) -> str:
 
 def table(frame: pd.DataFrame) -> str:
     """A table of finished text."""
+    return _table(frame, [""] * len(frame), "")
+
+
+def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:
+    """A table whose rows are coloured by their verdict.
+
+    Args:
+        frame: finished text, with a column ``verdict``.
+        kinds: the class of each row.
+    """
+    return _table(frame, [f' class="{kind}"' for kind in kinds], ' class="verdicts"')
+
+
+def _table(frame: pd.DataFrame, of_rows: Sequence[str], of_table: str) -> str:
+    marks = [' class="verdict"' if name == "verdict" and of_table else "" for name in frame]
     head = "".join(f"<th>{escape(str(name))}</th>" for name in frame)
     rows = [
-        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>"
-        for row in frame.to_numpy().tolist()
+        f"<tr{kind}>"
+        + "".join(f"<td{mark}>{escape(str(cell))}</td>" for mark, cell in zip(marks, row, strict=True))
+        + "</tr>"
+        for kind, row in zip(of_rows, frame.to_numpy().tolist(), strict=True)
     ]
     return (
-        f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>'
+        f'<div class="scroll"><table{of_table}><thead><tr>{head}</tr></thead>\n<tbody>'
         + "\n".join(rows)
         + "</tbody></table></div>"
     )
 
 
-def items(sentences: Sequence[str], *, failed: bool = False) -> str:
-    """A list of sentences."""
-    kind = ' class="failed"' if failed else ""
-    return f"<ul{kind}>" + "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences) + "</ul>"
+def items(sentences: Sequence[str], *, kind: str = "plain") -> str:
+    """A list of sentences.
+
+    Args:
+        sentences: its items.
+        kind: ``plain``, ``answers``, ``notes`` or ``failed``.
+    """
+    return (
+        f'<ul class="{kind}">' + "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences) + "</ul>"
+    )
 
 
 def verbatim(text: str) -> str:

@@ -1,7 +1,7 @@
 """What the trials achieved, as tables: CSV with every digit for programs, Markdown and LaTeX for people.
 
-In the tables for people a value is "mean ± standard error" over seeds, and a share of seeds is "3 of 5" with
-Wilson's 95% interval in percent behind it: never a percentage without the numbers.
+In the tables for people a value is "mean ± standard error" over seeds, or one seed's value. A share of seeds
+is "3 of 5", from five seeds on with Wilson's 95% interval in percent.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import GROUP
+from recrl.analysis.data.labels import GROUP
+from recrl.analysis.statistics.intervals import share_text
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.redaction import printable
 
@@ -36,9 +37,9 @@ LATEX = {
 
 
 def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
-    """Return, costs, gap to the optimum and share of feasible seeds, as text.
+    """Return, costs, regret and shares of feasible and solved seeds, as text.
 
-    The gap is only an honest score where the seeds are feasible: who breaks the limit can be above J*(d_d).
+    The regret, J*(d_d) minus the return, is left out where a seed is infeasible: it may be above J*(d_d).
 
     Args:
         summary: of ``metrics.summary``.
@@ -55,20 +56,17 @@ def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
             line[title] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
             line[f"limit of {title}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["optimum"] = number(row["optimal_return"])
-        line["gap"] = with_error(row["gap"], row["gap_se"])
-        seeds = int(row["seeds"])
-        low, high = round(100 * row["feasible_low"]), round(100 * row["feasible_high"])
-        line["cost ≤ limit"] = f"{row['feasible_seeds']} of {seeds} ({low}–{high}%)"
-        line["within one s.e."] = f"{row['feasible_within_se_seeds']} of {seeds}"
-        low, high = round(100 * row["optimal_low"]), round(100 * row["optimal_high"])
-        found = f"{row['optimal_seeds']} of {seeds} ({low}–{high}%)"
-        line["at the optimum"] = DASH if math.isnan(row["optimal_return"]) else found
+        seeds, feasible = int(row["seeds"]), int(row["feasible_seeds"])
+        line["regret"] = with_error(row["gap"], row["gap_se"]) if feasible == seeds else DASH
+        line["feasible"] = share_text(feasible, seeds, row["feasible_low"], row["feasible_high"])
+        found = share_text(int(row["optimal_seeds"]), seeds, row["optimal_low"], row["optimal_high"])
+        line["solved"] = DASH if math.isnan(row["optimal_return"]) else found
         lines.append(line)
     return pd.DataFrame(lines)
 
 
 def comparison_table(comparisons: pd.DataFrame, measure: Measure) -> pd.DataFrame:
-    """Paired differences to the student without a curriculum, as text.
+    """Paired differences to the agent without a curriculum, as text.
 
     Args:
         comparisons: of ``metrics.comparisons``.
@@ -125,8 +123,9 @@ def with_error(mean: float, error: float, *, digits: int = 2) -> str:
 def with_interval(row: pd.Series, name: str) -> str:
     """Estimate [low, high] from the three columns of an interval; without ends where there are none."""
     estimate, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    shown, low, high = (round(value, 2) + 0.0 for value in (estimate, low, high))  # no -0.00
     ends = "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
-    return DASH if math.isnan(estimate) else f"{estimate:.2f}{ends}"
+    return DASH if math.isnan(estimate) else f"{shown:.2f}{ends}"
 
 
 def markdown(table: pd.DataFrame) -> str:

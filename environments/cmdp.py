@@ -13,7 +13,7 @@ Imports neither Gymnasium nor torch at run time, so that teachers can use it alo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
@@ -157,6 +157,63 @@ class CostLimits:
     def unlimited(cls, num_costs: int) -> CostLimits:
         """Limits that constrain nothing: the CMDP is an MDP (paper, section 4)."""
         return cls((math.inf,) * num_costs)
+
+
+@dataclass(frozen=True)
+class CurriculumStep:
+    """What a curriculum asks for one policy update: while its samples are collected, and while it learns.
+
+    Attributes:
+        limits: the cost limits d, [k].
+        policy_noise: eps_pi in [0, 1], noise that is added to the policy once, before it collects samples for
+            the update (Algorithm 2, line 9); 0 for none.
+        entropy_coefficient: what a nat of the policy's entropy is worth in the update, in the task's reward
+            per step, at least 0; None if the curriculum never rewards entropy.
+        start_limits: the training limits d_t from which the curriculum starts, [k]; None while they are being
+            measured. For the record only; agents do not use them.
+    """
+
+    limits: CostLimits
+    policy_noise: float = 0.0
+    entropy_coefficient: float | None = None
+    start_limits: CostLimits | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.policy_noise <= 1.0:
+            raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
+        coefficient = self.entropy_coefficient
+        if coefficient is not None and not 0.0 <= coefficient < math.inf:
+            raise ValueError(f"entropy coefficient must be finite and at least 0, got {coefficient}")
+
+    @property
+    def rewards_entropy(self) -> bool:
+        """Whether the policy's entropy is worth anything in this update."""
+        return self.entropy_coefficient is not None and self.entropy_coefficient > 0.0
+
+    def in_deployment(self, deploy_limits: CostLimits) -> CurriculumStep:
+        """The step after this one when deployment begins: limits d_d, no noise, no reward for entropy."""
+        coefficient = None if self.entropy_coefficient is None else 0.0
+        return CurriculumStep(deploy_limits, 0.0, coefficient, self.start_limits)
+
+    def to_json(self) -> dict[str, Any]:
+        """The step as strict JSON, by the attributes' names."""
+        return {
+            "limits": self.limits.to_json(),
+            "policy_noise": self.policy_noise,
+            "entropy_coefficient": self.entropy_coefficient,
+            "start_limits": None if self.start_limits is None else self.start_limits.to_json(),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> CurriculumStep:
+        """The inverse of ``to_json``; ``entropy_coefficient`` may be missing, and other keys are ignored."""
+        start, coefficient = values["start_limits"], values.get("entropy_coefficient")
+        return cls(
+            CostLimits.from_json(values["limits"]),
+            float(values["policy_noise"]),
+            None if coefficient is None else float(coefficient),
+            None if start is None else CostLimits.from_json(start),
+        )
 
 
 @dataclass(frozen=True)

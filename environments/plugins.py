@@ -121,6 +121,17 @@ def load_attribute(path: str) -> Any:
         ) from error
 
 
+def trusted_attribute(path: str) -> Any:
+    """The object at ``package.module:attribute`` that an option names.
+
+    Raises:
+        UnknownNameError: the module cannot be imported or has no such attribute.
+        UntrustedNameError: this process follows no import paths.
+    """
+    require_trust(path)
+    return load_attribute(path)
+
+
 def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any:
     """What ``name`` stands for.
 

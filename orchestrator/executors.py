@@ -1,8 +1,8 @@
-"""The seam between a sweep and whatever runs its trials.
+"""Who runs the trials of a sweep.
 
-An executor works through specs and leaves everything it achieved in the store's files; it returns nothing.
-What happened is read back from there, so an executor may die at any time. Ray is one executor, in
-``ray_executor``; ``InlineExecutor`` runs the trials one after the other in this process: for tests,
+An executor works through specs and leaves everything it achieved in the sweep's files; it returns nothing.
+What happened is read back from there, so an executor may die at any time. Ray is one executor
+(``ray.executor``); ``InlineExecutor`` runs the trials one after the other in this process: for tests,
 debuggers, and machines without Ray.
 """
 
@@ -10,21 +10,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec
-
-if TYPE_CHECKING:
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 
 
 class Executor(Protocol):
     """Something that runs trials."""
 
-    def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
+    def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """Work on the specs, in order of priority, until each is finished or ``stop`` is set.
 
         A trial that raises is recorded as failed in its own files; the others go on. When ``stop`` is
@@ -33,27 +28,15 @@ class Executor(Protocol):
         ...
 
 
-@dataclass(frozen=True)
 class InlineExecutor:
-    """Runs the trials one after the other in this process.
+    """Runs the trials one after the other in this process."""
 
-    Attributes:
-        storage: where the trials are kept; None for the sweep's folder itself.
-    """
-
-    storage: RemoteSweep | None = None
-
-    def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
+    def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """See ``Executor.run``."""
         from recrl.orchestrator.trial.trial import run_recorded  # noqa: PLC0415  (imports torch)
 
         for spec in specs:
             if stop.is_set():
                 return
-            place = (
-                self.storage.working_copy(spec, stop.is_set)
-                if self.storage
-                else nullcontext(store.trial(spec))
-            )
-            with place as trial:
+            with place.working_copy(spec, stop.is_set) as trial:
                 run_recorded(spec, trial, should_stop=stop.is_set)

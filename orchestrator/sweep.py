@@ -12,23 +12,21 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from recrl.orchestrator.background import beside
-from recrl.orchestrator.errors import DamagedError, RecrlError, StorageError
+from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.provenance import collect
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import GridSpec
-from recrl.orchestrator.grid.plan import Plan, Work, make_plan
+from recrl.orchestrator.grid.plan import Plan, Work, make_plan, select
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
-
-if TYPE_CHECKING:
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
 MIRROR_SECONDS = 120.0
@@ -72,130 +70,111 @@ class SweepResult:
         return self.progress.standing(Standing.FAILED)
 
 
-def launch(
-    grid: GridSpec,
-    store: SweepStore,
-    executor: Executor,
-    *,
-    stop: threading.Event,
-    only: Mapping[str, Sequence[str]] | None = None,
-    retry_failed: bool = False,
-    rerun_damaged: bool = False,
-    rerun_changed: bool = False,
-    storage: RemoteSweep | None = None,
-    start_mirror: Callable[[SweepStore], Mirror] | None = None,
-    watch: Callable[[Plan], None] | None = None,
-    finish: Callable[[SweepProgress], None] | None = None,
-) -> SweepResult:
-    """Work on everything in the grid that is not finished.
+@dataclass(frozen=True)
+class LaunchSettings:
+    """What to launch.
 
-    Args:
+    Attributes:
         grid: the checked grid.
-        store: the sweep's folder.
+        place: where the sweep is kept.
         executor: who runs the trials.
-        stop: once set, running trials save where they are, and the call returns.
         only: the trials to work on, as ``plan.select`` reads it; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again.
         rerun_changed: whether trials that ran other code than is installed now are run again.
-        storage: where the trials are kept, if ``store`` is only a mirror; the executor's as well.
         start_mirror: begins to show the sweep elsewhere, before the first trial.
         watch: told the plan before the first trial.
         finish: called after the last trial, before the mirror stops: draws figures, for example.
+    """
+
+    grid: GridSpec
+    place: SweepPlace
+    executor: Executor
+    only: Mapping[str, Sequence[str]] | None = None
+    retry_failed: bool = False
+    rerun_damaged: bool = False
+    rerun_changed: bool = False
+    start_mirror: Callable[[SweepStore], Mirror] | None = None
+    watch: Callable[[Plan], None] = lambda plan: None
+    finish: Callable[[SweepProgress], None] = lambda after: None
+
+
+def launch(settings: LaunchSettings, *, stop: threading.Event) -> SweepResult:
+    """Work on everything in the grid that is not finished.
+
+    Args:
+        settings: what to launch.
+        stop: once set, running trials save where they are, and the call returns.
 
     Raises:
         SweepBusyError: another process is running this sweep.
-        StorageError: the storage cannot be used.
-        RecrlError: ``only`` names what is not in the grid, or the executor cannot run at all.
+        StorageError: the object store cannot be used.
+        RecrlError: ``only`` names what is not in the grid, the trials cannot be run again where they are
+            kept, or the executor cannot run at all.
     """
-    if storage is not None and (rerun_damaged or rerun_changed):
-        raise RecrlError(
-            f"{storage.uri}: trials of a sweep that is kept there are not run again: give the sweep another "
-            "name; if only its folder here is damaged, delete that, and it is fetched again"
-        )
-    specs = grid.trials()
-    make_plan(specs, store, only=only)  # a mistake in ``only`` leaves no trace
-    with store.lock(), _stopping_on_request(store, stop), _held(storage, stop):
-        if storage is not None:
-            storage.pull(store)
-        _write_files(grid, specs, store)
-        if storage is not None:
-            storage.publish(store)
+    place, store = settings.place, settings.place.store
+    if settings.rerun_damaged or settings.rerun_changed:
+        place.require_reruns()
+    specs = settings.grid.trials()
+    select(specs, settings.only or {})  # a mistake in ``only`` leaves no trace
+    with store.lock(), _stopping_on_request(store, stop), place.held(stop):
+        place.pull()
+        _write_files(settings.grid, specs, store)
+        place.publish()
         _leave_none_running(specs, store)  # of a launch that died
-        plan = make_plan(
-            specs,
-            store,
-            only=only,
-            retry_failed=retry_failed,
-            rerun_damaged=rerun_damaged,
-            rerun_changed=rerun_changed,
-        )
-        chosen = [trial.spec for trial in plan.trials]
-        if watch is not None:
-            watch(plan)
+        plan = _plan(settings, specs)
+        settings.watch(plan)
         for trial in plan.doing(Work.RERUN):
             store.trial(trial.spec).set_all_aside()
-        mirror = start_mirror(store) if start_mirror is not None else None
-        patience = HASTY_MIRROR_SECONDS
-        mirrored: bool | None = None
-        try:
-            try:
-                with _mirrored(storage, store, stop):
-                    executor.run(plan.to_do, store, stop)
-            finally:
-                _leave_none_running(plan.to_do, store)
-                _settle(plan.to_do, store, storage)
-            after = progress(chosen, store)
-            if finish is not None:
-                finish(after)
-            if not stop.is_set():
-                patience = MIRROR_SECONDS
-        finally:
-            if mirror is not None:
-                mirrored = mirror.stop(patience)
+        return _run(settings, plan, stop)
+
+
+def _plan(settings: LaunchSettings, specs: Sequence[TrialSpec]) -> Plan:
+    return make_plan(
+        specs,
+        settings.place.store,
+        only=settings.only,
+        retry_failed=settings.retry_failed,
+        rerun_damaged=settings.rerun_damaged,
+        rerun_changed=settings.rerun_changed,
+    )
+
+
+def _run(settings: LaunchSettings, plan: Plan, stop: threading.Event) -> SweepResult:
+    """Run the trials of a plan, and show them elsewhere meanwhile."""
+    store = settings.place.store
+    mirror = settings.start_mirror(store) if settings.start_mirror is not None else None
+    patience = HASTY_MIRROR_SECONDS
+    mirrored: bool | None = None
+    try:
+        _run_trials(settings, plan.to_do, stop)
+        after = progress([trial.spec for trial in plan.trials], store)
+        settings.finish(after)
+        if not stop.is_set():
+            patience = MIRROR_SECONDS
+    finally:
+        if mirror is not None:
+            mirrored = mirror.stop(patience)
     return SweepResult(plan, after, stopped=stop.is_set(), mirrored=mirrored)
 
 
-def request_stop(store: SweepStore, storage: RemoteSweep | None = None) -> Callable[[], bool]:
-    """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
-
-    Args:
-        store: the sweep's folder.
-        storage: what that is the mirror of, if it is one.
-
-    Returns:
-        Whether it still runs; to be asked until it does not.
-    """
-    if store.is_locked():
-        store.stop_request_path.touch()
-    elif storage is not None and storage.is_held():
-        storage.request_stop()
-        return storage.is_held
-    return store.is_locked
-
-
-def _held(storage: RemoteSweep | None, stop: threading.Event) -> AbstractContextManager[None]:
-    return storage.held(stop) if storage else nullcontext()
-
-
-def _mirrored(
-    storage: RemoteSweep | None, store: SweepStore, stop: threading.Event
-) -> AbstractContextManager[None]:
-    return storage.mirrored(store, stop) if storage else nullcontext()
-
-
-def _settle(specs: Sequence[TrialSpec], store: SweepStore, storage: RemoteSweep | None) -> None:
-    """Tell the storage what only this machine knows; it must not hide what came before."""
-    if storage is not None:
+def _run_trials(settings: LaunchSettings, specs: Sequence[TrialSpec], stop: threading.Event) -> None:
+    """Run trials; afterwards none of them stands as running, whatever happened."""
+    place = settings.place
+    try:
+        with place.mirrored(stop):
+            settings.executor.run(specs, place, stop)
+    finally:
+        _leave_none_running(specs, place.store)
         try:
-            storage.settle(specs, store)
-        except StorageError as error:
+            place.settle(specs)
+        except StorageError as error:  # it must not hide what came before
             logger.warning("%s; how its trials ended is known on this machine only", error)
 
 
 @contextmanager
 def _stopping_on_request(store: SweepStore, stop: threading.Event) -> Iterator[None]:
-    """Set ``stop`` when ``request_stop`` is called, in whatever process; what was asked before is void."""
+    """Set ``stop`` on a ``SweepPlace.request_stop`` from any process; earlier requests are void."""
 
     def watch(over: threading.Event) -> None:
         while not over.wait(REQUEST_SECONDS):

@@ -21,7 +21,7 @@ kind to the other.
 The bounds hold for updates that solve CPO's problem under a finite limit. Recovery steps, updates that
 noise was added to, and those over which an infinite d_t is measured are not covered.
 
-Letters: d_t, d_d training and deployment limit of one cost, d a limit in force, n the number of policies,
+Notation: d_t, d_d training and deployment limit of one cost, d a limit in force, n the number of policies,
 p in [0, 1] progress, w(p) the weight of d_t in D = d_d + w (d_t - d_d), delta the bound on (or the measured)
 mean KL divergence of an update, eps = max_s |E_{a ~ new policy} A_C(s, a)|, gamma the discount, H the
 horizon.

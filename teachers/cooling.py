@@ -9,14 +9,13 @@ temperature is high, and both arrive together.
 
     h = max(0, 1 - p / cooled)      heat: 1 at first, 0 from the share ``cooled`` of B on
     d = min(d_t, d_d (1 + relaxation h))
-    tau = temperature h             reward per nat, in the update after the lesson
+    tau = temperature h             reward per nat, in the next update
 
 Where nothing is left to learn at a temperature, log pi(a | s) is the advantage over the temperature, up to a
-constant: ``Experience.with_entropy``. It needs a student to whom every observation can be worth something of
-its own (``observation: pose`` of RiverGrid), and whose price for a violation can rise until no way through it
-pays (``ppo-lag`` as it is, or with a ``multiplier_maximum`` above that price; ``cpo``).
+constant: ``Experience.with_entropy``. It needs an agent whose price for a violation can rise until no way
+through it pays (``ppo-lag`` as it is, or with a ``multiplier_maximum`` above that price; ``cpo``).
 
-Letters: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
+Notation: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
 environment steps, p in [0, 1] the share of B that is used up, k the number of costs.
 """
 
@@ -24,14 +23,12 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from recrl.environments.cmdp import CostLimits
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.teacher import (
-    Lesson,
     ProgressReport,
     TeacherSpec,
     TeacherState,
     already_seen,
-    last_lesson,
     progress,
 )
 
@@ -74,8 +71,8 @@ def heat(p: float, cooled: float) -> float:
 class CoolingTeacher:
     """The cooling curriculum, a function of the clock only.
 
-    Its state holds ``update``, ``limits`` [k], ``policy_noise`` (always 0), ``temperature`` and
-    ``start_limits`` (where the limits begin, [k]).
+    Its state holds ``update``, ``limits`` [k], ``policy_noise`` (always 0), ``entropy_coefficient``
+    and ``start_limits`` (where the limits begin, [k]).
 
     Args:
         spec: d_t, d_d, B and the options of ``CoolingConfig``.
@@ -85,17 +82,16 @@ class CoolingTeacher:
         self.spec = spec
         self.config = CoolingConfig.model_validate(dict(spec.options))
 
-    def start(self) -> tuple[Lesson, TeacherState]:
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``."""
-        return self._taught(0, Lesson(self._limits(1.0)))
+        return self._taught(0, 1.0, 0.0)
 
-    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.step``."""
         if already_seen(state, report):
-            return last_lesson(state), state
+            return CurriculumStep.from_json(state), state
         left = heat(progress(report.env_steps, self.spec.train_steps), self.config.cooled)
-        tau = self.config.temperature * left
-        return self._taught(report.update, Lesson(self._limits(left), temperature=tau))
+        return self._taught(report.update, left, self.config.temperature * left)
 
     def _limits(self, left: float) -> CostLimits:
         """The limits at the heat h, [k]."""
@@ -106,12 +102,7 @@ class CoolingTeacher:
             )
         )
 
-    def _taught(self, update: int, lesson: Lesson) -> tuple[Lesson, TeacherState]:
-        state = {
-            "update": update,
-            "limits": lesson.limits.to_json(),
-            "policy_noise": lesson.policy_noise,
-            "temperature": lesson.temperature,
-            "start_limits": self._limits(1.0).to_json(),
-        }
-        return lesson, state
+    def _taught(self, update: int, left: float, coefficient: float) -> tuple[CurriculumStep, TeacherState]:
+        """The step at the heat h after an update, and the state that says so."""
+        step = CurriculumStep(self._limits(left), 0.0, coefficient, self._limits(1.0))
+        return step, {"update": update, **step.to_json()}

@@ -45,7 +45,7 @@ the letter wherever it is defined.
 One consequence of line 7 is kept, and worth knowing: a student whose converged cost is below d_d is given
 d_d at once, whatever remains of the budget.
 
-Letters: d limits in force, d_t training limits, d_d deployment limits, B the training budget in environment
+Notation: d limits in force, d_t training limits, d_d deployment limits, B the training budget in environment
 steps, b an episode, C-bar and r-bar the mean episode cost and return of a window, W a window's size, k the
 number of costs, eps_r, eps_c, eps_pi the paper's settings.
 """
@@ -58,18 +58,16 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from recrl.environments.cmdp import CostLimits
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.start import START_FRACTION, StartMeasurement
 from recrl.teachers.teacher import (
-    Lesson,
     ProgressReport,
     TeacherSpec,
     TeacherState,
     already_seen,
-    last_lesson,
     progress,
 )
-from recrl.teachers.windows import Stretch, WindowUnit, extend, last_two_windows
+from recrl.teachers.windows import WindowStatistics, WindowUnit, extend, last_two_windows
 
 # The pseudocode as it stands. W and eps_pi are not given in the paper: W is five updates of 16 episodes.
 PAPER = {
@@ -230,16 +228,16 @@ def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int
     return max(deploy_limit, deploy_limit + (start - deploy_limit) * (1.0 - 1.0 / max(1, remaining)))
 
 
-def judge(
-    old: Stretch,
-    new: Stretch,
+def decide(
+    old: WindowStatistics,
+    new: WindowStatistics,
     *,
     limits: CostLimits,
     deploy_limits: CostLimits,
     remaining: int,
     config: DynamicConfig,
-) -> Lesson:
-    """Lines 5 to 10 of Algorithm 2: the next lesson.
+) -> CurriculumStep:
+    """Lines 5 to 10 of Algorithm 2: the next step.
 
     Args:
         old: the window before the last.
@@ -250,7 +248,7 @@ def judge(
         config: the settings.
     """
     if old.episodes == 0 or new.episodes == 0:
-        return Lesson(limits)
+        return CurriculumStep(limits)
     converged = _converged(old, new, config)
     kept = _kept(new, limits, config)
     if config.dimensions == "joint":
@@ -262,10 +260,10 @@ def judge(
             limits, new.mean_costs, deploy_limits, converged, kept, strict=True
         )
     )
-    return Lesson(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
+    return CurriculumStep(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
 
 
-def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
+def _converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConfig) -> list[bool]:
     """Whether the return and the cost of each dimension have converged (line 5), [k].
 
     Never where a window has no episode. Jointly, none has before all have.
@@ -283,7 +281,7 @@ def _converged(old: Stretch, new: Stretch, config: DynamicConfig) -> list[bool]:
     return [all(converged)] * len(converged) if config.dimensions == "joint" else converged
 
 
-def _floors(window: Stretch, config: DynamicConfig) -> tuple[float, tuple[float, ...]]:
+def _floors(window: WindowStatistics, config: DynamicConfig) -> tuple[float, tuple[float, ...]]:
     """What a mean return and mean costs at least count as in a comparison: the floor, or the spread."""
     if not config.window_grows:
         return config.return_floor, (config.cost_floor,) * len(window.mean_costs)
@@ -291,7 +289,7 @@ def _floors(window: Stretch, config: DynamicConfig) -> tuple[float, tuple[float,
     return max(window.return_spread, config.return_floor), cost_floors
 
 
-def is_precise(window: Stretch, config: DynamicConfig) -> bool:
+def is_precise(window: WindowStatistics, config: DynamicConfig) -> bool:
     """Whether a window's means are known to within what equal means may differ by.
 
     s <= eps max(|mean|, floor, standard deviation), s the standard error of the return and of each cost. With
@@ -308,7 +306,7 @@ def is_precise(window: Stretch, config: DynamicConfig) -> bool:
     )
 
 
-def _kept(new: Stretch, limits: CostLimits, config: DynamicConfig) -> list[bool]:
+def _kept(new: WindowStatistics, limits: CostLimits, config: DynamicConfig) -> list[bool]:
     """Whether each limit is kept, [k]."""
     return [
         keeps_limit(cost, limit, tolerance=_tolerance(limit, error, config))
@@ -328,7 +326,7 @@ def _tolerance(limit: float, standard_error: float, config: DynamicConfig) -> fl
 
 
 def steps_left(
-    last: Stretch, *, env_steps: int, train_steps: int, unit: Literal["windows", "episodes"]
+    last: WindowStatistics, *, env_steps: int, train_steps: int, unit: Literal["windows", "episodes"]
 ) -> int:
     """How many steps of ``next_limit`` the training budget has room for, at the pace of the last window.
 
@@ -338,7 +336,7 @@ def steps_left(
     next one is not counted: Algorithm 2 judges before it plays episode b, when b - 1 are played and
     B - b + 1 are left.
 
-    >>> last = Stretch(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    >>> last = WindowStatistics(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
     [2, 35]
     """
@@ -352,7 +350,7 @@ class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
-    episodes since limits or policy were changed, in the unit of W), ``history`` (one ``Stretch`` for each
+    episodes since limits or policy were changed, in the unit of W), ``history`` (``WindowStatistics`` of each
     update of the last two windows, as far as they are comparable) and the keys of ``StartMeasurement``.
 
     Args:
@@ -364,61 +362,63 @@ class DynamicTeacher:
         self.config = DynamicConfig.model_validate(dict(spec.options))
         self.measurement = StartMeasurement(spec, self.config.start_fraction)
 
-    def start(self) -> tuple[Lesson, TeacherState]:
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``."""
         state = _state(
             update=0,
             env_steps=0,
-            lesson=Lesson(self.spec.train_limits),
+            step=CurriculumStep(self.spec.train_limits),
             last_change=0,
             history=(),
             start=self.measurement.begin(),
         )
-        return last_lesson(state), state
+        return CurriculumStep.from_json(state), state
 
-    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.step``."""
         if already_seen(state, report):
-            return last_lesson(state), state
+            return CurriculumStep.from_json(state), state
         start = self.measurement.advance(state, report)
         history = self._history(state, report)
         last_change = state["last_change"] + (
             len(report.episodes) if self.config.window_unit == "episodes" else 1
         )
-        before = last_lesson(state).limits
+        before = CostLimits.from_json(state["limits"])
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
         is_due = False  # line 4
         if progress(report.env_steps, self.spec.train_steps) >= 1.0:
-            lesson, history = Lesson(self.spec.deploy_limits), ()
+            step, history = CurriculumStep(self.spec.deploy_limits), ()
         elif start["start_limits"] is None or limits != before or last_change < self.config.window:
-            lesson = Lesson(limits)
+            step = CurriculumStep(limits)
         else:
             is_due = True
-            lesson = self._judge(limits, history, report.env_steps, last_change)
-        has_changed = lesson.limits != before or lesson.policy_noise > 0.0
+            step = self._decide(limits, history, report.env_steps, last_change)
+        has_changed = step.limits != before or step.policy_noise > 0.0
         if is_due and self.config.clock_reset == "convergence":
             has_changed = has_changed or self._has_converged(history, last_change)
-        if lesson.policy_noise > 0.0 and self.config.windows_after_noise == 2:
+        if step.policy_noise > 0.0 and self.config.windows_after_noise == 2:
             history = ()
         next_state = _state(
             update=report.update,
             env_steps=report.env_steps,
-            lesson=lesson,
+            step=step,
             last_change=0 if has_changed else last_change,
             history=history,
             start=start,
         )
-        return lesson, next_state
+        return CurriculumStep.from_json(next_state), next_state
 
-    def _history(self, state: TeacherState, report: ProgressReport) -> tuple[Stretch, ...]:
+    def _history(self, state: TeacherState, report: ProgressReport) -> tuple[WindowStatistics, ...]:
         """The updates of the last two windows, or all of them as long as they are fewer."""
-        latest = Stretch.of_update(
+        latest = WindowStatistics.of_update(
             report.episodes,
             env_steps=report.env_steps - state["env_steps"],
             num_costs=len(self.spec.train_limits),
         )
         unit = self.config.window_unit
-        history = extend([Stretch.from_json(stretch) for stretch in state["history"]], latest, unit=unit)
+        history = extend(
+            [WindowStatistics.from_json(statistics) for statistics in state["history"]], latest, unit=unit
+        )
         needed = [self._last_two(history, group) for group in self._groups]
         if any(windows is None for windows in needed):
             return history
@@ -433,8 +433,8 @@ class DynamicTeacher:
         return (costs,)
 
     def _last_two(
-        self, history: Sequence[Stretch], group: tuple[int, ...]
-    ) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]] | None:
+        self, history: Sequence[WindowStatistics], group: tuple[int, ...]
+    ) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
         """The updates of the last two windows for a group of costs, or None as long as there are too few."""
         config = self.config
         return last_two_windows(
@@ -446,37 +446,38 @@ class DynamicTeacher:
             else None,
         )
 
-    def _is_due(self, newest: Sequence[Stretch], last_change: int) -> bool:
+    def _is_due(self, newest: Sequence[WindowStatistics], last_change: int) -> bool:
         """Whether a newest window lies wholly after the last change (line 4)."""
         in_episodes = self.config.window_unit == "episodes"
         length = sum(each.episodes for each in newest) if in_episodes else len(newest)
         return not self.config.window_grows or last_change >= length
 
     def _windows(
-        self, history: Sequence[Stretch], group: tuple[int, ...], last_change: int
-    ) -> tuple[Stretch, Stretch] | None:
+        self, history: Sequence[WindowStatistics], group: tuple[int, ...], last_change: int
+    ) -> tuple[WindowStatistics, WindowStatistics] | None:
         """The last two windows of a group of costs, each pooled; None if they are too few or too old."""
         windows = self._last_two(history, group)
         if windows is None or not self._is_due(windows[1], last_change):
             return None
-        return Stretch.pooled(windows[0]).of_costs(group), Stretch.pooled(windows[1]).of_costs(group)
+        old, new = (WindowStatistics.pooled(window).of_costs(group) for window in windows)
+        return old, new
 
-    def _has_converged(self, history: Sequence[Stretch], last_change: int) -> bool:
+    def _has_converged(self, history: Sequence[WindowStatistics], last_change: int) -> bool:
         """Whether line 11 is reached: the test of line 5 holds in some dimension, or jointly."""
         groups = (self._windows(history, group, last_change) for group in self._groups)
         return any(any(_converged(*windows, self.config)) for windows in groups if windows is not None)
 
-    def _judge(
-        self, limits: CostLimits, history: Sequence[Stretch], env_steps: int, last_change: int
-    ) -> Lesson:
-        """The next lesson once W has passed since the last change."""
+    def _decide(
+        self, limits: CostLimits, history: Sequence[WindowStatistics], env_steps: int, last_change: int
+    ) -> CurriculumStep:
+        """The next step once W has passed since the last change."""
         values, noise = list(limits), 0.0
         for group in self._groups:
             windows = self._windows(history, group, last_change)
             if windows is None:
                 continue
             old, new = windows
-            lesson = judge(
+            step = decide(
                 old,
                 new,
                 limits=CostLimits(tuple(limits[index] for index in group)),
@@ -486,28 +487,28 @@ class DynamicTeacher:
                 ),
                 config=self.config,
             )
-            noise = max(noise, lesson.policy_noise)
-            for index, value in zip(group, lesson.limits, strict=True):
+            noise = max(noise, step.policy_noise)
+            for index, value in zip(group, step.limits, strict=True):
                 values[index] = value
-        return Lesson(CostLimits(tuple(values)), noise)
+        return CurriculumStep(CostLimits(tuple(values)), noise)
 
 
 def _state(
     *,
     update: int,
     env_steps: int,
-    lesson: Lesson,
+    step: CurriculumStep,
     last_change: int,
-    history: Sequence[Stretch],
+    history: Sequence[WindowStatistics],
     start: dict[str, Any],
 ) -> dict[str, Any]:
     """A state as JSON."""
     return {
         "update": update,
         "env_steps": env_steps,
-        "limits": lesson.limits.to_json(),
-        "policy_noise": lesson.policy_noise,
+        "limits": step.limits.to_json(),
+        "policy_noise": step.policy_noise,
         "last_change": last_change,
-        "history": [stretch.to_json() for stretch in history],
+        "history": [statistics.to_json() for statistics in history],
         **start,
     }

@@ -10,7 +10,6 @@ from typing import Any
 from pydantic import BaseModel
 
 from recrl.environments.plugins import resolve
-from recrl.teachers.annealed import AnnealedConfig, AnnealedTeacher
 from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
 from recrl.teachers.dynamic import DynamicConfig, DynamicTeacher
 from recrl.teachers.static import (
@@ -61,11 +60,6 @@ TEACHERS: dict[str, TeacherKind] = {
         "CLiC_D: lower limits for a student that keeps them, noise for one that is stuck.",
         DynamicConfig,
         DynamicTeacher,
-    ),
-    "annealed": TeacherKind(
-        "Ours: noise in every update, slowly taken away, while the limit falls to d_d in equal ratios.",
-        AnnealedConfig,
-        AnnealedTeacher,
     ),
     "cooling": TeacherKind(
         "Ours: entropy is worth a reward that falls to 0, and the limit, relaxed as far, falls with it.",

@@ -3,7 +3,7 @@
 The three decays of the paper, and the controls that hold one limit for the whole training phase. The clock
 counts environment steps (``teacher.progress``) and is read once per policy update.
 
-Letters: d_t training limits, d_d deployment limits, B the training budget in environment steps,
+Notation: d_t training limits, d_d deployment limits, B the training budget in environment steps,
 p = env steps / B in [0, 1] the progress, k the number of costs.
 """
 
@@ -15,15 +15,13 @@ from dataclasses import replace
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from recrl.environments.cmdp import CostLimits
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.start import START_FRACTION, StartMeasurement
 from recrl.teachers.teacher import (
-    Lesson,
     ProgressReport,
     TeacherSpec,
     TeacherState,
     already_seen,
-    last_lesson,
     progress,
 )
 
@@ -94,7 +92,7 @@ class StaticTeacher:
         self.decay = decay
         self.measurement = StartMeasurement(spec, start_fraction)
 
-    def start(self) -> tuple[Lesson, TeacherState]:
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``."""
         state = {
             "update": 0,
@@ -102,19 +100,19 @@ class StaticTeacher:
             "policy_noise": 0.0,
             **self.measurement.begin(),
         }
-        return last_lesson(state), state
+        return CurriculumStep.from_json(state), state
 
-    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.step``."""
         if already_seen(state, report):
-            return last_lesson(state), state
+            return CurriculumStep.from_json(state), state
         start = self.measurement.advance(state, report)
         p = progress(report.env_steps, self.spec.train_steps)
         limits = CostLimits(
             tuple(
                 min(limit, limit_at(p, train, deploy, self.decay))
                 for limit, train, deploy in zip(
-                    last_lesson(state).limits,
+                    CostLimits.from_json(state["limits"]),
                     self.measurement.limits(start),
                     self.spec.deploy_limits,
                     strict=True,
@@ -122,7 +120,7 @@ class StaticTeacher:
             )
         )
         next_state = {"update": report.update, "limits": limits.to_json(), "policy_noise": 0.0, **start}
-        return last_lesson(next_state), next_state
+        return CurriculumStep.from_json(next_state), next_state
 
 
 class NoConfig(BaseModel):

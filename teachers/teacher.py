@@ -1,49 +1,25 @@
 """The seam between a trial and its teacher.
 
-A teacher is a pure function ``step(state, report) -> (Lesson, state')``. The *trial* holds the state and
-checkpoints it with the agent; a teacher keeps nothing between calls, so it can run inline, in an actor of
-its own or in one actor that a whole sweep shares, and always gives the same limits. It is asked once per
-policy update, with every episode that finished since the last one.
+A teacher is a pure function ``step(state, report) -> (CurriculumStep, state')``. The *trial* holds the state,
+which is opaque to it, and checkpoints it with the agent. A teacher keeps nothing between calls, so it can run
+inline, in an actor of its own or in one actor that a whole sweep shares, and always gives the same limits. It
+is asked once per policy update, with every episode that finished since the last one.
 
-Letters: d_t training limits, d_d deployment limits, B the training budget in environment steps,
+Notation: d_t training limits, d_d deployment limits, B the training budget in environment steps,
 p = env steps / B in [0, 1] the progress, k the number of costs.
 """
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats
 
 # A teacher's state: JSON values only, so that it can be checkpointed and sent between processes.
 TeacherState = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """What the student is to learn under until the next lesson.
-
-    Attributes:
-        limits: the cost limits d, [k].
-        policy_noise: eps_pi in [0, 1], noise to add to the student's policy once, before it collects
-            the next batch (Algorithm 2, line 9); 0 for none.
-        temperature: what a nat of the policy's entropy is worth in the update from the next batch, in the
-            task's reward, at least 0; only students that ``reward_entropy`` can be taught so.
-    """
-
-    limits: CostLimits
-    policy_noise: float = 0.0
-    temperature: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.temperature < math.inf:
-            raise ValueError(f"temperature must be finite and at least 0, got {self.temperature}")
-        if not 0.0 <= self.policy_noise <= 1.0:
-            raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
 
 
 @dataclass(frozen=True)
@@ -109,15 +85,15 @@ class TeacherSpec:
 class Teacher(Protocol):
     """A cost-limit curriculum (the paper's CLiC teacher)."""
 
-    def start(self) -> tuple[Lesson, TeacherState]:
-        """The first lesson and the state before any update."""
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
+        """The step of the first update and the state before any update."""
         ...
 
-    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
-        """The next lesson, given all finished episodes; never changes ``state``.
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
+        """The step of the next update, given all finished episodes; never changes ``state``.
 
         Idempotent on the update index: asked again for the update that ``state`` has already seen, it
-        returns the same lesson and the same state.
+        returns the same step and the same state.
 
         Raises:
             ValueError: ``report.update`` is neither the update after the state's nor the state's own.
@@ -126,8 +102,8 @@ class Teacher(Protocol):
 
 
 # What follows is shared by the teachers of this package. Their states hold at least ``update``, the last
-# update seen (0 before the first), and the last lesson as ``limits``, ``policy_noise`` and, if it has one,
-# ``temperature``: a repeated question is answered from the state alone.
+# update seen (0 before the first), and the keys of ``CurriculumStep.to_json``, so that a repeated question is
+# answered from the state alone.
 
 
 def progress(env_steps: int, train_steps: int) -> float:
@@ -152,12 +128,3 @@ def already_seen(state: TeacherState, report: ProgressReport) -> bool:
             f"or for {seen} again, got {report.update}"
         )
     return report.update == seen
-
-
-def last_lesson(state: TeacherState) -> Lesson:
-    """The lesson that ``state`` was returned with."""
-    return Lesson(
-        CostLimits.from_json(state["limits"]),
-        float(state["policy_noise"]),
-        float(state.get("temperature", 0.0)),
-    )

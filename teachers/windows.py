@@ -1,10 +1,10 @@
-"""What a student did over a stretch of policy updates, and the two windows the dynamic teacher compares.
+"""What a student did over some consecutive policy updates, and the two windows the dynamic teacher compares.
 
 A policy is constant between two updates, so a window is made of whole updates and its episodes are summed
 up once, when they are reported: judging costs nothing per episode, and a state keeps one short record for
 each update of the last two windows.
 
-Letters: k the number of costs, W a window's size.
+Notation: k the number of costs, W a window's size.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ WindowUnit = Literal["updates", "episodes"]
 
 
 @dataclass(frozen=True)
-class Stretch:
+class WindowStatistics:
     """The episodes that finished over some consecutive policy updates.
 
     Attributes:
@@ -40,7 +40,9 @@ class Stretch:
     return_scatter: float = 0.0
 
     @classmethod
-    def of_update(cls, episodes: Sequence[EpisodeStats], *, env_steps: int, num_costs: int) -> Stretch:
+    def of_update(
+        cls, episodes: Sequence[EpisodeStats], *, env_steps: int, num_costs: int
+    ) -> WindowStatistics:
         """What one update's report says."""
         count = len(episodes)
         if count == 0:
@@ -56,8 +58,8 @@ class Stretch:
         return cls(env_steps, count, mean_return, mean_costs, cost_scatter, return_scatter)
 
     @classmethod
-    def pooled(cls, parts: Sequence[Stretch]) -> Stretch:
-        """Several stretches as one; exact sums, so that the order does not matter."""
+    def pooled(cls, parts: Sequence[WindowStatistics]) -> WindowStatistics:
+        """Several statistics as one; exact sums, so that the order does not matter."""
         env_steps = sum(part.env_steps for part in parts)
         episodes = sum(part.episodes for part in parts)
         if episodes == 0:
@@ -80,7 +82,7 @@ class Stretch:
         )
         return cls(env_steps, episodes, mean_return, mean_costs, cost_scatter, return_scatter)
 
-    def of_costs(self, group: Sequence[int]) -> Stretch:
+    def of_costs(self, group: Sequence[int]) -> WindowStatistics:
         """The same with some of the costs alone."""
         return replace(
             self,
@@ -107,7 +109,7 @@ class Stretch:
         return math.sqrt(scatter / (self.episodes - 1)) if self.episodes > 1 else 0.0
 
     def to_json(self) -> list[Any]:
-        """The stretch as a JSON list, in the order of the attributes."""
+        """The statistics as a JSON list, in the order of the attributes."""
         return [
             self.env_steps,
             self.episodes,
@@ -118,29 +120,31 @@ class Stretch:
         ]
 
     @classmethod
-    def from_json(cls, values: Sequence[Any]) -> Stretch:
+    def from_json(cls, values: Sequence[Any]) -> WindowStatistics:
         """The inverse of ``to_json``."""
         env_steps, episodes, mean_return, mean_costs, cost_scatter, return_scatter = values
         return cls(env_steps, episodes, mean_return, tuple(mean_costs), tuple(cost_scatter), return_scatter)
 
 
-def extend(history: Sequence[Stretch], latest: Stretch, *, unit: WindowUnit) -> tuple[Stretch, ...]:
+def extend(
+    history: Sequence[WindowStatistics], latest: WindowStatistics, *, unit: WindowUnit
+) -> tuple[WindowStatistics, ...]:
     """The history with one more update.
 
     Where windows are counted in episodes, an update in which none finished only lends its steps to the
     next one that has any: a history is never longer than the episodes it holds.
     """
     if unit == "episodes" and history and history[-1].episodes == 0:
-        return (*history[:-1], Stretch.pooled([history[-1], latest]))
+        return (*history[:-1], WindowStatistics.pooled([history[-1], latest]))
     return (*history, latest)
 
 
 def latest_window(
-    history: Sequence[Stretch],
+    history: Sequence[WindowStatistics],
     size: int,
     *,
     unit: WindowUnit,
-    is_enough: Callable[[Stretch], bool] | None = None,
+    is_enough: Callable[[WindowStatistics], bool] | None = None,
 ) -> int | None:
     """How many of the last updates make a window of W; None if there are too few.
 
@@ -151,33 +155,33 @@ def latest_window(
     count = _latest_of_size(history, size, unit=unit)
     if count is None or is_enough is None:
         return count
-    window = Stretch.pooled(history[len(history) - count :])
+    window = WindowStatistics.pooled(history[len(history) - count :])
     while not is_enough(window):
         count += 1
         if count > len(history):
             return None
-        window = Stretch.pooled([history[len(history) - count], window])
+        window = WindowStatistics.pooled([history[len(history) - count], window])
     return count
 
 
-def _latest_of_size(history: Sequence[Stretch], size: int, *, unit: WindowUnit) -> int | None:
+def _latest_of_size(history: Sequence[WindowStatistics], size: int, *, unit: WindowUnit) -> int | None:
     if unit == "updates":
         return size if len(history) >= size else None
     episodes = 0
-    for count, stretch in enumerate(reversed(history), start=1):
-        episodes += stretch.episodes
+    for count, statistics in enumerate(reversed(history), start=1):
+        episodes += statistics.episodes
         if episodes >= size:
             return count
     return None
 
 
 def last_two_windows(
-    history: Sequence[Stretch],
+    history: Sequence[WindowStatistics],
     size: int,
     *,
     unit: WindowUnit,
-    is_enough: Callable[[Stretch], bool] | None = None,
-) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]] | None:
+    is_enough: Callable[[WindowStatistics], bool] | None = None,
+) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
     """The updates of the window before the last one, and of the last one; None if there are too few."""
     new = latest_window(history, size, unit=unit, is_enough=is_enough)
     if new is None:

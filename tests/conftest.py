@@ -17,7 +17,8 @@ from recrl.analysis.data.sweep_data import Sweep, load
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.files.store import SweepStore, TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.tracking.mlflow_sync import sync, tracking_uri
+from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import sync
 
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0

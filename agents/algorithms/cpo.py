@@ -5,27 +5,25 @@ line search until the true surrogates and the true KL agree with the linear mode
 and not scaled, and the constraints enter in cost per step, so that b and c have one unit.
 
 If no episode finished, nothing is known about the constraints and the policy stays. A cost whose limit is
-infinite is no constraint. With ``cross_fitting`` a violation counts for more, as far as steps keep less than
-they promise (``recrl.agents.constraints.cross_fitting``).
+infinite is no constraint.
 
-Letters: N samples, k costs, P parameters, delta the trust region's size, H its metric.
+Notation: N samples, k costs, P parameters, delta the trust region's size, H its metric.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.config import CPOConfig, LinearisedConstraintConfig, TrustRegionConfig
-from recrl.agents.constraints.cross_fitting import KeptShares, confirmed, halves
+from recrl.agents.algorithms.configs import CPOConfig
+from recrl.agents.config import TrustRegionConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.learning.advantages import reward_spread
 from recrl.agents.learning.batch import to_tensor
 from recrl.agents.learning.distributions import Distribution, mean_divergence
@@ -49,11 +47,11 @@ class LocalModel:
 
     def __init__(self, policy: StochasticPolicy, experience: Experience, advantages: Floats) -> None:
         self._policy, self._experience = policy, experience
-        self._advantages = experience.batch.per_decision(advantages)
+        self._advantages = experience.batch.per_pair(advantages)
 
     def gradients(self) -> Tensor:
         """The gradients of all surrogates at the policy as it is now, [1 + k, P]."""
-        now = self._policy.evaluate(self._experience.batch.rows)
+        now = self._policy.evaluate(self._experience.batch.unique_observations)
         surrogates = self._surrogates(now.distribution)
         return torch.stack([now.gradient(each, retain_graph=True).clone() for each in surrogates.unbind()])
 
@@ -77,8 +75,8 @@ class LocalModel:
     def measure(self) -> tuple[npt.NDArray[np.floating], float]:
         """Surrogates [1 + k] and mean KL of the policy as it is now, in nats."""
         batch = self._experience.batch
-        distribution = self._policy.distribution(batch.rows)
-        divergence = mean_divergence(self._experience.old, distribution, batch.row_weights)
+        distribution = self._policy.distribution(batch.unique_observations)
+        divergence = mean_divergence(self._experience.old, distribution, batch.observation_weights)
         return self._surrogates(distribution).numpy(force=True), float(divergence)
 
 
@@ -86,10 +84,8 @@ def constrained_step(
     policy: StochasticPolicy,
     experience: Experience,
     solve: Callable[[StepProblem], DualSolution],
-    config: LinearisedConstraintConfig,
+    config: TrustRegionConfig,
     generator: np.random.Generator,
-    *,
-    kept: KeptShares | None,
 ) -> dict[str, float]:
     """Take one step in the trust region, unless nothing is known about the constraints.
 
@@ -97,21 +93,16 @@ def constrained_step(
         policy: changed in place.
         experience: the samples.
         solve: the step of the linearised problem.
-        config: the trust region, conjugate gradients, line search and temperature.
+        config: the trust region, conjugate gradients and line search.
         generator: of the samples that the metric is evaluated on.
-        kept: with cross-fitting, what steps have kept of their promises; it learns from this one's.
 
     Returns:
-        The step's metrics; ``multiplier_i`` are in standard deviations of the reward's advantages; with
-        cross-fitting ``kept_share_i``, NaN where cost i has no limit.
+        The step's metrics; ``multiplier_i`` are in standard deviations of the reward's advantages.
     """
     constraints = experience.constraints
-    config = config.in_update(noisy=constraints.noisy)
-    multipliers, shares = (np.full_like(constraints.limits, NAN) for _ in range(2))
+    multipliers = np.full_like(constraints.limits, NAN)
     if not constraints.known:
         stayed = {"policy_steps": 0.0, "case": NAN, "line_search_steps": NAN, "step_norm": 0.0}
-        if kept is not None:
-            stayed |= indexed("kept_share", shares)
         return {**stayed, **indexed("multiplier", multipliers)}
     centred = experience.advantages - experience.advantages.mean(axis=0)
     centred[:, 0] /= reward_spread(centred)  # changes no step, only the unit of the multipliers
@@ -119,31 +110,12 @@ def constrained_step(
     active = ActiveConstraints.of(constraints)
     metric = model.metric(config, generator)
     problem, solved = linearise(model, active, metric, config)
-    problem = replace(problem, temperature=config.temperature)
-    if kept is not None and len(active.index):
-        signs = halves(len(centred), experience.num_envs)
-        contrast = LocalModel(policy, experience, centred[:, 1 + active.index] * signs[:, None])
-        contrasts = np.diag(solve_against(metric, contrast.gradients(), config)[1])
-        promised = np.diag(problem.gram)
-        shares[active.index] = kept.learn(active.index, promised, confirmed(promised, contrasts, signs))
-        problem = replace(problem, violations=at_face_value(problem.violations, shares[active.index]))
     solution = solve(problem)
     is_acceptable = acceptance(model, active, solution, config.target_kl)
-    metrics = line_search(policy.parameters, along(solution, solved), is_acceptable, config)
+    metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
     multipliers[:] = 0.0
     multipliers[active.index] = solution.multipliers
-    if kept is not None:
-        metrics |= indexed("kept_share", shares)
     return {**metrics, "case": float(solution.case), **indexed("multiplier", multipliers)}
-
-
-def at_face_value(violations: Floats, shares: Floats) -> Floats:
-    """What steps that keep a share of what they promise have to promise, [j]; a slack stays what it is.
-
-    >>> at_face_value(np.array([0.5, -0.5]), np.array([0.25, 0.25]))
-    array([ 2. , -0.5])
-    """
-    return np.where(violations > 0.0, violations / shares, violations)
 
 
 def linearise(
@@ -152,29 +124,20 @@ def linearise(
     """The step's problem reduced to products, and H^-1 g, H^-1 b_1, ..., H^-1 b_j, [1 + j, P]."""
     gradients = model.gradients()
     chosen = torch.cat([-gradients[:1], gradients[1 + torch.as_tensor(active.index)]])
-    solved, gram = solve_against(metric, chosen, config)
+    solved = torch.stack(
+        [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in chosen]
+    )
+    # u.H u for u = H^-1 v, as safety-starter-agents takes it, not v.u: where conjugate gradients have not
+    # converged, that is the true size of the step.
+    products = torch.stack([metric(direction) for direction in solved])
+    gram = (solved @ products.T).numpy(force=True).astype(np.float64)
+    require_finite("products of the trust region's directions", gram)
+    gram = 0.5 * (gram + gram.T)
     problem = StepProblem(gram[0, 0], gram[0, 1:], gram[1:, 1:], active.violations, config.target_kl)
     return problem, solved
 
 
-def solve_against(
-    metric: FisherMetric, vectors: Tensor, config: TrustRegionConfig
-) -> tuple[Tensor, npt.NDArray[np.float64]]:
-    """H^-1 v_1, ..., H^-1 v_n of n vectors, [n, P], and their products in H, [n, n].
-
-    The products are u.H u for u = H^-1 v, as safety-starter-agents takes them, not v.u: where conjugate
-    gradients have not converged, that is the true size of the step.
-    """
-    solved = torch.stack(
-        [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in vectors]
-    )
-    products = torch.stack([metric(direction) for direction in solved])
-    gram = (solved @ products.T).numpy(force=True).astype(np.float64)
-    require_finite("products of the trust region's directions", gram)
-    return solved, 0.5 * (gram + gram.T)
-
-
-def along(solution: DualSolution, solved: Tensor) -> Tensor:
+def to_parameter_step(solution: DualSolution, solved: Tensor) -> Tensor:
     """The step x, [P], that a solution stands for; ``solved`` is as ``linearise`` gives it."""
     weights = np.concatenate([[solution.gradient_weight], solution.constraint_weights])
     return -to_tensor(weights) @ solved
@@ -215,18 +178,17 @@ def acceptance(
 class ConstrainedPolicyOptimisation:
     """The rule of ``cpo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
 
-    def __init__(self, config: CPOConfig, num_costs: int) -> None:
+    def __init__(self, config: CPOConfig) -> None:
         self._config = config
-        self._kept = KeptShares(num_costs) if config.cross_fitting else None
-        self.parts: dict[str, Stateful] = {"kept_shares": self._kept} if self._kept else {}
+        self.parts: dict[str, Stateful] = {}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one constrained trust-region step, unless nothing is known about the constraints."""
-        return constrained_step(policy, experience, solve_dual, self._config, generator, kept=self._kept)
+        return constrained_step(policy, experience, solve_dual, self._config, generator)
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh CPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: ConstrainedPolicyOptimisation(config, cmdp.num_costs))
+    """A fresh CPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: ConstrainedPolicyOptimisation(config))

@@ -20,9 +20,9 @@ complementarity problem. At the optimum it is 0: the reward pulls against costs 
 beyond a limit would only be taken back. Then a cost step mends the violation and no more, as Polyak (1967)
 steps down a violated constraint, and a reward step ends at the limit. Before, steps go as far beyond the
 limit on one side as on the other. A cost is at hand if the trust region reaches its limit. lambda is the
-``temperature``, in the same unit and for the same reason as that of ``trpo-lag``; 0 is the source's.
+``kl_price``, in the same unit and for the same reason as that of ``trpo-lag``; 0 is the source's.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, k
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, k
 costs, of which j have a finite limit.
 """
 
@@ -32,10 +32,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from recrl.agents.algorithms.cpo import LocalModel, along, linearise
-from recrl.agents.config import CRPOConfig
+from recrl.agents.algorithms.configs import CRPOConfig
+from recrl.agents.algorithms.cpo import LocalModel, linearise, to_parameter_step
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.learning.advantages import SMALLEST_STD, reward_spread
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.trust_region.cpo_dual import (
@@ -72,7 +72,7 @@ def step_down(problem: StepProblem, mended: int, config: CRPOConfig) -> DualSolu
     weights = np.zeros_like(problem.violations)
     if squared > NO_INFLUENCE:
         weights[mended] = np.sqrt(2.0 * problem.radius / squared)
-        if config.temperature > 0.0:
+        if config.kl_price > 0.0:
             beyond = overshoot(problem, config) * max(-float(problem.mixed[mended]), 0.0)
             weights[mended] = min(weights[mended], (float(problem.violations[mended]) + beyond) / squared)
     return DualSolution(StepCase.RECOVERY, 0.0, weights, np.full_like(weights, np.nan), (mended,))
@@ -83,7 +83,7 @@ def step_up(problem: StepProblem, config: CRPOConfig) -> DualSolution:
     nothing, size = np.zeros_like(problem.violations), 0.0
     if problem.squared_gradient > NO_INFLUENCE:
         size = float(np.sqrt(2.0 * problem.radius / problem.squared_gradient))
-        if config.temperature > 0.0:
+        if config.kl_price > 0.0:
             rises, slack = -problem.mixed, np.maximum(-problem.violations, 0.0)
             raised = rises > 0.0
             up_to_limit = float(np.min(slack[raised] / rises[raised], initial=np.inf))
@@ -92,14 +92,14 @@ def step_up(problem: StepProblem, config: CRPOConfig) -> DualSolution:
 
 
 def overshoot(problem: StepProblem, config: CRPOConfig) -> float:
-    """beta, how many times v a step goes beyond a limit, with a temperature above 0."""
+    """beta, how many times v a step goes beyond a limit, with a ``kl_price`` above 0."""
     squared = max(problem.squared_gradient, NO_INFLUENCE)
     reach = np.sqrt(2.0 * problem.radius * np.diag(problem.gram))
     at_hand = np.flatnonzero(-problem.violations <= reach)
     rises = -problem.mixed[at_hand]
     weights = projection_weights(problem.gram[np.ix_(at_hand, at_hand)], rises)
     taken = 0.0 if weights is None else float(rises @ weights)
-    return float(np.sqrt(max(1.0 - taken / squared, 0.0))) / (2.0 * config.temperature)
+    return float(np.sqrt(max(1.0 - taken / squared, 0.0))) / (2.0 * config.kl_price)
 
 
 class ConstraintRectifiedPolicyOptimisation:
@@ -114,7 +114,7 @@ class ConstraintRectifiedPolicyOptimisation:
     ) -> dict[str, float]:
         """Take one step up the reward or down a violated cost, unless nothing is known of the constraints."""
         constraints = experience.constraints
-        config = self._config.in_update(noisy=constraints.noisy)
+        config = self._config
         if not constraints.known:
             stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
             return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
@@ -132,7 +132,7 @@ class ConstraintRectifiedPolicyOptimisation:
             solution = step_down(problem, int(np.searchsorted(active.index, mended)), config)
             multipliers[mended] = np.inf  # as if this constraint were all that counts
         is_acceptable = improvement(model, mended, config.target_kl)
-        metrics = line_search(policy.parameters, along(solution, solved), is_acceptable, config)
+        metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
         return {**metrics, **indexed("multiplier", multipliers)}
 
 
@@ -149,5 +149,5 @@ def improvement(model: LocalModel, mended: int | None, target_kl: float) -> Call
 
 
 def make_crpo(cmdp: CMDPSpec, config: CRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh CRPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: ConstraintRectifiedPolicyOptimisation(config))
+    """A fresh CRPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: ConstraintRectifiedPolicyOptimisation(config))

@@ -6,15 +6,15 @@ network is drawn towards it. Up to constants, climbing
     mean over samples of 1[KL(s) <= delta] (ratio (A_r - sum_i nu_i A_i) / lam - KL(s)),
     KL(s) = KL(pi(. | s) || pi_old(. | s)),
 
-does that. lam, the temperature, is an option, in standard deviations of the reward advantages, and the
-multipliers nu move by a rule of ``recrl.agents.constraints.multiplier_rules``; the paper's is projected
-ascent up to 2. Here, as in ``ppo-lag``, the penalised advantage is divided by 1 + sum_i nu_i, so that a large
-multiplier does not make the policy jump; lam keeps its meaning where no constraint binds.
+does that. lam, the paper's temperature, is the option ``focops_lambda``, in standard deviations of the reward
+advantages. The multipliers nu move by a rule of ``recrl.agents.constraints.multiplier_rules``; the paper's is
+projected ascent up to 2. Here, as in ``ppo-lag``, the penalised advantage is divided by 1 + sum_i nu_i, so
+that a large multiplier does not make the policy jump; lam keeps its meaning where no constraint binds.
 
 The source stops when the mean KL is past delta; but the step that went past stands, and one Adam step may
 double the KL. So, ours, it is taken back as far as it went past: ``trust_region: kept``.
 
-Letters: N samples, U rows, D decisions, k costs, P parameters.
+Notation: N samples, U rows, D unique pairs, k costs, P parameters.
 """
 
 from __future__ import annotations
@@ -25,37 +25,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.config import FOCOPSConfig
+from recrl.agents.algorithms.configs import FOCOPSConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.distributions import Distribution, mean_divergence
-from recrl.agents.learning.gradient_ascent import Objective, climb
-from recrl.agents.learning.networks import Adam
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
 def projection_objective(
-    experience: Experience, advantages: Floats, *, temperature: float, radius: float
+    experience: Experience, advantages: Floats, *, focops_lambda: float, radius: float
 ) -> Objective:
     """What draws the policy towards pi*: the module's formula.
 
     Args:
         experience: the samples, and pi_old at their rows.
         advantages: of the Lagrangian, of all samples of the rollout, [N].
-        temperature: lam, above 0.
+        focops_lambda: lam, above 0.
         radius: delta, nats; rows that have moved further pull no more.
     """
     batch, old = experience.batch, experience.old
-    pull = batch.per_decision(advantages / temperature)
+    pull = batch.per_pair(advantages / focops_lambda)
 
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
         assert type(now) is type(old)
         divergence = now.divergence(old)  # type: ignore[arg-type]
         near = (divergence.detach() <= radius).to(divergence.dtype)
-        near_decisions = near if batch.decision_rows is None else near[batch.decision_rows]
-        return torch.dot(ratios * near_decisions, pull) - torch.dot(batch.row_weights * near, divergence)
+        near_decisions = near if batch.pair_observations is None else near[batch.pair_observations]
+        return torch.dot(ratios * near_decisions, pull) - torch.dot(
+            batch.observation_weights * near, divergence
+        )
 
     return objective
 
@@ -72,41 +73,46 @@ def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, r
         radius: delta, nats.
     """
     batch = experience.batch
-    divergence = float(mean_divergence(experience.old, policy.distribution(batch.rows), batch.row_weights))
+    divergence = float(
+        mean_divergence(
+            experience.old, policy.distribution(batch.unique_observations), batch.observation_weights
+        )
+    )
     if divergence > radius:
         policy.parameters.values.lerp_(start, 1.0 - (radius / divergence) ** 0.5)
 
 
-class FirstOrderConstrainedOptimisation:
+class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
     """The rule of ``focops``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
 
     def __init__(self, config: FOCOPSConfig, policy: StochasticPolicy, num_costs: int) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        super().__init__(config, policy)
         self._multipliers = Multipliers(config, num_costs)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser, "multipliers": self._multipliers}
+        self.parts["multipliers"] = self._multipliers
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
-        config = self._config.in_update(noisy=experience.constraints.noisy)
+        config = self._config
         start = policy.parameters.values.clone()
         penalty = self._multipliers.update(experience)
         objective = partial(
             projection_objective,
             advantages=penalty.advantages,
-            temperature=config.temperature,
+            focops_lambda=config.focops_lambda,
             radius=config.target_kl,
         )
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         if config.trust_region == "kept":
             keep_near(policy, experience, start, config.target_kl)
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 
 def make_focops(cmdp: CMDPSpec, config: FOCOPSConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh FOCOPS student."""
-    return fresh_student(
+    """A fresh FOCOPS agent."""
+    return fresh_agent(
         cmdp, config, seed, lambda policy: FirstOrderConstrainedOptimisation(config, policy, cmdp.num_costs)
     )

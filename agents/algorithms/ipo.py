@@ -17,8 +17,8 @@ where there is no slack: there phi goes on along its tangent (Kervadec et al. 20
 so that a violated constraint is an exact penalty with the factor kappa. All advantages and c are in standard
 deviations of the reward's advantages, so that kappa is in reward per unit of cost, as multipliers are.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, D
-decisions, k costs.
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
+pairs, k costs.
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.config import IPOConfig
+from recrl.agents.algorithms.configs import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.batch import LearningBatch, to_tensor
-from recrl.agents.learning.gradient_ascent import Objective, climb, with_prices
-from recrl.agents.learning.networks import Adam
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import (
     SignedAdvantages,
@@ -66,11 +65,11 @@ def relief_of(batch: LearningBatch, costs: Floats, config: IPOConfig) -> Callabl
     if config.cost_surrogate == "pessimistic":
         split = [SignedAdvantages.split(batch, -column) for column in costs.T]
         return partial(pessimistic_relief, relief=split, clip=config.clip)
-    per_decision = batch.per_decision(-costs)
-    return lambda ratios: surrogate(ratios - 1.0, per_decision)
+    per_pair = batch.per_pair(-costs)
+    return lambda ratios: surrogate(ratios - 1.0, per_pair)
 
 
-def barrier_gain(
+def barrier_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, violations: Floats, config: IPOConfig
 ) -> Callable[[Tensor], tuple[Tensor, float]]:
     """The module's formula, a function of the ratios, with the sum of the barriers' slopes.
@@ -90,21 +89,16 @@ def barrier_gain(
     shape = partial(barrier, sharpness=config.barrier_sharpness, slope=config.barrier_slope)
     relief = relief_of(batch, costs, config)
 
-    def gain(ratios: Tensor) -> tuple[Tensor, float]:
+    def surrogate_objective(ratios: Tensor) -> tuple[Tensor, float]:
         slack = relief(ratios) - offsets
         charged = slopes(slack.detach().numpy(force=True), config)
         return clipped_surrogate(ratios, signed, config.clip) + shape(slack).sum(), float(charged.sum())
 
-    return gain
+    return surrogate_objective
 
 
-class InteriorPointPolicyOptimisation:
+class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
     """The rule of ``ipo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
-
-    def __init__(self, config: IPOConfig, policy: StochasticPolicy) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
@@ -116,14 +110,16 @@ class InteriorPointPolicyOptimisation:
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:
-            return with_prices(barrier_gain(part.batch, rewards, costs, violations, config))
+            return with_prices(barrier_surrogate_objective(part.batch, rewards, costs, violations, config))
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         multipliers = np.zeros_like(constraints.limits)
         multipliers[ActiveConstraints.of(constraints).index] = slopes(-violations, config)
         return {**metrics, **indexed("multiplier", multipliers)}
 
 
 def make_ipo(cmdp: CMDPSpec, config: IPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh IPO student."""
-    return fresh_student(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))
+    """A fresh IPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))

@@ -9,8 +9,8 @@ mean of max(ratio A_i, clip(ratio) A_i). The penalty is exact: if kappa exceeds 
 constrained problem, both have the same optimum, and nothing has to adapt. All advantages and c are divided by
 the standard deviation of the reward's, so that kappa is in reward per unit of cost, as multipliers are.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Letters: N samples, D
-decisions, k costs.
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
+pairs, k costs.
 """
 
 from __future__ import annotations
@@ -21,18 +21,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.config import P3OConfig
+from recrl.agents.algorithms.configs import P3OConfig
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.batch import LearningBatch, to_tensor
-from recrl.agents.learning.gradient_ascent import Objective, climb, with_prices
-from recrl.agents.learning.networks import Adam
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
-def penalised_gain(
+def penalised_surrogate_objective(
     batch: LearningBatch,
     rewards: Floats,
     costs: Floats,
@@ -58,21 +57,16 @@ def penalised_gain(
     relief = [SignedAdvantages.split(batch, -column) for column in costs.T]
     offsets = to_tensor(violations)
 
-    def gain(ratios: Tensor) -> tuple[Tensor, float]:
+    def surrogate_objective(ratios: Tensor) -> tuple[Tensor, float]:
         excess = torch.relu(offsets - pessimistic_relief(ratios, relief, clip))
         value = clipped_surrogate(ratios, signed, clip) - factor * excess.sum()
         return value, factor * float((excess.detach() > 0.0).sum())
 
-    return gain
+    return surrogate_objective
 
 
-class PenalisedProximalPolicyOptimisation:
+class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
     """The rule of ``p3o``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
-
-    def __init__(self, config: P3OConfig, policy: StochasticPolicy) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
@@ -84,18 +78,18 @@ class PenalisedProximalPolicyOptimisation:
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:
-            gain = penalised_gain(
+            surrogate_objective = penalised_surrogate_objective(
                 part.batch, rewards, costs, violations, clip=config.clip, factor=config.penalty_factor
             )
-            return with_prices(gain)
+            return with_prices(surrogate_objective)
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         multipliers = np.where(constraints.gaps > 0.0, config.penalty_factor, 0.0)
         return {**metrics, **indexed("multiplier", multipliers)}
 
 
 def make_p3o(cmdp: CMDPSpec, config: P3OConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh P3O student."""
-    return fresh_student(
-        cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy)
-    )
+    """A fresh P3O agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy))

@@ -11,11 +11,9 @@ The optimum is x = y - sum_i nu_i w_i, where nu >= 0 solves the complementarity 
 
 for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far from feasible is far from it
 too: the paper bounds the damage, here the step is scaled back into the trust region. Then it is shortened by
-``cpo``'s line search, which the paper leaves out. With a temperature T (ours, as in ``cpo``) the reward's
-step ends with the gain: y = -min(sqrt(2 delta / q), 1 / T) v.
+``cpo``'s line search, which the paper leaves out.
 
-If no episode finished, nothing is known about the constraints and the policy stays. With ``cross_fitting`` c
-is what steps that keep a share of their promises have to promise, and nu grows with it. Letters: N samples, k
+If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, k
 costs, P parameters.
 """
 
@@ -23,11 +21,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from recrl.agents.algorithms.configs import PCPOConfig
 from recrl.agents.algorithms.cpo import constrained_step
-from recrl.agents.config import PCPOConfig
-from recrl.agents.constraints.cross_fitting import KeptShares
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student
+from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.trust_region.cpo_dual import (
     NO_INFLUENCE,
@@ -46,8 +43,6 @@ def projected_step(problem: StepProblem) -> DualSolution:
     """
     squared = problem.squared_gradient
     reach = float(np.sqrt(2.0 * problem.radius / squared)) if squared > NO_INFLUENCE else 0.0
-    if problem.temperature * reach > 1.0:
-        reach = 1.0 / problem.temperature
     excesses = problem.violations - reach * problem.mixed
     weights = projection_weights(problem.gram, excesses)
     if weights is None:
@@ -69,23 +64,17 @@ def projected_step(problem: StepProblem) -> DualSolution:
 class ProjectionBasedConstrainedPolicyOptimisation:
     """The rule of ``pcpo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
 
-    def __init__(self, config: PCPOConfig, num_costs: int) -> None:
+    def __init__(self, config: PCPOConfig) -> None:
         self._config = config
-        self._kept = KeptShares(num_costs) if config.cross_fitting else None
-        self.parts: dict[str, Stateful] = {"kept_shares": self._kept} if self._kept else {}
+        self.parts: dict[str, Stateful] = {}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one projected step, unless nothing is known about the constraints."""
-        return constrained_step(policy, experience, projected_step, self._config, generator, kept=self._kept)
+        return constrained_step(policy, experience, projected_step, self._config, generator)
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PCPO student."""
-    return fresh_student(
-        cmdp,
-        config,
-        seed,
-        lambda _: ProjectionBasedConstrainedPolicyOptimisation(config, cmdp.num_costs),
-    )
+    """A fresh PCPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))

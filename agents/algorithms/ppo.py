@@ -1,7 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017): the control that knows no constraint.
 
 Its objective is the clipped surrogate of the standardised reward advantages. Costs are learnt and reported,
-as with every student, and change nothing; so do limits, and whether an episode finished.
+as with every agent, and change nothing; so do limits, and whether an episode finished.
 """
 
 from __future__ import annotations
@@ -10,24 +10,18 @@ from functools import partial
 
 import numpy as np
 
-from recrl.agents.config import PPOConfig
+from recrl.agents.algorithms.configs import PPOConfig
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.advantages import scaled_advantages
-from recrl.agents.learning.gradient_ascent import Objective, climb, with_entropy
-from recrl.agents.learning.networks import Adam
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate
 from recrl.environments.cmdp import CMDPSpec
 
 
-class ProximalPolicyOptimisation:
+class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
     """The rule of ``ppo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
-
-    def __init__(self, config: PPOConfig, policy: StochasticPolicy) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
@@ -38,13 +32,15 @@ class ProximalPolicyOptimisation:
 
         def objective(part: Experience) -> Objective:
             signed = SignedAdvantages.split(part.batch, rewards)
-            gain = partial(clipped_surrogate, advantages=signed, clip=config.clip)
-            return with_entropy(gain, part.batch, config.entropy_bonus)
+            surrogate_objective = partial(clipped_surrogate, advantages=signed, clip=config.clip)
+            return with_entropy(surrogate_objective, part.batch, config.entropy_bonus)
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 
 
 def make_ppo(cmdp: CMDPSpec, config: PPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PPO student."""
-    return fresh_student(cmdp, config, seed, lambda policy: ProximalPolicyOptimisation(config, policy))
+    """A fresh PPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: ProximalPolicyOptimisation(config, policy))

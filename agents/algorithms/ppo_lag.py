@@ -4,10 +4,10 @@ Multipliers first answer the gaps; then the policy climbs the penalised surrogat
 it has moved too far. If no episode finished, nothing is known about the constraints: the multipliers stay.
 
 The objective is (L_r - sum_i p_i L_i) / (1 + sum_i p_i), p the multipliers. ``separate`` clips the reward's
-surrogate only (the paper's students); ``combined`` clips the surrogate of the penalised advantage
+surrogate only (the paper's agents); ``combined`` clips the surrogate of the penalised advantage
 A_r - sum_i p_i A_i, so that the policy gains nothing from leaving the clip range for a cost's sake either.
 
-Letters: N samples, D decisions, k costs.
+Notation: N samples, D unique pairs, k costs.
 """
 
 from __future__ import annotations
@@ -17,20 +17,19 @@ from collections.abc import Callable
 import numpy as np
 from torch import Tensor
 
-from recrl.agents.config import PPOLagConfig
+from recrl.agents.algorithms.configs import PPOLagConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.advantages import penalised_advantages
 from recrl.agents.learning.batch import LearningBatch
-from recrl.agents.learning.gradient_ascent import Objective, climb, with_entropy
-from recrl.agents.learning.networks import Adam
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
-def combined_gain(
+def combined_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
 ) -> Callable[[Tensor], Tensor]:
     """The clipped surrogate of the penalised advantages, as a function of the ratios, [D].
@@ -46,28 +45,30 @@ def combined_gain(
     return lambda ratios: clipped_surrogate(ratios, penalised, clip)
 
 
-def separate_gain(
+def separate_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
 ) -> Callable[[Tensor], Tensor]:
-    """The reward's clipped surrogate minus the multiplied costs' surrogates; see ``combined_gain``."""
+    """The reward's clipped surrogate minus the multiplied costs' surrogates.
+
+    The arguments are those of ``combined_surrogate_objective``.
+    """
     weight = 1.0 / (1.0 + float(multipliers.sum()))
     signed = SignedAdvantages.split(batch, weight * rewards)
-    penalty = batch.per_decision(weight * (costs @ multipliers))
+    penalty = batch.per_pair(weight * (costs @ multipliers))
     return lambda ratios: clipped_surrogate(ratios, signed, clip) - surrogate(ratios, penalty)
 
 
 # By the name that the option ``penalty`` has.
-GAINS = {"combined": combined_gain, "separate": separate_gain}
+SURROGATE_OBJECTIVES = {"combined": combined_surrogate_objective, "separate": separate_surrogate_objective}
 
 
-class PPOLagrangian:
+class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
     """The rule of ``ppo-lag``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
 
     def __init__(self, config: PPOLagConfig, policy: StochasticPolicy, num_costs: int) -> None:
-        self._config = config
-        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        super().__init__(config, policy)
         self._multipliers = Multipliers(config, num_costs)
-        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser, "multipliers": self._multipliers}
+        self.parts["multipliers"] = self._multipliers
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
@@ -75,16 +76,20 @@ class PPOLagrangian:
         """Move the multipliers, then the policy."""
         config = self._config
         penalty = self._multipliers.update(experience)
-        gain_of = GAINS[config.penalty]
+        surrogate_objective_of = SURROGATE_OBJECTIVES[config.penalty]
 
         def objective(part: Experience) -> Objective:
-            gain = gain_of(part.batch, penalty.rewards, penalty.costs, penalty.multipliers, config.clip)
-            return with_entropy(gain, part.batch, config.entropy_bonus)
+            surrogate_objective = surrogate_objective_of(
+                part.batch, penalty.rewards, penalty.costs, penalty.multipliers, config.clip
+            )
+            return with_entropy(surrogate_objective, part.batch, config.entropy_bonus)
 
-        metrics = climb(policy, self._optimiser, experience, objective, config=config, generator=generator)
+        metrics = gradient_ascent(
+            policy, self._optimiser, experience, objective, config=config, generator=generator
+        )
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 
 def make_ppo_lag(cmdp: CMDPSpec, config: PPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PPO-Lagrangian student."""
-    return fresh_student(cmdp, config, seed, lambda policy: PPOLagrangian(config, policy, cmdp.num_costs))
+    """A fresh PPO-Lagrangian agent."""
+    return fresh_agent(cmdp, config, seed, lambda policy: PPOLagrangian(config, policy, cmdp.num_costs))

@@ -3,9 +3,9 @@
 One step an update, along H^-1 g and as long as the trust region allows, sqrt(2 delta / q) H^-1 g with
 q = g.H^-1 g (appendix C), shortened until the surrogate does not fall and the true KL is within delta. ``g``
 is the gradient of a surrogate and H the Hessian of the mean KL plus damping. With no finite limit, ``cpo``
-takes the same step, and with the same temperature (ours), which ends a step with the gain.
+takes the same step.
 
-Letters: N samples, k costs, P parameters, delta the trust region's size.
+Notation: N samples, k costs, P parameters, delta the trust region's size.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from recrl.agents.algorithms.configs import TRPOConfig
 from recrl.agents.algorithms.cpo import LocalModel
-from recrl.agents.config import TRPOConfig, TrustRegionConfig
+from recrl.agents.config import TrustRegionConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.learning.advantages import scaled_advantages
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.trust_region.line_search import conjugate_gradient, line_search
@@ -31,12 +32,12 @@ def step_up(
     config: TrustRegionConfig,
     generator: np.random.Generator,
     *,
-    temperature: float = 0.0,
+    kl_price: float = 0.0,
 ) -> dict[str, float]:
     """Take one trust-region step up the surrogate of some advantages, or none where they are all equal.
 
-    With a temperature lambda it solves max over x of g.x - lambda x.H x / 2 within x.H x / 2 <= delta, so it
-    is min(sqrt(2 delta / q), 1 / lambda) H^-1 g: shorter than the trust region where little is to be gained.
+    With a price lambda of the KL it solves max over x of g.x - lambda x.H x / 2 within x.H x / 2 <= delta, by
+    min(sqrt(2 delta / q), 1 / lambda) H^-1 g: shorter than the trust region where little is to be gained.
 
     Args:
         policy: changed in place.
@@ -44,12 +45,11 @@ def step_up(
         objective: the advantages to climb, [N].
         config: the trust region, conjugate gradients and line search.
         generator: of the samples that the metric is evaluated on.
-        temperature: lambda, what a nat must be worth, in the advantages' unit, at least 0.
+        kl_price: lambda, what a nat must be worth, in the advantages' unit, at least 0.
 
     Returns:
         The step's metrics.
     """
-    config = config.in_update(noisy=experience.constraints.noisy)
     model = LocalModel(policy, experience, objective[:, None])
     metric = model.metric(config, generator)
     gradient = model.gradients()[0]
@@ -58,7 +58,7 @@ def step_up(
     require_finite("the squared length of the trust region's direction", squared)
     if squared <= 0.0:
         return {"policy_steps": 0.0, "line_search_steps": float(config.backtrack_tries), "step_norm": 0.0}
-    direction.mul_(step_size(squared, config.target_kl, temperature))
+    direction.mul_(step_size(squared, config.target_kl, kl_price))
     before = model.start()
 
     def is_acceptable() -> bool:
@@ -68,19 +68,19 @@ def step_up(
     return line_search(policy.parameters, direction, is_acceptable, config)
 
 
-def step_size(squared: float, target_kl: float, temperature: float) -> float:
+def step_size(squared: float, target_kl: float, kl_price: float) -> float:
     """The factor on H^-1 g: min(sqrt(2 delta / q), 1 / lambda).
 
     Args:
         squared: q, above 0.
         target_kl: delta, nats.
-        temperature: lambda, at least 0.
+        kl_price: lambda, at least 0.
 
     >>> step_size(8.0, 0.01, 0.0), step_size(8.0, 0.01, 10.0), step_size(8.0, 0.01, 40.0)
     (0.05, 0.05, 0.025)
     """
     longest: float = (2.0 * target_kl / squared) ** 0.5
-    return longest if temperature * longest <= 1.0 else 1.0 / temperature
+    return longest if kl_price * longest <= 1.0 else 1.0 / kl_price
 
 
 class TrustRegionPolicyOptimisation:
@@ -95,12 +95,10 @@ class TrustRegionPolicyOptimisation:
     ) -> dict[str, float]:
         """Take one step up the reward's surrogate."""
         rewards, _ = scaled_advantages(experience.advantages)
-        metrics = step_up(
-            policy, experience, rewards, self._config, generator, temperature=self._config.temperature
-        )
+        metrics = step_up(policy, experience, rewards, self._config, generator)
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 
 
 def make_trpo(cmdp: CMDPSpec, config: TRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh TRPO student."""
-    return fresh_student(cmdp, config, seed, lambda _: TrustRegionPolicyOptimisation(config))
+    """A fresh TRPO agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: TrustRegionPolicyOptimisation(config))

@@ -5,20 +5,20 @@ Multipliers first answer the gaps; then the policy takes one trust-region step u
 
 At a saddle of the Lagrangian that surrogate has no gradient, but a step that always reaches the edge of the
 trust region is as long there as anywhere, and the policy swings about the limit for ever. So, ours, a nat of
-KL must be worth ``temperature`` in that surrogate, and steps end with the gain.
+KL must be worth ``kl_price`` in that surrogate, and steps end with the gain.
 
-Letters: N samples, k costs.
+Notation: N samples, k costs.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from recrl.agents.algorithms.configs import TRPOLagConfig
 from recrl.agents.algorithms.trpo import step_up
-from recrl.agents.config import TRPOLagConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_student, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.environments.cmdp import CMDPSpec
 
@@ -42,11 +42,11 @@ class TRPOLagrangian:
             penalty.advantages,
             self._config,
             generator,
-            temperature=self._config.temperature,
+            kl_price=self._config.kl_price,
         )
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 
 def make_trpo_lag(cmdp: CMDPSpec, config: TRPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh TRPO-Lagrangian student."""
-    return fresh_student(cmdp, config, seed, lambda _: TRPOLagrangian(config, cmdp.num_costs))
+    """A fresh TRPO-Lagrangian agent."""
+    return fresh_agent(cmdp, config, seed, lambda _: TRPOLagrangian(config, cmdp.num_costs))

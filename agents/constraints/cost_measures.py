@@ -10,12 +10,12 @@ minimises, a small change of the policy changes the CVaR as if nu were fixed (Ta
 
     c'_t = (max(S_{t+1} - nu, 0) - max(S_t - nu, 0)) / (1 - alpha),  S_t the episode's cost before step t,
 
-which sum to max(C - nu, 0) / (1 - alpha) over an episode: only cost beyond the quantile counts. So a student
+which sum to max(C - nu, 0) / (1 - alpha) over an episode: only cost beyond the quantile counts. So an agent
 of mean costs that is given c'_t for the costs, and nu + the mean of their sums for the mean episode cost,
 keeps the CVaR within the limit, whatever its algorithm.
 
 Where all episodes are about equally bad, no episode has cost beyond its quantile: the CVaR is flat there, and
-a student that violates its limit d could not leave (Greenberg et al. 2022). But the CVaR is at most d if and
+an agent that violates its limit d could not leave (Greenberg et al. 2022). But the CVaR is at most d if and
 only if nu + E[max(C - nu, 0)] / (1 - alpha) is, for some nu <= d. Hence nu is the value at risk or d,
 whichever is less; where the limit is kept, that is the value at risk.
 
@@ -24,7 +24,7 @@ is the best of those, and the critics are baselines that know the average S_t. W
 costs is therefore seen by the trace, not by the bootstrap: with ``cvar``, a ``cost_trace_decay`` near 1 is
 right. And only a share 1 - alpha of the episodes of an update counts: it needs many.
 
-Letters: T steps, B environments, k costs, E finished episodes, alpha the level, nu the value at risk.
+Notation: T steps, B environments, k costs, E finished episodes, alpha the level, nu the value at risk.
 """
 
 from __future__ import annotations
@@ -156,23 +156,15 @@ class RecentEpisodes:
 
 
 class MeanCost:
-    """The mean episode cost is constrained, or a bound above it; nothing is kept.
+    """The mean episode cost is constrained; nothing is kept."""
 
-    Args:
-        margin: so many standard errors of the mean are added to it.
-    """
-
-    def __init__(self, margin: float = 0.0) -> None:
-        self._margin = margin
-
-    def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
-        """See ``TailCost.judge``."""
+    def constraint_costs(
+        self, rollout: Rollout, episode_costs: Floats, limits: Floats
+    ) -> tuple[Floats, Floats]:
+        """See ``TailCost.constraint_costs``."""
         if not len(episode_costs):
             return rollout.costs, np.full(rollout.costs.shape[2], np.nan)
-        values = episode_costs.mean(axis=0)
-        if self._margin > 0.0:
-            values = values + self._margin * standard_errors(episode_costs)
-        return rollout.costs, values
+        return rollout.costs, episode_costs.mean(axis=0)
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing."""
@@ -194,7 +186,9 @@ class TailCost:
         self._level = level
         self._value_at_risk = np.zeros(num_costs)
 
-    def judge(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> tuple[Floats, Floats]:
+    def constraint_costs(
+        self, rollout: Rollout, episode_costs: Floats, limits: Floats
+    ) -> tuple[Floats, Floats]:
         """The costs to learn from, and what the limits are compared with.
 
         Args:

@@ -6,11 +6,11 @@ the constraint is violated) and returns the next state. A dimension whose limit 
 constraint: its multiplier is 0 and the rest of its state stands still.
 
 A state is a dict of float64 arrays [k], so that a checkpoint can hold it as it is; ``multipliers`` is in
-each. Letters: k costs.
+each. Notation: k costs.
 
 Which to use: ``projected_ascent`` alone is an integrator, and so it swings about the limit; the proportional
 term of ``pid`` damps it. Neither winds down below 0 nor remembers old violations, so both answer at once when
-the limit moves. ``softplus_adam`` winds down and remembers; it is kept because the paper's students use it.
+the limit moves. ``softplus_adam`` winds down and remembers; it is kept because the paper's agents use it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-import numpy.typing as npt
 
 from recrl.agents.learning.scales import quotient
 from recrl.environments.cmdp import Floats
@@ -115,7 +114,6 @@ def pid(
     integral: float | Floats,
     derivative: float | Floats,
     maximum: float,
-    geometric: bool = False,
 ) -> dict[str, Floats]:
     """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
 
@@ -131,9 +129,6 @@ def pid(
     sum up under a limit of 1, no 400 later ones can take back. So a violation counts no more than the best
     that can undo it.
 
-    ``geometric`` (ours) sums up in the logarithm of 1 + I: I <- (1 + I) exp(K_I min(gap, largest)) - 1. A
-    price that had to be high comes down by shares of itself, as it went up; near 0 it moves as without.
-
     Args:
         state: ``multipliers``, ``integral``, ``last_gap``.
         gaps: J - d in any unit, [k]; -inf where there is no constraint.
@@ -143,15 +138,11 @@ def pid(
         integral: K_I.
         derivative: K_D.
         maximum: the largest multiplier, possibly infinite.
-        geometric: whether the integral grows and falls by shares of 1 + I.
     """
     active = np.isfinite(gaps)
     gap = np.where(active, gaps, 0.0)
     rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
-    change = integral * np.minimum(gap, largest)
-    if geometric:
-        change = (1.0 + state["integral"]) * np.expm1(change)
-    summed = np.clip(state["integral"] + change, 0.0, maximum)
+    summed = np.clip(state["integral"] + integral * np.minimum(gap, largest), 0.0, maximum)
     output = np.clip(proportional * gap + summed + derivative * rise, 0.0, maximum)
     return {
         "multipliers": np.where(active, output, 0.0),
@@ -181,14 +172,7 @@ def relative_gaps(gaps: Floats, limits: Floats, standard_errors: Floats) -> Floa
     return np.where(active, quotient(np.where(active, gaps, 0.0), floors), -np.inf)
 
 
-def restarted(
-    state: MultiplierState, start: MultiplierState, which: npt.NDArray[np.bool_]
-) -> dict[str, Floats]:
-    """``state`` with the dimensions ``which``, [k], put back to ``start``."""
-    return {key: np.where(which, start[key], values) for key, values in state.items()}
-
-
-# How each rule begins, by the name that a student's options use.
+# How each rule begins, by the name that an agent's options use.
 STARTS: dict[str, Callable[[int, float], dict[str, Floats]]] = {
     "projected": start_projected_ascent,
     "softplus-adam": start_softplus_adam,

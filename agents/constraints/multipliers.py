@@ -9,8 +9,7 @@ running root mean square over all updates; the CMDP's own, in reward per unit of
 ``cost`` is the paper's: violations in episode cost, standardised reward advantages, raw cost advantages.
 
 If no episode finished, nothing is known about the constraints and the multipliers stay. A cost whose limit is
-infinite has the multiplier 0. With ``multiplier_waits`` nothing is summed up while the teacher adds noise or
-rewards entropy: what the agent could not have avoided would have to be undone later, update by update.
+infinite has the multiplier 0.
 
 Notation: N samples, k costs.
 """
@@ -23,14 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from recrl.agents.config import MultiplierConfig
+from recrl.agents.config import LagrangianConfig
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
     MultiplierState,
     pid,
     projected_ascent,
     relative_gaps,
-    restarted,
     softplus_adam,
 )
 from recrl.agents.experience import Constraints, Experience
@@ -72,14 +70,10 @@ class Multipliers:
         num_costs: k.
     """
 
-    def __init__(self, config: MultiplierConfig, num_costs: int) -> None:
-        self._start = STARTS[config.multiplier_rule](num_costs, config.multiplier_initial)
-        self._state: MultiplierState = self._start
+    def __init__(self, config: LagrangianConfig, num_costs: int) -> None:
+        self._state: MultiplierState = STARTS[config.multiplier_rule](num_costs, config.multiplier_initial)
         self._is_relative = config.multiplier_unit == "relative"
         self._step = multiplier_step(config)
-        self._noisy_step = without_sum(config) if config.multiplier_waits else self._step
-        self._restarts = config.multiplier_reset
-        self._last_limits = np.full(num_costs, np.nan)
         self._spreads = RunningScale(1 + num_costs)
 
     def update(self, experience: Experience) -> Penalty:
@@ -96,57 +90,39 @@ class Multipliers:
 
     def move(self, constraints: Constraints) -> Floats:
         """Move with the violations, unless they are unknown; return the multipliers in force, mu, [k]."""
-        if self._restarts:
-            changed = (constraints.limits != self._last_limits) & ~np.isnan(self._last_limits)
-            self._state = restarted(self._state, self._start, changed)
-        self._last_limits = constraints.limits.copy()
         if constraints.known:
-            step = self._noisy_step if constraints.noisy else self._step
             gaps = constraints.gaps
             if self._is_relative:
                 gaps = relative_gaps(gaps, constraints.limits, constraints.standard_errors)
-            self._state = step(self._state, gaps)
+            self._state = self._step(self._state, gaps)
         return np.where(np.isfinite(constraints.limits), self._state["multipliers"], 0.0)
 
     def state_dict(self) -> dict[str, Any]:
-        """The rule's state, the limits last seen, and the advantages' spreads."""
+        """The rule's state and the advantages' spreads."""
         return {
             "multipliers": {key: values.copy() for key, values in self._state.items()},
-            "last_limits": self._last_limits.copy(),
             "spreads": self._spreads.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         self._state = {key: np.array(values, np.float64) for key, values in state["multipliers"].items()}
-        self._last_limits = np.array(state["last_limits"], np.float64)
         self._spreads.load_state_dict(state["spreads"])
 
 
-def without_sum(config: MultiplierConfig) -> MultiplierRule:
-    """The multiplier rule that the options name, without what it sums up: PID's integral, or all of it."""
-    return pid_step(config, integral=0.0) if config.multiplier_rule == "pid" else lambda state, _: state
-
-
-def multiplier_step(config: MultiplierConfig) -> MultiplierRule:
+def multiplier_step(config: LagrangianConfig) -> MultiplierRule:
     """The multiplier rule that the options name, as a function of state and gaps."""
     step, maximum = config.multiplier_step, config.multiplier_maximum
     if config.multiplier_rule == "softplus-adam":
         return lambda state, gaps: softplus_adam(state, gaps, learning_rate=step)
     if config.multiplier_rule == "projected":
         return lambda state, gaps: projected_ascent(state, gaps, step_size=step, maximum=maximum)
-    return pid_step(config, integral=step)
-
-
-def pid_step(config: MultiplierConfig, *, integral: float) -> MultiplierRule:
-    """The PID rule with the options' gains, but for that of the integral."""
     return lambda state, gaps: pid(
         state,
         gaps,
         largest=1.0 if config.multiplier_unit == "relative" else np.inf,
         proportional=config.multiplier_proportional,
-        integral=integral,
+        integral=step,
         derivative=config.multiplier_derivative,
-        maximum=config.multiplier_maximum,
-        geometric=config.multiplier_geometric,
+        maximum=maximum,
     )

@@ -1,13 +1,13 @@
-"""What all students here have in common: a policy, 1 + k critics, and the walk of an update.
+"""What all agents here have in common: a policy, 1 + k critics, and the walk of an update.
 
-A student is an ``ActorCritic`` with a *rule* that improves the policy; PPO-Lagrangian and CPO are rules. An
+An agent is an ``ActorCritic`` with a *rule* that improves the policy; PPO-Lagrangian and CPO are rules. An
 update collapses the rollout, estimates advantages, lets the rule improve the policy, and fits the critics.
 
-A student lives on the device that was PyTorch's default one when it was made (``with torch.device("cuda")``):
+An agent lives on the device that was PyTorch's default one when it was made (``with torch.device("cuda")``):
 there it learns, with equal initial parameters on all. Rollouts come, and actions go, as NumPy arrays.
 
-Letters: T steps, B environments, N = T B samples, k costs, C = 1 + k signals, U distinct rows, M truncated
-steps, E finished episodes.
+Notation: T steps, B environments, N = T B samples, k costs, C = 1 + k signals, U unique observations, M
+truncated steps, E finished episodes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -25,24 +25,26 @@ import torch
 from torch import Tensor
 
 from recrl.agents.agent import Rollout
-from recrl.agents.config import StudentConfig
+from recrl.agents.config import ActorCriticConfig
 from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, TailCost
 from recrl.agents.encoding import Encoder
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import generalised_advantages, next_values
 from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.distributions import mean_divergence
-from recrl.agents.learning.networks import INITIALISERS, Adam, Critics, NetworkForm
+from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.agents.learning.surrogates import surrogate
 from recrl.agents.spaces import observation_size
-from recrl.environments.cmdp import CMDPSpec, Floats
+from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
+from recrl.environments.plugins import trusted_attribute
 
 
 class Stateful(Protocol):
-    """Something that is saved and restored with a student."""
+    """Something that is saved and restored with an agent."""
 
     def state_dict(self) -> dict[str, Any]:
         """All it has learnt and adapted: a tree of dicts, lists, JSON scalars and NumPy arrays."""
@@ -54,7 +56,7 @@ class Stateful(Protocol):
 
 
 class PolicyRule(Protocol):
-    """How a student's policy gets better: what tells the algorithms apart."""
+    """How an agent's policy gets better: what tells the algorithms apart."""
 
     @property
     def parts(self) -> Mapping[str, Stateful]:
@@ -69,7 +71,7 @@ class PolicyRule(Protocol):
         Args:
             policy: the one that collected the samples; changed in place.
             experience: the samples, raw advantages, and how the constraints stand.
-            generator: the student's own randomness.
+            generator: the agent's own randomness.
 
         Returns:
             Metrics, the same keys every time: ``policy_steps``, ``multiplier_i``, and the rule's own.
@@ -95,24 +97,24 @@ def improve_and_measure(
     """
     metrics = rule.improve(policy, experience, generator)
     batch, advantages = experience.batch, experience.advantages
-    new = policy.distribution(batch.rows)
-    centred = batch.per_decision(advantages - advantages.mean(axis=0))
+    new = policy.distribution(batch.unique_observations)
+    centred = batch.per_pair(advantages - advantages.mean(axis=0))
     gains = surrogate(experience.ratios(new), centred).numpy(force=True)
     return {
         **metrics,
-        "kl": float(mean_divergence(experience.old, new, batch.row_weights)),
-        "entropy": float(torch.dot(batch.row_weights, new.entropy())),
+        "kl": float(mean_divergence(experience.old, new, batch.observation_weights)),
+        "entropy": float(torch.dot(batch.observation_weights, new.entropy())),
         "surrogate_reward": float(gains[0]),
         **indexed("surrogate_cost", gains[1:]),
     }
 
 
 class ActorCritic:
-    """A student; see ``recrl.agents.agent.Agent`` for what its methods promise.
+    """An agent; see ``recrl.agents.agent.Agent`` for what its methods promise.
 
     Args:
         cmdp: what the task fixes.
-        config: the settings that students share.
+        config: the settings that agents share.
         encoder: of the observations that policy and critics see.
         policy: of the encoded observations and the task's actions.
         critics: of the reward and the k costs.
@@ -120,10 +122,12 @@ class ActorCritic:
         generator: of the minibatches.
     """
 
+    learns_rewarded_entropy: ClassVar[bool] = True
+
     def __init__(
         self,
         cmdp: CMDPSpec,
-        config: StudentConfig,
+        config: ActorCriticConfig,
         *,
         encoder: Encoder,
         policy: StochasticPolicy,
@@ -141,12 +145,8 @@ class ActorCritic:
         self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
-        self._noisy = False
-        self._temperature = 0.0
         self._form = (
-            TailCost(config.cvar_level, cmdp.num_costs)
-            if config.constraint == "cvar"
-            else MeanCost(config.limit_margin)
+            TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
         )
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,
@@ -173,36 +173,37 @@ class ActorCritic:
         """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
         return self._policy.probabilities(self._encoder(observations))
 
-    def update(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
+    def update(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
         """Improve the policy by the rule, then fit the critics to the rollout.
 
         Raises:
             DivergedError: a reward, a loss or a parameter is not finite.
         """
         with self._on_its_device():
-            metrics = self._learn(rollout, episode_costs, limits)
-        self._noisy, self._temperature = False, 0.0
+            metrics = self._learn(rollout, episode_costs, step)
         self._policy.publish()
         require_finite("policy parameters", self._policy.parameters.to_numpy())
         require_finite("critic parameters", self._critics.parameters.to_numpy())
         return metrics
 
-    def _learn(self, rollout: Rollout, episode_costs: Floats, limits: Floats) -> dict[str, float]:
-        config = self._config
+    def _learn(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
+        config, limits = self._config, step.limits.array
         observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
         actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
-        batch = LearningBatch.gather(
-            self._encoder(observations), actions, compact=config.compaction, most_rows=config.minibatch_size
+        batch = LearningBatch.deduplicate(
+            self._encoder(observations),
+            actions,
+            compact=config.compaction,
+            most_observations=config.minibatch_size,
         )
         recent_costs, lengths = self._recent.add(episode_costs, rollout.finished_lengths())
-        costs, constrained = self._form.judge(rollout, recent_costs, limits)
+        costs, constrained = self._form.constraint_costs(rollout, recent_costs, limits)
         estimates = self._estimate(rollout, costs, batch)
         advantages = estimates.advantages
-        constraints = Constraints.measure(recent_costs, lengths, constrained, limits, noisy=self._noisy)
-        num_envs = rollout.rewards.shape[1]
-        experience = Experience.of(self._policy, batch, advantages, constraints, num_envs)
-        if self._temperature > 0.0:
-            experience = experience.with_entropy(self._temperature)
+        constraints = Constraints.measure(recent_costs, lengths, constrained, limits)
+        experience = Experience.of(self._policy, batch, advantages, constraints)
+        if step.entropy_coefficient:
+            experience = experience.with_entropy(step.entropy_coefficient)
         metrics = {
             **improve_and_measure(self._rule, self._policy, experience, self._generator),
             **indexed("cost_gap", constraints.gaps),
@@ -230,7 +231,7 @@ class ActorCritic:
                 trace_decays=np.ones(signals.shape[2]),
             )
             self._value_scale.add((first_returns**2).mean(axis=(0, 1)))
-        values = batch.per_sample(self._values(batch.rows)).reshape(signals.shape)
+        values = batch.per_sample(self._values(batch.unique_observations)).reshape(signals.shape)
         beyond = np.concatenate([rollout.final_observations, rollout.last_observations])
         beyond_values = self._values(torch.as_tensor(self._encoder(beyond)))
         num_final = len(rollout.final_observations)
@@ -296,7 +297,10 @@ class ActorCritic:
         losses = []
         for part in islice(batch.parts(config.minibatch_size, self._generator), steps):
             means, spread = regression_on(part)
-            losses.append(self._critics.differentiate(part.rows, part.row_weights, means) + spread)
+            losses.append(
+                self._critics.differentiate(part.unique_observations, part.observation_weights, means)
+                + spread
+            )
             self._critic_optimiser.step()
         mean = torch.stack(losses[-num_parts:]).mean(dim=0).numpy(force=True) * scale**2
         require_finite("value losses", mean)
@@ -306,14 +310,9 @@ class ActorCritic:
         """Make the policy more random once; see ``recrl.agents.learning.noise``."""
         with self._on_its_device():
             metrics = self._policy.add_noise(noise, self._encoder(observations), self._config.noise_form)
-        self._noisy = True
         self._policy.publish()
         require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
         return metrics
-
-    def reward_entropy(self, temperature: float) -> None:
-        """In the next update, count the entropy of the policy as reward; see ``Experience.with_entropy``."""
-        self._noisy, self._temperature = True, temperature
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, generator, and the state of every part."""
@@ -321,8 +320,6 @@ class ActorCritic:
             "policy": self._policy.parameters.to_numpy(),
             "critics": self._critics.parameters.to_numpy(),
             "generator": self._generator.bit_generator.state,
-            "noisy": self._noisy,
-            "temperature": self._temperature,
             **{name: part.state_dict() for name, part in self._parts.items()},
         }
 
@@ -332,8 +329,6 @@ class ActorCritic:
         self._policy.publish()
         self._critics.parameters.load(state["critics"])
         self._generator.bit_generator.state = state["generator"]
-        self._noisy = bool(state.get("noisy", False))  # earlier checkpoints lack both
-        self._temperature = float(state.get("temperature", 0.0))
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
 
@@ -387,25 +382,25 @@ def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
     Returns:
         The mean targets, [C, U], and the spread, [C].
     """
-    sums = batch.per_row(targets)
-    shares = batch.row_weights.numpy(force=True).astype(np.float64)[:, None]
+    sums = batch.per_observation(targets)
+    shares = batch.observation_weights.numpy(force=True).astype(np.float64)[:, None]
     spread = np.mean(batch.own(targets) ** 2, axis=0) - np.sum(sums**2 / shares, axis=0)
     return to_tensor((sums / shares).T.copy()), to_tensor(np.maximum(spread, 0.0))
 
 
-def fresh_student(
+def fresh_agent(
     cmdp: CMDPSpec,
-    config: StudentConfig,
+    config: ActorCriticConfig,
     seed: np.random.SeedSequence,
     make_rule: Callable[[StochasticPolicy], PolicyRule],
 ) -> ActorCritic:
-    """A student before its first update; the same seed gives all with the same networks the same policy.
+    """An agent before its first update; the same seed gives all with the same networks the same policy.
 
     Args:
         cmdp: what the task fixes.
-        config: the student's settings.
+        config: the agent's settings.
         seed: of the initial parameters and of the order of minibatches.
-        make_rule: the student's rule for a policy.
+        make_rule: the agent's rule for a policy.
     """
     generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
     encoder = Encoder(
@@ -414,7 +409,12 @@ def fresh_student(
         scales=config.proximity_scales if config.encoder == "proximity" else (),
         normalise=config.normalise_observations,
     )
-    form = NetworkForm(config.hidden_sizes, INITIALISERS[config.initialisation])
+    form = NetworkForm(
+        config.hidden_sizes,
+        INITIALISERS[config.initialisation],
+        config.activation,
+        None if config.network is None else trusted_attribute(config.network),
+    )
     policy = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
     critics = Critics(encoder.size, cmdp.num_costs, form, generator)
     order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))

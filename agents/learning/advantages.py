@@ -1,6 +1,6 @@
 """Generalised advantage estimation for the reward and every cost at once, and the units of the estimates.
 
-Letters: T steps, B environments, N = T B samples, C = 1 + k signals (the reward, then the k costs), M
+Notation: T steps, B environments, N = T B samples, C = 1 + k signals (the reward, then the k costs), M
 truncated steps, gamma the discount, lambda the trace decay.
 """
 

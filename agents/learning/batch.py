@@ -1,16 +1,16 @@
 """From a rollout to what learning needs: repeated observations evaluated once, distinct ones by minibatches.
 
 On a tabular task a rollout of thousands of samples holds a few hundred distinct observations. Networks are
-then evaluated on the distinct *rows*, and everything that is summed over samples is summed by row, or by
-*decision* (distinct pair of row and discrete action), beforehand. This is exact, not an approximation: a
-mean over samples of a function of the row is a weighted mean over rows; squared errors about several
-targets of one row are those about the targets' mean plus a constant; and a clipped surrogate, which depends
-on an advantage's sign, is linear in the positive and in the negative advantages of a decision. Where rows do
-not repeat, every sample is its own row and decision, and the same formulas hold; such a batch can be parted
-into minibatches.
+then evaluated on the *unique observations* (rows), and everything that is summed over samples is summed by
+row, or by *pair* (unique pair of row and discrete action), beforehand. This is exact, not an approximation: a
+mean over samples of a function of the row is a weighted mean over rows; squared errors about several targets
+of one row are those about the targets' mean plus a constant; and a clipped surrogate, which depends on an
+advantage's sign, is linear in the positive and in the negative advantages of a pair. Where rows do not
+repeat, every sample is its own row and pair, and the same formulas hold; such a batch can be parted into
+minibatches.
 
-Letters: N samples of a rollout, U distinct rows, D decisions, n observation components, k costs, C = 1 + k
-signals.
+Notation: N samples of a rollout, U unique observations, D unique pairs, n observation components, k costs, C
+= 1 + k signals.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ WORTHWHILE_SHARE = 0.5
 Indices = npt.NDArray[np.int64]
 
 
-def distinct_rows(
+def find_repeated(
     observations: npt.NDArray[np.float32], most: int | None = None
 ) -> tuple[Indices, Indices] | None:
     """Find equal rows, by a 64-bit hash that is then checked against the rows themselves.
 
     Args:
         observations: [N, n].
-        most: distinct rows that are of use, at least 1; any number if None.
+        most: unique observations that are of use, at least 1; any number if None.
 
     Returns:
         The first sample of each distinct row, [U], and the row of each sample, [N]; or None if rows seldom
@@ -83,34 +83,34 @@ def to_tensor(values: Floats) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class LearningBatch:
-    """The samples of a rollout, with repeated observations and decisions collapsed; or a minibatch of them.
+    """The samples of a rollout, with repeated observations and pairs collapsed; or a minibatch of them.
 
     Attributes:
-        rows: distinct observations, float32 [U, n].
-        row_weights: share of the samples at each, [U], summing to 1.
-        actions: the action of each decision, int64 [D] or float32 [D, m].
-        decision_rows: the row of each decision, int64 [D], or None if decision i is at row i.
-        row_of_sample: [N], or None if each sample is its own row.
-        decision_of_sample: [N], or None if each sample is its own decision.
+        unique_observations: distinct observations, float32 [U, n].
+        observation_weights: share of the samples at each, [U], summing to 1.
+        actions: the action of each pair, int64 [D] or float32 [D, m].
+        pair_observations: the row of each pair, int64 [D], or None if pair i is at row i.
+        observation_of_sample: [N], or None if each sample is its own row.
+        pair_of_sample: [N], or None if each sample is its own pair.
         samples: of a minibatch, the samples of the rollout that it has, [U]; None if it has all.
     """
 
-    rows: Tensor
-    row_weights: Tensor
+    unique_observations: Tensor
+    observation_weights: Tensor
     actions: Tensor
-    decision_rows: Tensor | None
-    row_of_sample: Indices | None
-    decision_of_sample: Indices | None
+    pair_observations: Tensor | None
+    observation_of_sample: Indices | None
+    pair_of_sample: Indices | None
     samples: Indices | None = None
 
     @classmethod
-    def gather(
+    def deduplicate(
         cls,
         observations: npt.NDArray[np.float32],
         actions: npt.NDArray[Any],
         *,
         compact: bool,
-        most_rows: int | None = None,
+        most_observations: int | None = None,
     ) -> LearningBatch:
         """Collapse N samples.
 
@@ -118,9 +118,9 @@ class LearningBatch:
             observations: [N, n].
             actions: int64 [N] or float32 [N, m].
             compact: whether to look for repeated rows at all.
-            most_rows: leave the samples as they are if more rows than this are distinct.
+            most_observations: leave the samples as they are if more rows than this are distinct.
         """
-        found = distinct_rows(observations, most_rows) if compact else None
+        found = find_repeated(observations, most_observations) if compact else None
         if found is None:
             share = torch.full((len(observations),), 1.0 / len(observations))
             return cls(torch.as_tensor(observations), share, torch.as_tensor(actions), None, None, None)
@@ -130,15 +130,15 @@ class LearningBatch:
         if actions.ndim > 1:
             return cls(rows, weights, torch.as_tensor(actions), torch.as_tensor(row), row, None)
         num_actions = int(actions.max()) + 1
-        pairs, decision = np.unique(row * num_actions + actions, return_inverse=True)
+        pairs, pair = np.unique(row * num_actions + actions, return_inverse=True)
         taken, at = torch.as_tensor(pairs % num_actions), torch.as_tensor(pairs // num_actions)
-        return cls(rows, weights, taken, at, row, decision)
+        return cls(rows, weights, taken, at, row, pair)
 
     def num_parts(self, size: int | None) -> int:
         """How many minibatches of about ``size`` rows make a pass over the samples; one if rows repeat."""
-        if size is None or self.row_of_sample is not None:
+        if size is None or self.observation_of_sample is not None:
             return 1
-        return -(-len(self.rows) // size)
+        return -(-len(self.unique_observations) // size)
 
     def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[LearningBatch]:
         """Minibatches without end: passes over the samples, each in a new random order.
@@ -152,19 +152,19 @@ class LearningBatch:
             if num_parts == 1:
                 yield self
                 continue
-            for chosen in np.array_split(generator.permutation(len(self.rows)), num_parts):
+            for chosen in np.array_split(generator.permutation(len(self.unique_observations)), num_parts):
                 yield self.minibatch(chosen)
 
     def minibatch(self, samples: Indices) -> LearningBatch:
         """Some samples, [U], of a batch in which each sample is its own row."""
         index = torch.as_tensor(samples)
         return LearningBatch(
-            rows=self.rows.index_select(0, index),
-            row_weights=torch.full((len(samples),), 1.0 / len(samples)),
+            unique_observations=self.unique_observations.index_select(0, index),
+            observation_weights=torch.full((len(samples),), 1.0 / len(samples)),
             actions=self.actions.index_select(0, index),
-            decision_rows=None,
-            row_of_sample=None,
-            decision_of_sample=None,
+            pair_observations=None,
+            observation_of_sample=None,
+            pair_of_sample=None,
             samples=samples,
         )
 
@@ -175,25 +175,27 @@ class LearningBatch:
             most: rows to keep, at most; None for all.
             generator: of the draw; not used if all rows are kept.
         """
-        if most is None or len(self.rows) <= most:
-            return self.rows, self.row_weights
-        num_samples = len(self.rows if self.row_of_sample is None else self.row_of_sample)
+        if most is None or len(self.unique_observations) <= most:
+            return self.unique_observations, self.observation_weights
+        num_samples = len(
+            self.unique_observations if self.observation_of_sample is None else self.observation_of_sample
+        )
         drawn = generator.choice(num_samples, size=most, replace=False)
-        rows = drawn if self.row_of_sample is None else self.row_of_sample[drawn]
+        rows = drawn if self.observation_of_sample is None else self.observation_of_sample[drawn]
         kept, counts = np.unique(rows, return_counts=True)
-        return self.rows.index_select(0, torch.as_tensor(kept)), to_tensor(counts / most)
+        return self.unique_observations.index_select(0, torch.as_tensor(kept)), to_tensor(counts / most)
 
-    def per_row(self, samples: Floats) -> Floats:
+    def per_observation(self, samples: Floats) -> Floats:
         """Sums over the samples of each row, divided by N: [N] or [N, C] -> [U] or [U, C]."""
-        return by_group(self.own(samples), self.row_of_sample, len(self.rows))
+        return by_group(self.own(samples), self.observation_of_sample, len(self.unique_observations))
 
-    def per_decision(self, samples: Floats) -> Tensor:
-        """Sums over the samples of each decision, divided by N: [N] or [N, C] -> [D] or [D, C]."""
-        return to_tensor(by_group(self.own(samples), self.decision_of_sample, len(self.actions)))
+    def per_pair(self, samples: Floats) -> Tensor:
+        """Sums over the samples of each pair, divided by N: [N] or [N, C] -> [D] or [D, C]."""
+        return to_tensor(by_group(self.own(samples), self.pair_of_sample, len(self.actions)))
 
     def per_sample(self, values: Floats) -> Floats:
         """Hand each sample its row's values, [U, C] -> [N, C]."""
-        return values if self.row_of_sample is None else values[self.row_of_sample]
+        return values if self.observation_of_sample is None else values[self.observation_of_sample]
 
     def own(self, samples: Floats) -> Floats:
         """Those of the samples of a rollout, [N] or [N, C], that the batch has."""

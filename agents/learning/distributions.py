@@ -3,8 +3,8 @@
 Each knows its log-probabilities, its Kullback-Leibler divergence from another, its entropy, and the Fisher
 metric on its network's outputs, which is the Hessian of that divergence at the distribution itself.
 
-Letters: U distinct rows, D decisions (distinct (row, action) pairs; every sample is one if nothing repeats),
-A actions, m action components.
+Notation: U unique observations, D unique pairs (of row and action; every sample is one if nothing
+repeats), A actions, m action components.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Categorical:
     log_probs: Tensor
 
     def log_prob(self, actions: Tensor, rows: Tensor | None) -> Tensor:
-        """The log-probability log pi(a | s) of D decisions, [D].
+        """The log-probability log pi(a | s) of D unique pairs, [D].
 
         Args:
             actions: int64 [D].
-            rows: the row of each decision, int64 [D], or None if decision i was taken at row i.
+            rows: the row of each pair, int64 [D], or None if pair i was taken at row i.
         """
         num_rows, num_actions = self.log_probs.shape
         if rows is None:
@@ -69,13 +69,13 @@ class Gaussian:
     log_std: Tensor
 
     def log_prob(self, actions: Tensor, rows: Tensor | None) -> Tensor:
-        """The log-probability log pi(a | s) of D decisions, [D].
+        """The log-probability log pi(a | s) of D unique pairs, [D].
 
         log pi = sum_j -((a_j - mu_j) / sigma_j)^2 / 2 - log sigma_j - log(2 pi) / 2.
 
         Args:
             actions: [D, m].
-            rows: the row of each decision, int64 [D], or None if decision i was taken at row i.
+            rows: the row of each pair, int64 [D], or None if pair i was taken at row i.
         """
         mean = self.mean if rows is None else self.mean.index_select(0, rows)
         standardised = (actions - mean) * torch.exp(-self.log_std)
@@ -110,13 +110,13 @@ class Gaussian:
 Distribution = Categorical | Gaussian
 
 
-def mean_divergence(old: Distribution, new: Distribution, row_weights: Tensor) -> Tensor:
+def mean_divergence(old: Distribution, new: Distribution, observation_weights: Tensor) -> Tensor:
     """KL(old || new) averaged over the samples, a scalar.
 
     Args:
         old: the policy that collected the samples.
         new: of the same family.
-        row_weights: share of the samples at each row, [U], summing to 1.
+        observation_weights: share of the samples at each row, [U], summing to 1.
     """
     assert type(old) is type(new)
-    return torch.dot(row_weights, old.divergence(new))  # type: ignore[arg-type]
+    return torch.dot(observation_weights, old.divergence(new))  # type: ignore[arg-type]

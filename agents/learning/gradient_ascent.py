@@ -5,7 +5,7 @@ steps, or as many as ``policy_passes`` passes over the samples need, whichever i
 mean KL from the old policy is measured on the rows of the next, which need to be evaluated anyway: of a
 thousand rows it is known to a few per cent.
 
-Letters: N samples, D decisions, k costs.
+Notation: N samples, D unique pairs, k costs.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import islice
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -21,28 +22,48 @@ from torch import Tensor
 from recrl.agents.config import AscentConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
+from recrl.agents.learning.actor_critic import Stateful
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Distribution, mean_divergence
 from recrl.agents.learning.networks import Adam
 from recrl.agents.learning.policies import StochasticPolicy
 
 # What is climbed: a differentiable scalar of the policy's distributions at the rows of some samples, and of
-# the probability ratios pi(a | s) / pi_old(a | s) of their decisions, [D].
+# the probability ratios pi(a | s) / pi_old(a | s) of their pairs, [D].
 Objective = Callable[[Distribution, Tensor], Tensor]
 
 
-def with_entropy(gain: Callable[[Tensor], Tensor], batch: LearningBatch, bonus: float) -> Objective:
+AnyAscentConfig = TypeVar("AnyAscentConfig", bound=AscentConfig)
+
+
+class FirstOrderRule(Generic[AnyAscentConfig]):
+    """What the rules share that improve a policy by gradient ascent: the settings and the optimiser.
+
+    Args:
+        config: the agent's settings.
+        policy: whose parameters the optimiser changes.
+    """
+
+    def __init__(self, config: AnyAscentConfig, policy: StochasticPolicy) -> None:
+        self._config = config
+        self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
+        self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
+
+
+def with_entropy(
+    surrogate_objective: Callable[[Tensor], Tensor], batch: LearningBatch, bonus: float
+) -> Objective:
     """A function of the ratios alone, plus ``bonus`` times the mean entropy in nats."""
 
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
         if bonus == 0.0:
-            return gain(ratios)
-        return gain(ratios) + bonus * torch.dot(batch.row_weights, now.entropy())
+            return surrogate_objective(ratios)
+        return surrogate_objective(ratios) + bonus * torch.dot(batch.observation_weights, now.entropy())
 
     return objective
 
 
-def with_prices(gain: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
+def with_prices(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
     """A function of the ratios that also says what it charges for costs, over 1 + that price.
 
     A penalty's gradients are as long as its price. Adam, whose steps remember the length of past gradients,
@@ -51,13 +72,13 @@ def with_prices(gain: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
     """
 
     def objective(_: Distribution, ratios: Tensor) -> Tensor:
-        value, price = gain(ratios)
+        value, price = surrogate_objective(ratios)
         return value / (1.0 + price)
 
     return objective
 
 
-def climb(
+def gradient_ascent(
     policy: StochasticPolicy,
     optimiser: Adam,
     experience: Experience,
@@ -82,20 +103,19 @@ def climb(
     Raises:
         DivergedError: the KL is not finite.
     """
-    config = config.in_update(noisy=experience.constraints.noisy)
     size = config.minibatch_size
     steps = max(config.policy_steps, config.policy_passes * experience.batch.num_parts(size))
     largest_kl = config.stop_kl_factor * config.target_kl
     objective_on = lru_cache(maxsize=1)(objective_of)  # the whole batch comes again and again
     taken, divergence = 0, 0.0
     for taken, part in enumerate(islice(experience.parts(size, generator), steps + 1)):
-        now = policy.evaluate(part.batch.rows)
+        now = policy.evaluate(part.batch.unique_observations)
         with torch.no_grad():
-            divergence = float(mean_divergence(part.old, now.distribution, part.batch.row_weights))
+            divergence = float(mean_divergence(part.old, now.distribution, part.batch.observation_weights))
         if taken == steps or divergence > largest_kl:
             break
-        gain = objective_on(part)(now.distribution, part.ratios(now.distribution))
-        now.gradient(-gain)
+        surrogate_objective = objective_on(part)(now.distribution, part.ratios(now.distribution))
+        now.gradient(-surrogate_objective)
         optimiser.step()
     require_finite("the KL of the policy's steps", divergence)
     return {"policy_steps": float(taken)}

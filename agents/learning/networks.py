@@ -12,7 +12,7 @@ A layer's biases are the last row of its weights, and its inputs end in a column
 sum their slopes would each be a sweep over memory as large as the activations, and such sweeps are what a
 large update costs beside its products.
 
-Letters: C networks, U rows, n inputs, P parameters.
+Notation: C networks, U rows, n inputs, P parameters.
 """
 
 from __future__ import annotations
@@ -100,15 +100,20 @@ def blocks(num_rows: int) -> list[slice]:
 
 @dataclass(frozen=True)
 class NetworkForm:
-    """How the networks of a student are built.
+    """How the networks of an agent are built.
 
     Attributes:
-        hidden_sizes: widths of the tanh layers.
+        hidden_sizes: widths of the hidden layers.
         initialiser: draws each weight matrix.
+        activation: between the layers; a key of ``module_stack.ACTIVATIONS``.
+        factory: what makes a network of the user's own, from the numbers of inputs and outputs, or None; the
+            other attributes are then not used.
     """
 
     hidden_sizes: tuple[int, ...]
     initialiser: Initialiser
+    activation: str = "tanh"
+    factory: Callable[[int, int], torch.nn.Module] | None = None
 
 
 class FlatParameters:
@@ -254,6 +259,10 @@ class TanhStack:
             bias.zero_()
         self.weights[-1].mul_(last_scale)
 
+    def scale(self, factors: Tensor) -> None:
+        """Multiply each network's outputs by a factor, [C] or a scalar."""
+        self.layers[-1].mul_(factors.reshape(-1, 1, 1))
+
     def outputs(self, rows: Tensor) -> Tensor:
         """The outputs of every network, [C, U, out], block by block; rows are [U, n]."""
         outputs = [self.activations(rows[block])[-1] for block in blocks(len(rows))]
@@ -369,53 +378,3 @@ class Adam:
         self._parameters.load(np.asarray(state["first_moment"]), self._first_moment)
         self._parameters.load(np.asarray(state["second_moment"]), self._second_moment)
         self._steps = int(state["steps"])
-
-
-class Critics:
-    """The 1 + k value functions of a CMDP: of the reward, then of each cost.
-
-    Args:
-        num_observations: n.
-        num_costs: k.
-        form: of each network.
-        generator: the initialisation's randomness.
-    """
-
-    def __init__(
-        self, num_observations: int, num_costs: int, form: NetworkForm, generator: torch.Generator
-    ) -> None:
-        sizes = (num_observations, *form.hidden_sizes, 1)
-        self.parameters = FlatParameters(TanhStack.shapes(1 + num_costs, sizes))
-        self._stack = TanhStack(self.parameters, len(sizes) - 1)
-        self._stack.initialise(form.initialiser, 1.0, generator)
-
-    def values(self, rows: Tensor) -> npt.NDArray[np.float64]:
-        """The values of every row, [U, n] -> float64 [U, 1 + k]."""
-        return self._stack.outputs(rows)[..., 0].numpy(force=True).T.astype(np.float64)
-
-    def rescale(self, factors: npt.NDArray[np.float64]) -> None:
-        """Multiply each critic's values by a factor, [1 + k] (van Hasselt et al. 2016, section 2.2)."""
-        self._stack.layers[-1].mul_(torch.as_tensor(factors, dtype=torch.get_default_dtype())[:, None, None])
-
-    def differentiate(self, rows: Tensor, row_weights: Tensor, targets: Tensor) -> Tensor:
-        """The squared errors of each critic, and their sum's gradient, which the block then holds.
-
-        L_c = sum_u w_u (V_c(u) - y_cu)^2. The critics share no parameter, so the gradient of the sum is each
-        one's own.
-
-        Args:
-            rows: [U, n].
-            row_weights: w, [U].
-            targets: y, [1 + k, U].
-
-        Returns:
-            L, [1 + k].
-        """
-        losses = torch.zeros(len(targets))
-        for block in blocks(len(rows)):
-            activations = self._stack.activations(rows[block])
-            errors = activations[-1][..., 0] - targets[:, block]
-            weighted = errors * row_weights[block]
-            self._stack.pull_back(activations, (2.0 * weighted)[..., None], add=block.start > 0)
-            losses += (weighted * errors).sum(dim=1)
-        return losses

@@ -1,6 +1,6 @@
 """Adding exploration noise eps_pi to a policy (Algorithm 2, line 9), which the paper leaves open.
 
-The noise is put into the *parameters*, once, and the student goes on learning on-policy from there. Mixing
+The noise is put into the *parameters*, once, and the agent goes on learning on-policy from there. Mixing
 the policy with a uniform one instead would have to be carried through every later gradient, and does not
 free a saturated softmax: its gradients are about 1e-8.
 
@@ -8,7 +8,7 @@ free a saturated softmax: its gradients are about 1e-8.
 policy less random than it is. ``temperature`` divides the logits by 1 / (1 - eps), or multiplies the
 standard deviations by it.
 
-Letters: U distinct observations, A actions, m action components, eps = eps_pi.
+Notation: U distinct observations, A actions, m action components, eps = eps_pi.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Acting is plain NumPy, on a CPU on the parameters' own memory: at 16 observation
 cost more than the arithmetic. Learning is PyTorch. The probabilities that learning compares with are computed
 by PyTorch too, at the start of an update, so that the ratio of an unchanged policy is exactly 1.
 
-Letters: U rows, B observations, n observation components, A actions, m action components, P parameters.
+Notation: U rows, B observations, n observation components, A actions, m action components, P parameters.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from torch import Tensor
 
-from recrl.agents.learning.batch import distinct_rows
+from recrl.agents.learning.batch import find_repeated
 from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
-from recrl.agents.learning.networks import FlatParameters, NetworkForm, Scratch, TanhStack, blocks
+from recrl.agents.learning.networks import NetworkForm, Scratch, TanhStack, blocks
 from recrl.agents.learning.noise import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.learning.stacks import make_stack
 from recrl.agents.spaces import action_size
 from recrl.environments.cmdp import Floats
 
@@ -48,6 +49,7 @@ class StochasticPolicy:
     Attributes:
         parameters: all of them, in one block.
         stack: the network.
+        is_categorical: whether actions are Discrete.
     """
 
     def __init__(
@@ -59,24 +61,28 @@ class StochasticPolicy:
         generator: torch.Generator,
     ) -> None:
         num_outputs = action_size(action_space)
-        sizes = (num_observations, *form.hidden_sizes, num_outputs)
-        shapes = TanhStack.shapes(1, sizes)
-        self._is_categorical = isinstance(action_space, Discrete)
-        if not self._is_categorical:
-            shapes.append((num_outputs,))
-        self.parameters = FlatParameters(shapes)
-        self.stack = TanhStack(self.parameters, len(sizes) - 1)
-        self.stack.initialise(form.initialiser, last_scale, generator)
+        self.is_categorical = isinstance(action_space, Discrete)
+        self.parameters, self.stack = make_stack(
+            form,
+            1,
+            num_observations,
+            num_outputs,
+            last_scale=last_scale,
+            generator=generator,
+            others=[] if self.is_categorical else [(num_outputs,)],
+        )
         if isinstance(action_space, Box):
             self.log_std.fill_(INITIAL_LOG_STD)
             half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
             self._half_ranges = np.where(np.isfinite(half), half, 1.0)
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
         acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
-        layers = [layer[0] for layer in acting[: len(self.stack.layers)]]
-        self._weights = [layer[:-1] for layer in layers]
-        self._biases = [layer[-1] for layer in layers]
         self._acting_log_std = acting[-1]
+        self._layers = (
+            [layer[0] for layer in acting[: len(self.stack.layers)]]
+            if isinstance(self.stack, TanhStack)
+            else None
+        )
         self._scratch: list[Scratch] = []
         self._latest: _Latest | None = None
 
@@ -91,12 +97,17 @@ class StochasticPolicy:
 
     def outputs(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Logits or means of B observations, [B, n] -> [B, A] or [B, m]; no autograd."""
+        outputs: npt.NDArray[np.float32]
+        if self._layers is None:
+            rows = torch.as_tensor(observations, device=self.parameters.values.device)
+            outputs = self.stack.outputs(rows)[0].numpy(force=True)
+            return outputs
         hidden = observations
-        for weight, bias in zip(self._weights[:-1], self._biases[:-1], strict=True):
-            hidden = hidden @ weight
-            hidden += bias
+        for layer in self._layers[:-1]:
+            hidden = hidden @ layer[:-1]
+            hidden += layer[-1]
             np.tanh(hidden, out=hidden)
-        outputs: npt.NDArray[np.float32] = hidden @ self._weights[-1] + self._biases[-1]
+        outputs = hidden @ self._layers[-1][:-1] + self._layers[-1][-1]
         return outputs
 
     def sample(
@@ -104,7 +115,7 @@ class StochasticPolicy:
     ) -> npt.NDArray[Any]:
         """Draw actions for B observations [B, n]: int64 [B] by inversion, or float32 [B, m]."""
         outputs = self.outputs(observations)
-        if not self._is_categorical:
+        if not self.is_categorical:
             spread = np.exp(self._acting_log_std)
             outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
             return outputs
@@ -120,14 +131,14 @@ class StochasticPolicy:
         Raises:
             ValueError: actions are continuous.
         """
-        if not self._is_categorical:
+        if not self.is_categorical:
             raise ValueError("continuous actions have densities, not probabilities")
         return _cumulative(self.outputs(observations))
 
     def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
         outputs = self.outputs(observations)
-        return outputs.argmax(axis=1) if self._is_categorical else outputs
+        return outputs.argmax(axis=1) if self.is_categorical else outputs
 
     def probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
         """pi(a | s) at B observations [B, n], float64 [B, A].
@@ -135,7 +146,7 @@ class StochasticPolicy:
         Raises:
             ValueError: actions are continuous.
         """
-        if not self._is_categorical:
+        if not self.is_categorical:
             raise ValueError("continuous actions have densities, not probabilities")
         outputs = self.outputs(observations).astype(np.float64)
         masses = np.exp(outputs - outputs.max(axis=1, keepdims=True))
@@ -168,13 +179,13 @@ class StochasticPolicy:
         )
         outputs.requires_grad_()
         leaves = [outputs]
-        if not self._is_categorical:
+        if not self.is_categorical:
             leaves.append(self.log_std.clone().requires_grad_())
         return PolicyEvaluation(self, activations, leaves, self.head(outputs, leaves[-1]))
 
     def head(self, outputs: Tensor, log_std: Tensor) -> Distribution:
         """The distributions that outputs, [U, A] or [U, m], stand for; only a Gaussian has a log_std."""
-        if self._is_categorical:
+        if self.is_categorical:
             return Categorical(torch.log_softmax(outputs, dim=1))
         return Gaussian(outputs, log_std)
 
@@ -191,19 +202,19 @@ class StochasticPolicy:
             (Gaussian), and ``randomness_before`` and ``_after``, the mean off-greedy mass or the mean
             standard deviation.
         """
-        if self._is_categorical:
+        if self.is_categorical:
             return self._soften(noise, observations, form)
         return self._widen(noise, form)
 
     def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
-        distinct = distinct_rows(observations)
+        distinct = find_repeated(observations)
         weights = np.full(len(observations), 1.0 / len(observations))
         if distinct is not None:  # on a tabular task a sixteenth of them
             first, row = distinct
             observations, weights = observations[first], np.bincount(row) / len(observations)
         logits = self.outputs(observations).astype(np.float64)
         scale = 1.0 - noise if form == "temperature" else matching_scale(logits, weights, noise)
-        self.stack.layers[-1].mul_(scale)
+        self.stack.scale(torch.tensor(scale))
         return {
             "noise_scale": scale,
             "randomness_before": off_greedy_mass(logits, weights),
@@ -254,7 +265,7 @@ def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:
 class PolicyEvaluation:
     """A policy evaluated at some rows; valid until its parameters change or it is evaluated again.
 
-    The part between the network's outputs and a loss is differentiated automatically, so that a student may
+    The part between the network's outputs and a loss is differentiated automatically, so that an agent may
     write any loss of the distribution; the network itself is ``TanhStack``'s to differentiate.
 
     Attributes:
@@ -290,18 +301,20 @@ class FisherMetric:
     Args:
         policy: at the parameters of the metric; they must not change while it is used.
         rows: the distinct observations, [U, n].
-        row_weights: share of the samples at each row, [U], summing to 1.
+        observation_weights: share of the samples at each row, [U], summing to 1.
         damping: multiple of the identity added, at least 0.
     """
 
-    def __init__(self, policy: StochasticPolicy, rows: Tensor, row_weights: Tensor, damping: float) -> None:
+    def __init__(
+        self, policy: StochasticPolicy, rows: Tensor, observation_weights: Tensor, damping: float
+    ) -> None:
         self._policy = policy
         self._damping = damping
         self._blocks: list[tuple[list[Tensor], Distribution, Tensor]] = []
         for block in blocks(len(rows)):
             activations = policy.stack.activations(rows[block], Scratch())
             distribution = policy.head(activations[-1][0], policy.log_std)
-            self._blocks.append((activations, distribution, row_weights[block, None]))
+            self._blocks.append((activations, distribution, observation_weights[block, None]))
 
     def __call__(self, vector: Tensor) -> Tensor:
         """H times a vector of parameter changes, [P] -> [P]; overwrites the policy's gradient block."""
@@ -310,6 +323,6 @@ class FisherMetric:
         for number, (activations, distribution, weights) in enumerate(self._blocks):
             moved = stack.output_change(activations, change)[0]
             stack.pull_back(activations, (weights * distribution.fisher(moved))[None], add=number > 0)
-        if len(change) > len(stack.layers):
+        if not self._policy.is_categorical:
             parameters.gradients[-1].copy_(2.0 * change[-1])  # the Fisher metric of log_std is 2
         return parameters.gradient + self._damping * vector

@@ -1,8 +1,8 @@
-"""Surrogate objectives of policy gradient methods, over the decisions of a batch.
+"""Surrogate objectives of policy gradient methods, over the pairs of a batch.
 
-A surrogate is a mean over samples of something that depends on a sample only through its decision's
-probability ratio and, linearly, its advantage; so advantages are summed by decision first
-(``recrl.agents.learning.batch``). Letters: N samples, D decisions, k costs.
+A surrogate is a mean over samples of something that depends on a sample only through its pair's
+probability ratio and, linearly, its advantage; so advantages are summed by pair first
+(``recrl.agents.learning.batch``). Notation: N samples, D unique pairs, k costs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def surrogate(ratios: Tensor, advantages: Tensor) -> Tensor:
 
     Args:
         ratios: pi(a | s) / pi_old(a | s), [D].
-        advantages: summed by decision and divided by N, [D] or [D, k].
+        advantages: summed by pair and divided by N, [D] or [D, k].
 
     Returns:
         A scalar, or [k].
@@ -33,7 +33,7 @@ def surrogate(ratios: Tensor, advantages: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SignedAdvantages:
-    """Advantages split by their sign, each part summed by decision and divided by N.
+    """Advantages split by their sign, each part summed by pair and divided by N.
 
     Attributes:
         positive: [D].
@@ -46,9 +46,7 @@ class SignedAdvantages:
     @classmethod
     def split(cls, batch: LearningBatch, advantages: Floats) -> SignedAdvantages:
         """Split the advantages of N samples, [N]."""
-        return cls(
-            batch.per_decision(np.maximum(advantages, 0.0)), batch.per_decision(np.minimum(advantages, 0.0))
-        )
+        return cls(batch.per_pair(np.maximum(advantages, 0.0)), batch.per_pair(np.minimum(advantages, 0.0)))
 
     @property
     def total(self) -> Tensor:

@@ -24,11 +24,6 @@ Each of the at most 2^k candidates is the best point of its face. Those that als
 A are feasible, and the optimum is among them: the best feasible candidate is the solution. For k = 1 that is
 nu = 0 or nu = (lam c - r) / s, lam = sqrt((q - r^2 / s) / (2 delta - c^2 / s)), as in the paper.
 
-A linear model has no reason to stop before the trust region's edge. Where the policy has all but settled, its
-gradient is next to nothing but rounding, and a step to that edge a step anywhere: deterministic policies lose
-their way at random. With a temperature T the objective is g.x + T x.H x / 2 (ours; a nat of KL must be worth
-T), whose minimum on a face has lam no less than T: the step ends where the gain does.
-
 If no candidate is feasible, no step within the trust region meets all constraints, and the step recovers:
 towards the nearest point that meets them all, x = -sum_i nu_i w_i with nu >= 0 and S nu >= c where nu_i > 0
 binds, as far as the trust region goes. Every violated cost falls on the way, and none that holds is broken.
@@ -37,7 +32,7 @@ most, in turns, a policy goes to and fro between two costs that must fall togeth
 limits. Only where the constraints contradict one another is the most violated one lowered alone; "most" is
 measured by the length c_i / sqrt(S_ii) of the step that would mend it, whatever the costs' units.
 
-Letters: k constraints.
+Notation: k constraints.
 """
 
 from __future__ import annotations
@@ -76,7 +71,6 @@ class StepProblem:
         gram: S_ij = b_i.H^-1 b_j, [k, k], symmetric and positive semidefinite.
         violations: c_i, cost per step, [k]; negative where the constraint holds.
         radius: delta, the largest mean KL, above 0.
-        temperature: T, in the unit of the reward's surrogate, at least 0; in CPO as published 0.
     """
 
     squared_gradient: float
@@ -84,19 +78,11 @@ class StepProblem:
     gram: Floats
     violations: Floats
     radius: float
-    temperature: float = 0.0
 
     def objective(self, solution: DualSolution) -> float:
-        """g.x + T x.H x / 2 of a step; the reward surrogate rises by -g.x, to first order."""
-        weight, weights = solution.gradient_weight, solution.constraint_weights
-        mixed = float(weights @ self.mixed)
-        linear = -(weight * self.squared_gradient + mixed)
-        if self.temperature == 0.0:
-            return linear
-        squared = weight * (weight * self.squared_gradient + 2.0 * mixed) + float(
-            weights @ self.gram @ weights
-        )
-        return linear + 0.5 * self.temperature * squared
+        """g.x of a step; the reward surrogate rises by -g.x, to first order."""
+        mixed = float(solution.constraint_weights @ self.mixed)
+        return -(solution.gradient_weight * self.squared_gradient + mixed)
 
     def after(self, solution: DualSolution) -> Floats:
         """b_i.x + c_i, how far each constraint is violated after a step, to first order, [k]."""
@@ -157,8 +143,6 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
     remaining = problem.squared_gradient - float(mixed @ along)
     has_gradient = remaining > NO_GRADIENT * problem.squared_gradient
     gradient_weight = float(np.sqrt(slack / remaining)) if has_gradient else 0.0
-    if problem.temperature * gradient_weight > 1.0:
-        gradient_weight = 1.0 / problem.temperature
     weights, multipliers = np.zeros_like(problem.mixed), np.zeros_like(problem.mixed)
     weights[index] = to_meet - gradient_weight * along
     if not has_gradient:

@@ -1,6 +1,6 @@
 """Tools of trust-region methods: conjugate gradient and a backtracking line search on a policy.
 
-Letters: P parameters, H the metric (``recrl.agents.learning.policies.FisherMetric``).
+Notation: P parameters, H the metric (``recrl.agents.learning.policies.FisherMetric``).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def backtrack(
 def line_search(
     parameters: FlatParameters, step: Tensor, is_acceptable: Callable[[], bool], config: TrustRegionConfig
 ) -> dict[str, float]:
-    """``backtrack`` with a student's settings.
+    """``backtrack`` with an agent's settings.
 
     Returns:
         Metrics: ``policy_steps``, 1 or 0; ``line_search_steps``, how often the step was shortened; and

@@ -13,7 +13,8 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import ROWS, TRIAL, Sweep, TrialFacts, assemble, is_made_again
+from recrl.analysis.data.labels import TRIAL
+from recrl.analysis.data.sweep_data import ROWS, Rows, Sweep, TrialFacts, assemble, is_made_again
 from recrl.orchestrator.spec import TrialState
 
 OUTCOMES = ("phases", "evaluations")  # the frames that every source has unrounded
@@ -46,7 +47,7 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
     return assemble(
         parts[0].name,
         [trials[number][trial_id] for trial_id, number in taken.items()],
-        **{name: _taken(parts, name, taken) for name in ROWS},
+        Rows(**{name: _taken(parts, name, taken) for name in ROWS}),
         grid=next((part.grid for part in parts if part.grid), ""),
         notes=[*notes, *_disagreements(parts, having)],
     )

@@ -21,10 +21,9 @@ task lacks are NaN. All returns and costs are undiscounted sums over an episode.
     events       a row an event: KEY, update, end_step, event
     policies     a row a state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
 
-Three sources give the same frames: the trials' files (``load``, here), MLflow alone
-(``recrl.analysis.data.from_mlflow``) and the compact file of a finished sweep
-(``recrl.analysis.data.export``). Each tells ``assemble`` the trials and, for each of the other frames, its
-rows.
+Two sources give the same frames: the trials' files (``load``, here) and the export file of a sweep
+(``recrl.analysis.data.export``), which MLflow has as well (``recrl.analysis.data.from_mlflow``). Each tells
+``assemble`` the trials and, for each of the other frames, its rows.
 
 Episode files can hold 500,000 rows a trial. ``load`` reads them one at a time and keeps their sums
 (``phases``); ``load_episodes`` gives the rows themselves to whoever wants them.
@@ -35,19 +34,19 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from recrl.analysis.data.exact_values import exact_values, finite_model
+from recrl.analysis.data.labels import DOUBLES, KEY, TRIAL, keys_of
+from recrl.analysis.data.optima import UNKNOWN_OPTIMUM, optima_of
 from recrl.environments.cmdp import Phase
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError
-from recrl.environments.registry import optimal_return
-from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
+from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.store import (
     EPISODE_COLUMNS,
     EVALUATION_COLUMNS,
@@ -59,20 +58,6 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.phase_totals import phase_totals
 from recrl.orchestrator.untrusted import checked_name
 
-KEY = ("task", "agent", "method", "seed")
-GROUP = ("task", "agent", "method")
-AGENT_ORDER = ("ppo-lag", "cpo")
-METHOD_ORDER = (
-    "none",
-    "linear",
-    "cosine",
-    "exponential",
-    "dynamic",
-    "annealed",
-    "cooling",
-    "step",
-    "unconstrained",
-)
 TRIAL_COLUMNS = (
     "trial_id",
     "group",
@@ -93,12 +78,9 @@ TRIAL_COLUMNS = (
 PHASE_COLUMNS = ("phase", "episodes", "steps", "episode_return", "episode_return_std")
 PHASE_COST_COLUMNS = (("cost", ""), ("cost", "_std"), ("cost", "_total"), ("excess", "_total"))
 EVENT_COLUMNS = ("update", "end_step", "event")
-TRIAL = "trial"  # in rows given to ``assemble``: the position of the trial they are of
 ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the frames that are given to it
 
 # Notes of ``assemble`` say one of these.
-DOUBLES = "groups of trials have these labels but different settings"
-UNKNOWN_OPTIMUM = "the optimum is unknown here, because"
 
 # The students' metrics that figures and tables read; MLflow and the compact file give no others.
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
@@ -129,6 +111,25 @@ class TrialFacts:
     cpu_seconds: float = 0.0
     start_limits: Sequence[float | str] | None = None
     provenance: str = ""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The tables but ``trials`` as a source knows them: a column TRIAL, and the table's own but KEY.
+
+    Attributes:
+        phases: a row a trial and phase.
+        updates: a row a policy update.
+        evaluations: a row an episode of the final policy.
+        events: a row an event.
+        policies: a row a state of a final policy.
+    """
+
+    phases: pd.DataFrame
+    updates: pd.DataFrame
+    evaluations: pd.DataFrame
+    events: pd.DataFrame
+    policies: pd.DataFrame
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,14 @@ class Sweep:
         return {it.spec.task.label: it.spec.task.options for it in self.facts}
 
     @cached_property
+    def exact(self) -> pd.DataFrame:
+        """The final policies' exact values where the task is finite, as of ``exact_values``."""
+        tasks = {str(label) for label in self.policies["task"].unique()}
+        choices = {it.spec.task.label: it.spec.task for it in self.facts if it.spec.task.label in tasks}
+        models = {label: finite_model(it.name, it.options) for label, it in choices.items()}
+        return exact_values(self.policies, models)
+
+    @cached_property
     def agent_options(self) -> Mapping[str, Mapping[str, Any]]:
         """The options of every student, by its label."""
         return {it.spec.agent.label: it.spec.agent.options for it in self.facts}
@@ -207,7 +216,7 @@ def load(store: SweepStore) -> Sweep:
     return assemble(
         store.name,
         [facts for facts, _ in read],
-        **{name: joined([rows[name] for _, rows in read]) for name in ROWS},
+        Rows(**{name: joined([rows[name] for _, rows in read]) for name in ROWS}),
         grid=grid,
         notes=[problem] if problem else [],
     )
@@ -235,56 +244,43 @@ def load_episodes(
             episodes = episodes[episodes["phase"] == phase.value]
         return episodes if columns is None else episodes.reindex(columns=list(columns))
 
-    keys, _ = _keys(specs)
+    keys, _ = keys_of(specs)
     return keys.put_before(joined([rows(trial) for trial in trials]), columns or EPISODE_COLUMNS)
 
 
 def assemble(
-    name: str,
-    facts: Sequence[TrialFacts],
-    *,
-    phases: pd.DataFrame,
-    updates: pd.DataFrame,
-    evaluations: pd.DataFrame,
-    events: pd.DataFrame,
-    policies: pd.DataFrame,
-    grid: str = "",
-    notes: Sequence[str] = (),
+    name: str, facts: Sequence[TrialFacts], rows: Rows, *, grid: str = "", notes: Sequence[str] = ()
 ) -> Sweep:
-    """The frames from what a source knows; those but ``trials`` are given as rows, in order for each trial.
+    """Return the tables of a sweep from what a source knows of it.
 
     Args:
         name: of the sweep.
         facts: its trials, in the order of the grid.
-        phases: rows with a column TRIAL, the position in ``facts``, and the frame's own but KEY.
-        updates: likewise.
-        evaluations: likewise.
-        events: likewise.
-        policies: likewise.
+        rows: of the other tables, in order for each trial.
         grid: the grid file, or empty.
         notes: what the source has to say.
     """
-    keys, doubles = _keys([it.spec for it in facts])
+    keys, doubles = keys_of([it.spec for it in facts])
     try:
         checked_name(name)
     except ValueError as error:
         raise RecrlError(str(error)) from error
-    optima, unknown = _optima([it.spec for it in facts])
+    optima, unknown = optima_of([it.spec for it in facts])
     costs = range(max((len(it.spec.deploy_limits) for it in facts), default=0))
     cost_columns, limit_columns = [f"cost_{i}" for i in costs], [f"limit_{i}" for i in costs]
     phase_columns = [f"{kind}_{i}{end}" for i in costs for kind, end in PHASE_COST_COLUMNS]
-    rows = [
+    trials = [
         _trial_row(it, optimum) | {TRIAL: i}
         for i, (it, optimum) in enumerate(zip(facts, optima, strict=True))
     ]
     return Sweep(
         name=name,
-        trials=keys.put_before(pd.DataFrame(rows), TRIAL_COLUMNS),
-        phases=keys.put_before(phases, PHASE_COLUMNS, phase_columns),
-        updates=keys.put_before(updates, UPDATE_COLUMNS, (*cost_columns, *limit_columns)),
-        evaluations=keys.put_before(evaluations, EVALUATION_COLUMNS, cost_columns),
-        events=keys.put_before(events, EVENT_COLUMNS),
-        policies=keys.put_before(policies, ("state",)),
+        trials=keys.put_before(pd.DataFrame(trials), TRIAL_COLUMNS),
+        phases=keys.put_before(rows.phases, PHASE_COLUMNS, phase_columns),
+        updates=keys.put_before(rows.updates, UPDATE_COLUMNS, (*cost_columns, *limit_columns)),
+        evaluations=keys.put_before(rows.evaluations, EVALUATION_COLUMNS, cost_columns),
+        events=keys.put_before(rows.events, EVENT_COLUMNS),
+        policies=keys.put_before(rows.policies, ("state",)),
         facts=tuple(facts),
         grid=grid,
         notes=tuple(dict.fromkeys((*notes, *doubles, *unknown))),
@@ -315,115 +311,6 @@ def drawn_columns(columns: Iterable[str]) -> list[str]:
         for name in columns
         if name in kept or re.fullmatch(r"(cost|limit)_\d+", name) or DRAWN_METRICS.fullmatch(name)
     ]
-
-
-def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
-    """Labels without duplicates: those of ``first`` in its order, then the others by name, numbers by size.
-
-    >>> ordered(["dynamic", "mine", "none", "dynamic"], METHOD_ORDER)
-    ['none', 'dynamic', 'mine']
-    >>> ordered(["map-10", "map-9"], ())
-    ['map-9', 'map-10']
-    """
-    present = set(labels)
-    return [label for label in first if label in present] + sorted(present - set(first), key=_numbers_by_size)
-
-
-def _numbers_by_size(label: str) -> tuple[list[str | int], str]:
-    """A key to sort by: texts and whole numbers by turns."""
-    parts = re.split(r"([0-9]+)", label)
-    return [int(part) if index % 2 else part for index, part in enumerate(parts)], label
-
-
-def occurring(labels: pd.Series) -> list[str]:
-    """The categories of a column of labels that occur in it, in their order."""
-    return ordered(labels.unique(), list(labels.cat.categories))
-
-
-@dataclass(frozen=True, eq=False)
-class _Keys:
-    """KEY of every trial.
-
-    Attributes:
-        labels: task, agent and method, a category a trial.
-        seeds: int64, [number of trials].
-    """
-
-    labels: Mapping[str, pd.Categorical[str]]
-    seeds: npt.NDArray[np.int64]
-
-    def put_before(
-        self, rows: pd.DataFrame, columns: Sequence[str], of_costs: Sequence[str] = ()
-    ) -> pd.DataFrame:
-        """The rows sorted by KEY, behind KEY instead of TRIAL.
-
-        ``columns`` exist even if there is no row, ``of_costs`` also where no trial with so many has one.
-        """
-        if not len(rows):
-            rows = pd.DataFrame(columns=[TRIAL, *columns, *of_costs], dtype=float).astype({TRIAL: np.int64})
-        rows = rows.assign(**{name: math.nan for name in of_costs if name not in rows})
-        codes = [self.labels[name].codes for name in GROUP]
-        rank = np.empty(len(self.seeds), dtype=np.int64)
-        rank[np.lexsort((self.seeds, *reversed(codes)))] = np.arange(len(rank))
-        of = rows[TRIAL].to_numpy(np.int64)
-        order = np.argsort(rank[of], kind="stable")
-        of = of[order]
-        keys = {name: self.labels[name].take(of) for name in GROUP} | {"seed": self.seeds[of]}
-        others = rows.drop(columns=TRIAL).iloc[order].reset_index(drop=True)
-        return pd.concat([pd.DataFrame(keys), others], axis=1)
-
-
-def _keys(specs: Sequence[TrialSpec]) -> tuple[_Keys, list[str]]:
-    """The trials' labels, and notes on those that had to be told apart.
-
-    Two groups of trials may have the same labels but different settings (say, budgets). They must not be
-    averaged: their method's name then carries the group.
-    """
-    groups: dict[tuple[str, ...], set[str]] = {}
-    identities = [spec.group for spec in specs]
-    for spec, group in zip(specs, identities, strict=True):
-        groups.setdefault(_labels(spec), set()).add(group)
-    notes = [
-        f"{' '.join(labels)}: {len(found)} {DOUBLES}; they are kept apart as {labels[2]} [...]"
-        for labels, found in sorted(groups.items())
-        if len(found) > 1
-    ]
-    methods = [
-        f"{spec.method.label} [{group}]" if len(groups[_labels(spec)]) > 1 else spec.method.label
-        for spec, group in zip(specs, identities, strict=True)
-    ]
-    columns: dict[str, tuple[list[str], Sequence[str]]] = {
-        "task": ([spec.task.label for spec in specs], ()),
-        "agent": ([spec.agent.label for spec in specs], AGENT_ORDER),
-        "method": (methods, METHOD_ORDER),
-    }
-    labels = {
-        name: pd.Categorical(values, categories=ordered(values, first), ordered=True)
-        for name, (values, first) in columns.items()
-    }
-    return _Keys(labels, np.array([spec.seed for spec in specs], dtype=np.int64)), notes
-
-
-def _labels(spec: TrialSpec) -> tuple[str, str, str]:
-    return (spec.task.label, spec.agent.label, spec.method.label)
-
-
-def _optima(specs: Sequence[TrialSpec]) -> tuple[list[float], list[str]]:
-    """J*(d_d) of every trial, NaN where unknown, and a note for each task that is not installed here."""
-    optima: list[float] = []
-    notes: dict[str, str] = {}
-    for spec in specs:
-        task = spec.task
-        try:
-            optimum = optimal_return(task.name, task.options, spec.deploy_limits)
-        except (UnknownNameError, UntrustedNameError) as error:
-            optimum = None
-            notes[task.label] = f"{task.label}: {UNKNOWN_OPTIMUM} {error}"
-        except USERS_ERRORS as error:
-            optimum = None
-            notes[task.label] = f"{task.label}: {UNKNOWN_OPTIMUM} {described(error)}"
-        optima.append(math.nan if optimum is None else optimum)
-    return optima, list(notes.values())
 
 
 def _trial_row(trial: TrialFacts, optimum: float) -> dict[str, Any]:

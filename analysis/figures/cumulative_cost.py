@@ -16,7 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recrl.analysis.data.sweep_data import KEY, Sweep, occurring
+from recrl.analysis.data.labels import KEY, occurring
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.cumulative_cost import policies_of, training_runs
@@ -27,7 +28,7 @@ REFERENCES: dict[str, tuple[str, Literal["-"] | tuple[float, Sequence[float]], s
     "limit": (LIMIT_COLOUR, panels.DASHED, "limits in force"),
     "discounted_bound": ("#5b3a8c", (0.0, (1.2, 1.2)), "Proposition 1, discounted cost"),
     "bound": ("black", (0.0, (6.0, 1.5, 1.2, 1.5)), "bound, undiscounted cost"),
-    "ceiling": ("#8a8a8a", "-", "ceiling: every step at the largest cost"),
+    "ceiling": ("#8a8a8a", "-", "trivial bound: every step at the largest cost"),
 }
 
 
@@ -89,7 +90,7 @@ def _panel(axes: Axes, series: list[pd.DataFrame], style: MethodStyle) -> None:
             axes.plot(steps, mean, color=colour, linestyle=dashes, linewidth=0.9, label=label, zorder=3.0)
     bound = _sums(series, "bound").mean(axis=0)[-1]
     if np.isfinite(bound):
-        note = f"bound {bound / measured.mean(axis=0)[-1]:.3g} times\nwhat it cost"
+        note = f"bound: {bound / measured.mean(axis=0)[-1]:.3g} times\nthe measured cost"
         axes.text(0.97, 0.04, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.0)
     panels.step_axis(axes, 0.0, float(steps[-1]))
 

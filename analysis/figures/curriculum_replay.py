@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recrl.analysis.data.sweep_data import AGENT_ORDER, METHOD_ORDER, ordered
+from recrl.analysis.data.labels import AGENT_ORDER, METHOD_ORDER, ordered
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH
 from recrl.environments.cmdp import Phase

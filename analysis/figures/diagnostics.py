@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.metrics import mean_curve, step_grid
+from recrl.analysis.statistics.curves import mean_curve, step_grid
 from recrl.environments.cmdp import Floats
 
 BINS = 100
@@ -74,18 +74,23 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             if "case" in chosen and "kl" in rows:
                 recovering = chosen.loc[chosen["case"] == RECOVERY_CASE, "end_step"]
                 _event_ticks(column[rows.index("kl")], recovering, style)
+            column[0].axhline(limit, color="black", linewidth=0.7, linestyle=(0.0, (1.0, 1.5)), zorder=2.4)
             column[0].set_title(method)
             panels.step_axis(column[-1], 0.0, total)
             column[-1].set_xlabel("environment steps")
         panels.cost_axis(grid[0, 0], limit, float(np.nanmax(updates[f"cost_{cost}"].to_numpy(np.float64))))
+        low, high = grid[0, 0].get_ylim()
+        for axes in grid[0]:
+            panels.infeasible_region(axes, limit)
+        grid[0, 0].set_ylim(low, max(high, 1.2 * limit))
         for axes, quantity in zip(grid[:, 0], rows, strict=True):
             axes.set_ylabel(_label(quantity), fontsize=7.0)
             if quantity.startswith(EXPLAINED):
-                axes.set_ylim(LEAST_EXPLAINED, 1.0)
+                axes.set_ylim(LEAST_EXPLAINED, 1.05)
             if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
                 axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
                 axes.set_ylim(bottom=-0.3)
-        _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}")
+        _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}", updates["seed"].nunique())
     return figure
 
 
@@ -128,14 +133,17 @@ def _event_ticks(axes: Axes, steps: Iterable[float], style: MethodStyle) -> None
         )
 
 
-def _legend(figure: Figure, title: str) -> None:
+def _legend(figure: Figure, title: str, seeds: int) -> None:
+    line = "mean ± standard error" if seeds > 1 else "the one run"
     handles = [
-        Line2D([], [], color="0.2", linewidth=1.1, label="mean ± standard error"),
+        Line2D([], [], color="0.2", linewidth=1.1, label=line),
         Line2D([], [], color=LIMIT_COLOUR, linewidth=0.9, label="limit in force, every run"),
+        Line2D([], [], color="black", linewidth=0.7, linestyle=(0.0, (1.0, 1.5)), label="limit $d_d$"),
+        panels.infeasible_patch(),
         Line2D([], [], color="black", linewidth=0.8, linestyle=panels.DASHED, label="deployment begins"),
         Line2D([], [], color="0.2", linestyle="none", marker="|", label="noise added / recovery step"),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), title=title)
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, title=title)
 
 
 def _is_noise(events: pd.DataFrame, method: str) -> pd.Series[bool]:

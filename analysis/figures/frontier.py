@@ -1,8 +1,8 @@
-"""Return against cost: where the final policies of all runs lie under the exact frontier J*(d).
+"""Return against cost: which final policies are feasible, and how far they are below the best return J*(d).
 
-No policy lies above the frontier but by the chance of its evaluation's episodes, and no good one lies to the
-right of the limit. The points are the frozen policies, sampled (``Measure.STOCHASTIC``): the frontier is
-about the expectation of one policy, not about the deployment phase, which averages over many.
+A policy to the right of the limit is infeasible. None lies above the frontier, but by the chance of sampled
+episodes. The points are the stochastic final policies (``Measure.STOCHASTIC``), exact where the task is
+finite. The deployment phase, which averages many policies, is not drawn.
 """
 
 from __future__ import annotations
@@ -15,52 +15,70 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recrl.analysis.data.sweep_data import Sweep, occurring
-from recrl.analysis.figures import styles
+from recrl.analysis.data.labels import occurring
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.metrics import Measure
 from recrl.environments.cmdp import CostLimits, Floats
 from recrl.environments.registry import optimal_return
 
+COST, LIMIT = "shown_cost", "shown_limit"  # the columns of the cost that a row of panels shows
 FAR_COST = 10.0  # times the limit: points beyond are drawn at the right edge
 
 
 def return_against_cost(sweep: Sweep) -> Figure | None:
-    """A row a task with one cost and a known optimum, a column a student; a point a run.
+    """A row a task and cost, a column an agent; a point a run.
+
+    The limit is a line, and the region beyond it is shaded. The frontier J*(d) is drawn where a task has one
+    cost and a known optimum.
 
     Args:
         sweep: its complete trials are drawn.
 
     Returns:
-        The figure, or None if no complete trial is of such a task.
+        The figure, or None if no trial is complete.
     """
     rows = metrics.outcomes(sweep)
     rows = rows[rows["measure"] == Measure.STOCHASTIC.value]
-    single = sweep.trials[(sweep.trials["num_costs"] == 1) & sweep.trials["optimal_return"].notna()]
-    rows = rows[rows["task"].isin(set(single["task"]))]
     if not len(rows):
         return None
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
-    tasks, agents = occurring(rows["task"]), occurring(rows["agent"])
+    agents = occurring(rows["agent"])
+    cells = _cells(sweep, rows)
     with styles.context():
-        figure = Figure(figsize=(TEXT_WIDTH, 2.0 * len(tasks) + 0.6), layout="constrained")
-        grid = figure.subplots(len(tasks), len(agents), squeeze=False, sharex="row", sharey="row")
-        for row, task in zip(grid, tasks, strict=True):
-            trials, chosen = single[single["task"] == task], rows[rows["task"] == task]
-            costs, returns = _frontier(sweep, trials, far=_right_edge(chosen))
-            for axes, agent in zip(row, agents, strict=True):
+        figure = Figure(figsize=(TEXT_WIDTH, 2.0 * len(cells) + 0.75), layout="constrained")
+        grid = figure.subplots(len(cells), len(agents), squeeze=False, sharex="row", sharey="row")
+        for line, (task, i) in zip(grid, cells, strict=True):
+            chosen = rows[rows["task"] == task].rename(
+                columns={f"cost_{i}": COST, f"deploy_limit_{i}": LIMIT}
+            )
+            trials = sweep.trials[sweep.trials["task"] == task]
+            far = _right_edge(chosen)
+            costs, returns = _frontier(sweep, trials, far=far)
+            for axes, agent in zip(line, agents, strict=True):
                 axes.plot(costs, returns, color=OPTIMUM_COLOUR, linewidth=0.9, zorder=1.0)
-                _points(axes, chosen[chosen["agent"] == agent], look, far=costs[-1])
-                for limit in sorted(set(chosen["deploy_limit_0"])):
-                    axes.axvline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=(0.0, (4.0, 2.0)))
+                _points(axes, chosen[chosen["agent"] == agent], look, far=far)
+                for limit in sorted(set(chosen[LIMIT])):
+                    axes.axvline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED)
+                    axes.axvspan(limit, far, **panels.INFEASIBLE)
                 axes.set_title(f"{task}, {agent}", loc="left", pad=3.0)
-            row[0].set_ylabel("return")
-        for axes in grid[-1]:
-            axes.set_xlabel("episode cost")
+                axes.set_xlabel("episode cost" if sweep.num_costs == 1 else f"episode cost {i + 1}")
+            line[0].set_ylabel("return")
         present = [method for method in look if (rows["method"] == method).any()]
         _legend(figure, look, present)
     return figure
+
+
+def _cells(sweep: Sweep, rows: pd.DataFrame) -> list[tuple[str, int]]:
+    """The tasks that have a complete trial, with each of their costs."""
+    return [
+        (task, i)
+        for task in occurring(rows["task"])
+        for i in range(sweep.num_costs)
+        if rows.loc[rows["task"] == task, f"deploy_limit_{i}"].notna().any()
+    ]
 
 
 def concave_frontier(optimum: Callable[[float], float], far: float, *, tolerance: float) -> Floats:
@@ -88,8 +106,10 @@ def concave_frontier(optimum: Callable[[float], float], far: float, *, tolerance
 
 
 def _frontier(sweep: Sweep, trials: pd.DataFrame, *, far: float) -> tuple[Floats, Floats]:
-    """J*(d) of a task for limits 0 ... ``far``, with the deployment limits among them."""
+    """J*(d) of a task for limits 0 ... ``far``, with the deployment limits among them; empty if unknown."""
     first = trials.iloc[0]
+    if first["num_costs"] > 1 or not np.isfinite(first["optimal_return"]):
+        return np.empty(0), np.empty(0)
     name, options = str(first["task_name"]), sweep.task_options[str(first["task"])]
 
     def optimum(limit: float) -> float:
@@ -106,60 +126,57 @@ def _frontier(sweep: Sweep, trials: pd.DataFrame, *, far: float) -> tuple[Floats
 
 def _right_edge(rows: pd.DataFrame) -> float:
     """A cost that shows the limit and nearly all points."""
-    limit = float(rows["deploy_limit_0"].max())
+    limit = float(rows[LIMIT].max())
     scale = limit if limit > 0.0 else 1.0
-    return min(max(2.0 * scale, 1.15 * float(rows["cost_0"].max())), FAR_COST * scale)
+    return min(max(2.0 * scale, 1.15 * float(rows[COST].max())), FAR_COST * scale)
 
 
 def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far: float) -> None:
-    """A small point a run and an open one for the mean; what lies too far right sits on the edge.
+    """An open mark a run; what lies too far right sits on the edge.
 
-    The open marks shrink from method to method, so that equal means show as marks within each other.
+    The marks shrink from method to method, so that equal runs show as marks within each other.
     """
     for position, (method, style) in enumerate(look.items()):
         chosen = rows[rows["method"] == method]
-        if not len(chosen):
-            continue
-        costs = np.minimum(chosen["cost_0"].to_numpy(np.float64), far)
-        returns = chosen["episode_return"].to_numpy(np.float64)
         axes.scatter(
-            costs,
-            returns,
-            s=9.0,
-            c=style.colour,
-            marker=style.marker,
-            linewidths=0.0,
-            clip_on=False,
-            zorder=3.0,
-        )
-        axes.scatter(
-            [min(far, float(chosen["cost_0"].mean()))],
-            [returns.mean()],
-            s=(11.0 - 1.4 * min(position, 5)) ** 2,
+            np.minimum(chosen[COST].to_numpy(np.float64), far),
+            chosen["episode_return"].to_numpy(np.float64),
+            s=(9.0 - 1.3 * min(position, 5)) ** 2,
             marker=style.marker,
             facecolors="none",
             edgecolors=style.colour,
             linewidths=1.1,
             clip_on=False,
-            zorder=4.0,
+            zorder=3.0,
         )
     axes.set_xlim(-0.05 * far, far)
 
 
 def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str]) -> None:
     handles = [
-        Line2D([], [], color=look[method].colour, marker=look[method].marker, linestyle="none", label=method)
+        Line2D(
+            [],
+            [],
+            color=look[method].colour,
+            marker=look[method].marker,
+            markerfacecolor="none",
+            markersize=5.0,
+            linestyle="none",
+            label=method,
+        )
         for method in methods
     ]
-    handles += [
-        Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=(0.0, (4.0, 2.0)), label="limit $d_d$"),
-        Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.9, label="frontier $J^*(d)$"),
+    references = [
+        Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, label="limit $d_d$"),
+        panels.infeasible_patch(),
+        Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.9, label="best return $J^*(d)$, where known"),
     ]
+    figure.legend(handles=references, loc="outside lower center", ncols=len(references))
     figure.legend(
         handles=handles,
         loc="outside upper center",
-        ncols=len(handles),
+        ncols=min(len(handles), panels.METHODS_A_LINE),
         columnspacing=1.2,
         handletextpad=0.5,
-        title="frozen final policies, sampled: a filled mark a run, an open one their mean",
+        title="final policies, a mark a run; at the right edge: further right",
     )

@@ -2,7 +2,7 @@
 
 ``learning_curves`` is Figures 3 and 4 (one a student): return and cost over training, and magnified over
 deployment. ``curricula`` is Figure 5: the limits in force. Trials are averaged on a common grid of
-environment steps (``metrics.step_grid``), about 100 bins over a whole trial and 25 over its deployment.
+environment steps (``curves.step_grid``), about 100 bins over a whole trial and 25 over its deployment.
 
 Costs begin far above the limit and end near it. Where they exceed ten limits, the cost axis is linear up to
 the deployment limit and logarithmic above it, so that the limit can be read; the axis says so.
@@ -17,15 +17,19 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from recrl.analysis.data.sweep_data import Sweep, occurring
+from recrl.analysis.data.labels import occurring
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.metrics import MEAN, Averaging, mean_curve, step_grid
+from recrl.analysis.statistics.curves import MEAN, Averaging, mean_curve, step_grid
+from recrl.analysis.statistics.metrics import OPTIMAL_GAP
 from recrl.environments.cmdp import Floats
 
 BINS = 100
 DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
+LEAST_SHOWN = 0.2  # of a limit, above and below it
+LEAST_SHOWN_RETURN = 2.0 * OPTIMAL_GAP  # above and below J*(d_d)
 WORTH_MARKING = 0.03  # of a trial: shorter spells of infinite limits (the measuring of d_t) are not marked
 
 
@@ -101,6 +105,9 @@ def curricula(sweep: Sweep) -> Figure:
                 else:
                     axes.set_title(f"{task}: nothing run yet", loc="left", pad=3.0)
                     axes.set_xticks([])
+            row[0].set_ylim(bottom=0.0)
+            limits = sweep.trials.loc[sweep.trials["task"] == task, f"deploy_limit_{i}"]
+            _shade(list(row), float(limits.iloc[0]))
             row[0].set_ylabel("cost limit" if sweep.num_costs == 1 else f"limit of cost {i + 1}")
         for axes, agent in zip(grid[0], agents, strict=True):
             axes.set_title(f"{agent}\n{axes.get_title(loc='left')}", loc="left", pad=3.0)
@@ -112,7 +119,7 @@ def curricula(sweep: Sweep) -> Figure:
             look,
             present,
             optimum=False,
-            title="cost limits in force: every run thin, their mean thick; the student's own cost faint",
+            title="cost limits in force: every run thin, their mean thick; the agent's own cost faint",
         )
     return figure
 
@@ -155,7 +162,19 @@ def _task_row(
             limit = float(trials[f"deploy_limit_{position - 1}"].iloc[0])
             largest = float(np.nanmax(updates[quantity].to_numpy(np.float64)))
             panels.cost_axis(row[2 * position], limit, largest)
+            panels.widen(row[2 * position + 1], limit, LEAST_SHOWN * limit or LEAST_SHOWN)
+            _shade(row[2 * position : 2 * position + 2], limit)
+        else:
+            panels.widen(row[1], float(trials["optimal_return"].iloc[0]), LEAST_SHOWN_RETURN)
     row[0].set_ylabel(panels.panel_title(trials, updates, separator="\n"))
+
+
+def _shade(panels_of_cost: Sequence[Axes], limit: float) -> None:
+    """Shade what is above the limit, and keep the axes as they are."""
+    for axes in panels_of_cost:
+        low, high = axes.get_ylim()
+        panels.infeasible_region(axes, limit)
+        axes.set_ylim(low, max(high, limit * 1.05))
 
 
 def _curves(
@@ -206,11 +225,10 @@ def _curriculum_panel(
         if last >= WORTH_MARKING * total:
             edge = axes.get_xaxis_transform()
             axes.plot([0.0, last], [1.0, 1.0], **style.line, transform=edge, clip_on=False)
-            axes.text(last, 1.0, " ∞", color=style.colour, va="center", fontsize=9.0, transform=edge)
+            axes.text(last, 1.0, " ∞", color=style.colour, va="top", fontsize=9.0, transform=edge)
     panels.step_axis(axes, 0.0, total)
     panels.reference_lines(axes, trials, f"cost_{i}")
     panels.phase_boundary(axes, boundary, total)
-    axes.set_ylim(bottom=0.0)
 
 
 def _column_titles(num_costs: int) -> list[str]:

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, MethodStyle
-from recrl.analysis.statistics.metrics import Curve
+from recrl.analysis.statistics.curves import Curve
 
 LOG_AXIS_FROM = 10.0  # times the limit
 MARKERS_A_LINE = 6
 METHODS_A_LINE = 7
 DASHED = (0.0, (4.0, 2.0))
+INFEASIBLE: dict[str, Any] = {"color": "#c0392b", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.5}
+FAR_ABOVE = 1e6  # times the limit: the shaded region has no upper end
 
 
 def draw_curve(
@@ -73,6 +77,25 @@ def reference_lines(axes: Axes, trials: pd.DataFrame, quantity: str) -> None:
         return
     for limit in sorted(set(trials[f"deploy_limit_{quantity.removeprefix('cost_')}"].dropna())):
         axes.axhline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=DASHED, zorder=4.0)
+
+
+def infeasible_region(axes: Axes, limit: float) -> None:
+    """Shade the costs above a deployment limit."""
+    if np.isfinite(limit):
+        axes.axhspan(limit, FAR_ABOVE * max(limit, 1.0), **INFEASIBLE)
+
+
+def widen(axes: Axes, centre: float, least: float) -> None:
+    """Make a y-axis show at least ``centre`` ± ``least``, so that rounding errors do not fill a panel.
+
+    Args:
+        axes: to change.
+        centre: for example a limit; nothing happens if it is not finite.
+        least: half the height that must be shown.
+    """
+    if np.isfinite(centre):
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, centre - least), max(high, centre + least))
 
 
 def phase_boundary(axes: Axes, step: int, total: int) -> None:
@@ -137,18 +160,31 @@ def panel_title(trials: pd.DataFrame, updates: pd.DataFrame, *, separator: str =
     return f"{task}{separator}{count} seed{'s' if high > 1 else ''}, {total} steps"
 
 
+def infeasible_patch() -> Patch:
+    """The infeasible region in a legend."""
+    return Patch(facecolor=INFEASIBLE["color"], alpha=0.2, linewidth=0.0, label="infeasible (above $d_d$)")
+
+
 def legend(
-    figure: Figure, look: dict[str, MethodStyle], methods: Sequence[str], *, optimum: bool, title: str
+    figure: Figure,
+    look: dict[str, MethodStyle],
+    methods: Sequence[str],
+    *,
+    optimum: bool,
+    title: str,
+    shaded: bool = True,
 ) -> None:
     """The methods, in their order, above all panels, and the reference lines below."""
     lines = [
         Line2D([], [], **look[method].line, marker=look[method].marker, markeredgewidth=0.0, label=method)
         for method in methods
     ]
-    references = [
+    references: list[Line2D | Patch] = [
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=DASHED, label="limit $d_d$"),
         Line2D([], [], color="black", linewidth=0.8, linestyle=DASHED, label="deployment begins"),
     ]
+    if shaded:
+        references.insert(1, infeasible_patch())
     if optimum:
         references.append(Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.7, label="optimum $J^*(d_d)$"))
     figure.legend(
@@ -159,4 +195,4 @@ def legend(
         columnspacing=1.6,
         title=title,
     )
-    figure.legend(handles=references, loc="outside lower center", ncols=3, handlelength=2.6)
+    figure.legend(handles=references, loc="outside lower center", ncols=len(references), handlelength=2.6)

@@ -21,7 +21,8 @@ from matplotlib.colors import LogNorm, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from recrl.analysis.data.sweep_data import Sweep, occurring
+from recrl.analysis.data.labels import occurring
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.styles import TEXT_WIDTH
 from recrl.analysis.report_tables import number
@@ -100,7 +101,7 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
         bar = figure.colorbar(ScalarMappable(scale, VISIT_COLOURS), ax=grid, shrink=0.6, aspect=30, pad=0.01)
         gap = " " if rows > 1 else "\n"  # one row is lower than the label is long
         bar.set_label(f"expected steps{gap}on the square, an episode", fontsize=6.0)
-        title = f"{agent}: final policies, sampled; the mean over runs, exactly computed"
+        title = f"{agent}: stochastic final policies, exactly evaluated; the mean over runs"
         figure.suptitle(title, fontsize=7.0)
     return figure
 

@@ -1,5 +1,6 @@
-"""Performance profiles: for every return, the share of a method's runs that are above it.
+"""Performance profiles: for every return, the fraction of runs that are feasible and return more.
 
+An infeasible run counts as worse than any return. Its line starts below 1 and never rises.
 The profile shows the whole distribution over runs where a mean shows one number: with five seeds, one that
 failed is a step of a fifth. Agarwal et al. 2021, figure 4; here a panel a task and student, so that returns
 of different tasks need not be normalised.
@@ -8,21 +9,24 @@ of different tasks need not be normalised.
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recrl.analysis.data.sweep_data import Sweep, occurring
+from recrl.analysis.data.labels import occurring
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.styles import OPTIMUM_COLOUR, TEXT_WIDTH
 from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.intervals import performance_profile
-from recrl.analysis.statistics.metrics import Measure
+from recrl.analysis.statistics.metrics import OPTIMAL_GAP, Measure
+from recrl.environments.cmdp import Floats
 
 THRESHOLDS = 400
 
 
 def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
-    """A row a task, a column a student, a line a method.
+    """A row a task, a column an agent, a line a curriculum.
 
     Args:
         sweep: its complete trials are drawn.
@@ -42,20 +46,18 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
         grid = figure.subplots(len(tasks), len(agents), squeeze=False, sharex="row", sharey=True)
         for line, task in zip(grid, tasks, strict=True):
             chosen = rows[rows["task"] == task]
-            low, high = float(chosen["episode_return"].min()), float(chosen["episode_return"].max())
-            room = 0.05 * (high - low) or 1.0
-            thresholds = np.linspace(low - room, high + room, THRESHOLDS)
+            thresholds = _thresholds(chosen)
             for axes, agent in zip(line, agents, strict=True):
                 for method, style in look.items():
                     runs = chosen[(chosen["agent"] == agent) & (chosen["method"] == method)]
                     if len(runs):
-                        scores = runs["episode_return"].to_numpy(np.float64)[:, None]
-                        shares = performance_profile(scores, thresholds)
+                        shares = performance_profile(feasible_scores(runs), thresholds)
                         axes.plot(thresholds, shares, **style.line, zorder=3.0 + bool(style.dashes))
                 for optimum in sorted(set(chosen["optimal_return"].dropna())):
                     axes.axvline(optimum, color=OPTIMUM_COLOUR, linewidth=0.7, zorder=1.0)
+                axes.set_ylim(-0.05, 1.05)
                 axes.set_title(f"{task}, {agent}", loc="left", pad=3.0)
-            line[0].set_ylabel("share of runs above")
+            line[0].set_ylabel("fraction of runs")
         for axes in grid[-1]:
             axes.set_xlabel("return")
         present = [method for method in look if (rows["method"] == method).any()]
@@ -64,6 +66,25 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
             loc="outside upper center",
             ncols=len(present),
             handlelength=3.2,
-            title=f"performance profiles of {measure.description}; grey: the optimum, where it is known",
+            title=f"{measure.description}: fraction of runs feasible and above a return (grey: optimum)",
         )
     return figure
+
+
+def feasible_scores(rows: pd.DataFrame) -> Floats:
+    """The returns of runs, minus infinity for an infeasible one, [n, 1].
+
+    Args:
+        rows: of ``metrics.outcomes``.
+    """
+    scores = rows["episode_return"].where(rows["feasible"], -np.inf)
+    return scores.to_numpy(np.float64)[:, None]
+
+
+def _thresholds(rows: pd.DataFrame) -> Floats:
+    """Returns around those of the feasible runs, or of all runs if none is feasible, and the optimum."""
+    shown = rows[rows["feasible"]] if rows["feasible"].any() else rows
+    values = np.concatenate([shown["episode_return"], rows["optimal_return"]])
+    values = values[np.isfinite(values)]
+    room = max(0.05 * float(values.max() - values.min()), OPTIMAL_GAP)
+    return np.linspace(values.min() - room, values.max() + room, THRESHOLDS)

@@ -19,7 +19,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from recrl.analysis.data.sweep_data import METHOD_ORDER, ordered
+from recrl.analysis.data.labels import METHOD_ORDER, ordered
 
 # The formulas in figures: ours, and those that matplotlib makes of numbers on an axis.
 OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$")
@@ -62,7 +62,6 @@ STYLES = {
     "cosine": MethodStyle("#0072b2", (5.0, 1.5, 1.2, 1.5), "^"),
     "exponential": MethodStyle("#009e73", (1.4, 1.2), "v"),
     "dynamic": MethodStyle("#d55e00", (), "D", 1.5),
-    "annealed": MethodStyle("#882255", (6.0, 1.2, 3.0, 1.2), "<"),
     "cooling": MethodStyle("#44aa99", (4.0, 1.0, 1.0, 1.0), ">"),
     "step": MethodStyle("#cc79a7", (8.0, 2.0), "P"),
     "unconstrained": MethodStyle("#7a7a7a", (3.0, 1.2, 1.0, 1.2, 1.0, 1.2), "X"),

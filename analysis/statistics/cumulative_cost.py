@@ -47,7 +47,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import GROUP, KEY, Sweep
+from recrl.analysis.data.labels import GROUP, KEY
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report_tables import number
 from recrl.environments.cmdp import Floats, Phase
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv

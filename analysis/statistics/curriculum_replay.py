@@ -17,12 +17,12 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.report_tables import number
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.store import TrialStore
 from recrl.orchestrator.spec import Choice
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec
+from recrl.teachers.teacher import ProgressReport, TeacherSpec
 
 
 def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
@@ -47,19 +47,19 @@ def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
     teacher = make_teacher(
         TeacherSpec(method.name, method.options, spec.train_limits, spec.deploy_limits, spec.train_steps)
     )
-    lesson, state = teacher.start()
-    lessons = []
+    step, state = teacher.start()
+    steps = []
     for report in progress_reports(trial, updates):
-        lessons.append(lesson)
+        steps.append(step)
         if report.env_steps < spec.train_steps:
-            lesson, state = teacher.step(state, report)
+            step, state = teacher.step(state, report)
         else:
-            lesson = Lesson(spec.deploy_limits)
+            step = CurriculumStep(spec.deploy_limits)
     costs = range(len(spec.deploy_limits))
     recorded = (f"{name}_{i}" for name in ("cost", "limit") for i in costs)
     columns = ["update", "phase", "end_step", *recorded, "noise"]
-    limits = {f"replayed_limit_{i}": [each.limits[i] for each in lessons] for i in costs}
-    return updates[columns].assign(**limits, replayed_noise=[each.policy_noise for each in lessons])
+    limits = {f"replayed_limit_{i}": [each.limits[i] for each in steps] for i in costs}
+    return updates[columns].assign(**limits, replayed_noise=[each.policy_noise for each in steps])
 
 
 def progress_reports(trial: TrialStore, updates: pd.DataFrame) -> Iterator[ProgressReport]:

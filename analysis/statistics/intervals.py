@@ -39,6 +39,7 @@ from scipy.special import ndtri, stdtrit  # scipy.stats takes a second and a hal
 from recrl.environments.cmdp import Floats
 
 ENOUGH_RUNS = 10
+ENOUGH_FOR_SHARES = 5  # runs: with fewer, Wilson's interval says next to nothing
 REPLICATIONS = 2000
 CONFIDENCE = 0.95
 
@@ -220,6 +221,22 @@ def wilson_interval(successes: int, runs: int, *, confidence: float = CONFIDENCE
     scale = 1 + z**2 / n
     low, high = (centre - reach) / scale, (centre + reach) / scale
     return Interval(p, max(0.0, min(p, low)), min(1.0, max(p, high)), n, False)  # rounding may cross p
+
+
+def share_text(successes: int, runs: int, low: float, high: float) -> str:
+    """A share of runs as text, with its interval from ENOUGH_FOR_SHARES runs on.
+
+    Args:
+        successes: how many.
+        runs: of how many.
+        low: lower end of the interval, in [0, 1].
+        high: upper end, likewise.
+
+    >>> share_text(4, 5, 0.376, 0.964), share_text(1, 1, 0.2, 1.0)
+    ('4 of 5 (38–96%)', '1 of 1')
+    """
+    interval = f" ({round(100 * low)}–{round(100 * high)}%)"
+    return f"{successes} of {runs}{interval if runs >= ENOUGH_FOR_SHARES else ''}"
 
 
 def _resampled(scores: Floats, generator: np.random.Generator, replications: int) -> Floats:

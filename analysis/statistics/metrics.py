@@ -1,32 +1,28 @@
-"""What a trial achieved, and learning curves over seeds: functions from frames to frames and arrays.
+"""What a trial achieved: functions from tables to tables.
 
-A trial's outcome is measured three ways, never mixed (``Measure``). The design goes on learning in
-deployment, as the paper's curves show, so the deployment phase averages over policies; the frozen policy is
-the one a user would take away.
+A trial's outcome is measured three ways, never mixed (``Measure``). Learning goes on in the deployment phase,
+so that phase averages over policies. The final policy is the one a user would take away. Its values are exact
+where the task is finite and its table was recorded; otherwise they are means over episodes.
 
-Feasible means cost_i <= d_d,i for every i, of the sample means, without tolerance. ``feasible_within_se``
-allows one standard error over the trial's episodes. At a cost of exactly d_d in expectation the first is a
-coin's toss, which is why both are reported.
+There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``: a share
+COST_TOLERANCE of the limit, or one standard error of the mean where that is more. A policy with softmax
+outputs cannot meet a limit exactly where the optimum does: each action keeps some probability.
 
-Where J*(d_d) is known, ``optimal`` says whether a trial has found it: within OPTIMAL_GAP of the return at
-costs within d_d + OPTIMAL_EXCESS.
+Solved (the column ``optimal``) means feasible and at most OPTIMAL_GAP below J*(d_d), where that is known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import GROUP, KEY, Sweep
+from recrl.analysis.data.labels import GROUP, KEY
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics.intervals import (
-    CONFIDENCE,
-    ENOUGH_RUNS,
     Interval,
     improvement_interval,
     interquartile_mean,
@@ -35,14 +31,12 @@ from recrl.analysis.statistics.intervals import (
     stratified_bootstrap,
     wilson_interval,
 )
-from recrl.environments.cmdp import Floats, Phase
+from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialState
 
-BAND_REPLICATIONS = 500  # a band has a hundred intervals
 OPTIMAL_GAP = 0.2  # of the return to J*(d_d)
-OPTIMAL_EXCESS = 0.05  # of each mean cost over d_d
+COST_TOLERANCE = 0.01  # of a limit; in episode cost where the limit is 0
 ROUNDING = 1e-9  # of a difference of two returns: 9.5 - 9.3 is more than 0.2
-BAND_ENDS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 
 
 class Measure(StrEnum):
@@ -56,9 +50,9 @@ class Measure(StrEnum):
     def description(self) -> str:
         """What it is, for captions."""
         return {
-            Measure.DEPLOYMENT: "all episodes of the deployment phase, in which learning goes on",
-            Measure.STOCHASTIC: "the frozen final policy, sampled",
-            Measure.DETERMINISTIC: "the frozen final policy, most probable actions",
+            Measure.DEPLOYMENT: "the deployment phase (learning goes on)",
+            Measure.STOCHASTIC: "the final policy, stochastic",
+            Measure.DETERMINISTIC: "the final policy, deterministic",
         }[self]
 
 
@@ -68,19 +62,22 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     Trials that are not complete are left out: half a deployment phase is no outcome.
 
     Returns:
-        KEY, measure, episodes, episode_return, episode_return_se, cost_i, cost_i_se (standard errors over
-        the trial's episodes), deploy_limit_i, optimal_return, gap (J*(d_d) minus the return; only an
-        honest score where the trial is feasible), feasible, feasible_within_se, optimal (False where J* is
-        not known).
+        KEY, measure, episodes, exact (whether computed, not sampled), episode_return, episode_return_se,
+        cost_i, cost_i_se (standard errors over the trial's episodes, 0 where exact), deploy_limit_i,
+        optimal_return, gap (J*(d_d) minus the return; the regret of a feasible trial), excess (the largest
+        cost_i - d_d,i), feasible, optimal (solved; False where J* is not known).
     """
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
-    measured = pd.concat([_deployment(sweep, costs), _frozen(sweep, costs)], ignore_index=True)
+    final = _with_exact(_frozen(sweep, costs), sweep.exact)
+    measured = pd.concat([_deployment(sweep, costs), final], ignore_index=True)
     complete = sweep.trials[sweep.trials["status"] == TrialState.COMPLETE.value]
     limits = [f"deploy_limit_{i}" for i in range(sweep.num_costs)]
     rows = measured.merge(complete[[*KEY, *limits, "optimal_return"]], on=list(KEY))
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
+    rows["excess"] = pd.DataFrame(
+        {i: rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"] for i in _costs_of(rows)}
+    ).max(axis=1)
     rows["feasible"] = within_limits(rows)
-    rows["feasible_within_se"] = within_limits(rows, standard_errors=1.0)
     rows["optimal"] = optimal(rows)
     order = {measure.value: position for position, measure in enumerate(Measure)}
     by_measure = rows["measure"].map(order).rename("_order")
@@ -88,33 +85,39 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     return rows.drop(columns="_order")
 
 
-def within_limits(
-    rows: pd.DataFrame, *, standard_errors: float = 0.0, excess: float = 0.0
-) -> pd.Series[bool]:
-    """Whether every mean cost is at most its limit plus a tolerance; costs that a task lacks are.
+def within_limits(rows: pd.DataFrame) -> pd.Series[bool]:
+    """Whether every mean cost is at most its limit plus ``tolerance``; costs that a task lacks are.
 
     Args:
-        rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se if it is asked for.
-        standard_errors: the tolerance, in standard errors of the mean (0 where they are not known).
-        excess: more of it, in episode cost.
+        rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se where costs are sampled.
     """
-    within = pd.Series(True, index=rows.index)
-    for limit in (str(name) for name in rows if str(name).startswith("deploy_limit_")):
-        cost = limit.removeprefix("deploy_limit_")
-        bounds = rows[limit] + excess
-        if standard_errors:
-            bounds = bounds + standard_errors * rows[f"cost_{cost}_se"].fillna(0.0)
-        within &= (rows[f"cost_{cost}"] <= bounds) | rows[limit].isna()
+    within: pd.Series[bool] = pd.Series(True, index=rows.index)
+    for i in _costs_of(rows):
+        limit = rows[f"deploy_limit_{i}"]
+        errors = rows[f"cost_{i}_se"] if f"cost_{i}_se" in rows else pd.Series(0.0, index=rows.index)
+        within = within & ((rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna())
     return within
 
 
+def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[float]:
+    """How far a mean cost may be above its limit: COST_TOLERANCE of it, or a standard error if that is more.
+
+    Args:
+        limits: d_d,i; at a limit of 0 the tolerance is COST_TOLERANCE itself.
+        errors: standard errors of the mean costs; NaN counts as 0.
+    """
+    share = COST_TOLERANCE * limits.where(limits > 0.0, 1.0)
+    return pd.Series(np.maximum(share, errors.fillna(0.0)) + ROUNDING * (1.0 + limits), index=limits.index)
+
+
 def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether a gap to J*(d_d) is known and small and the costs are within d_d; the module says how far.
+    """Whether a trial is solved: feasible, and at most OPTIMAL_GAP below J*(d_d), which is known.
 
     Args:
         rows: gap, and what ``within_limits`` takes.
     """
-    return (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & within_limits(rows, excess=OPTIMAL_EXCESS)
+    near = (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & (rows["gap"] > -math.inf)  # NaN is neither
+    return near & within_limits(rows)
 
 
 def training_totals(sweep: Sweep) -> pd.DataFrame:
@@ -146,11 +149,11 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     Returns:
         GROUP, measure, seeds, then mean and standard error (``_se``) of episode_return, cost_i and gap,
         deploy_limit_i, optimal_return, feasible_seeds, feasible_share with Wilson's 95% interval
-        (feasible_low, feasible_high), feasible_within_se_seeds, and optimal_seeds with Wilson's interval of
-        their share (optimal_low, optimal_high).
+        (feasible_low, feasible_high), and optimal_seeds with Wilson's interval of their share (optimal_low,
+        optimal_high).
     """
     names = [str(name) for name in rows]
-    averaged = [name for name in names if name in ("episode_return", "gap") or _is_cost(name)]
+    averaged = [name for name in names if name in ("episode_return", "gap") or is_cost(name)]
     constant = [name for name in names if name.startswith("deploy_limit_") or name == "optimal_return"]
     lines = []
     for group, chosen in rows.groupby([*GROUP, "measure"], observed=True, sort=False):
@@ -167,7 +170,6 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
             "feasible_share": share.estimate,
             "feasible_low": share.low,
             "feasible_high": share.high,
-            "feasible_within_se_seeds": int(chosen["feasible_within_se"].sum()),
             "optimal_seeds": int(chosen["optimal"].sum()),
             "optimal_low": best.low,
             "optimal_high": best.high,
@@ -215,7 +217,7 @@ def comparisons(
         improvement, the probability that a run returns more than one of the baseline's, with its
         bootstrap interval _low, _high, and too_few_seeds (that interval is then too short).
     """
-    costs = [str(name) for name in rows if _is_cost(str(name))]
+    costs = [str(name) for name in rows if is_cost(str(name))]
     lines = []
     for (task, agent, method, measure), chosen in rows.groupby(
         [*GROUP, "measure"], observed=True, sort=False
@@ -245,174 +247,14 @@ def _ends(name: str, interval: Interval) -> dict[str, float]:
     return {name: interval.estimate, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A quantity over training, averaged over seeds on a grid of environment steps.
-
-    Attributes:
-        steps: centres of the grid's bins, [g].
-        centre: mean or interquartile mean over the runs that have data in the bin, [g]; NaN where none has.
-        low: lower end of the band, [g]; NaN where fewer than two have.
-        high: upper end, likewise.
-        runs: how many have, int [g].
-    """
-
-    steps: Floats
-    centre: Floats
-    low: Floats
-    high: Floats
-    runs: npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Averaging:
-    """A way to make one line with a band of several runs.
-
-    Attributes:
-        description: of line and band, for legends.
-        curve: (updates, column, edges) as of ``mean_curve``.
-        enough_runs: with fewer the band is narrower than it says.
-    """
-
-    description: str
-    curve: Callable[[pd.DataFrame, str, Floats], Curve]
-    enough_runs: int = 1
-
-    def describe(self, runs: int) -> str:
-        """The description, with a warning where there are too few runs."""
-        warning = f"; {runs} seeds are too few for it: the band is too narrow"
-        return self.description + (warning if runs < self.enough_runs else "")
-
-
-def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) -> Floats:
-    """Edges of bins over a trial's steps, one of them at the phase boundary so that no bin mixes phases.
-
-    Args:
-        boundary_step: first step under d_d.
-        total_steps: environment steps of the trial.
-        updates: policy updates of the trial: there are never more bins than updates.
-        bins: bins wanted over the whole trial, at least 2.
-
-    Returns:
-        Ascending edges from 0 to ``total_steps``, about [min(bins, updates) + 1].
-    """
-    count = max(2, min(bins, updates))
-    if not 0 < boundary_step < total_steps:
-        return np.linspace(0.0, total_steps, count + 1)
-    deployment = min(max(1, round(count * (1.0 - boundary_step / total_steps))), count - 1)
-    training = np.linspace(0.0, boundary_step, count - deployment + 1)
-    return np.concatenate([training, np.linspace(boundary_step, total_steps, deployment + 1)[1:]])
-
-
-def binned_runs(updates: pd.DataFrame, column: str, edges: Floats) -> Floats:
-    """Every run's curve on a common grid.
-
-    A bin (e_j, e_j+1] holds the mean of the run's updates that end in it, each weighted with its number of
-    episodes (limits and the student's own metrics: each update once), NaN if there is none.
-
-    Args:
-        updates: of one task, student and method; of a ``Sweep``.
-        column: what to average.
-        edges: ascending, [g + 1].
-
-    Returns:
-        [n, g], runs in the order of their seeds.
-    """
-    weighted = column == "episode_return" or _is_cost(column)
-    values = updates[column].to_numpy(np.float64)
-    weights = updates["episodes"].to_numpy(np.float64) if weighted else np.ones(len(updates))
-    bins = np.searchsorted(edges, updates["end_step"].to_numpy(np.float64), side="left") - 1
-    seeds, runs = np.unique(updates["seed"].to_numpy(), return_inverse=True)
-    count = len(edges) - 1
-    usable = np.isfinite(values) & (weights > 0.0) & (bins >= 0) & (bins < count)
-    cells, size = runs[usable] * count + bins[usable], len(seeds) * count
-    sums = np.bincount(cells, weights[usable] * values[usable], minlength=size)
-    totals = np.bincount(cells, weights[usable], minlength=size)
-    means: Floats = np.divide(sums, totals, out=np.full(size, np.nan), where=totals > 0.0)
-    return np.reshape(means, (len(seeds), count))
-
-
-def mean_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
-    """Mean and standard error over seeds of ``binned_runs``.
-
-    Args:
-        updates: of one task, student and method.
-        column: what to average.
-        edges: ascending, [g + 1].
-    """
-    runs = binned_runs(updates, column, edges)
-    present = np.isfinite(runs)
-    count = present.sum(axis=0)
-    mean = _divided(np.where(present, runs, 0.0).sum(axis=0), count)
-    squares = np.where(present, (runs - mean) ** 2, 0.0).sum(axis=0)
-    error = np.sqrt(_divided(squares, (count - 1) * count))
-    return Curve(_centres(edges), mean, mean - error, mean + error, count.astype(np.int64))
-
-
-def interquartile_curve(
-    updates: pd.DataFrame, column: str, edges: Floats, generator: np.random.Generator
-) -> Curve:
-    """Interquartile mean over seeds of ``binned_runs``, with its 95% percentile bootstrap band.
-
-    Whole runs are resampled, so that a band's neighbouring bins rest on the same resamples.
-
-    Args:
-        updates: of one task, student and method.
-        column: what to average.
-        edges: ascending, [g + 1].
-        generator: draws the resamples.
-    """
-    runs = binned_runs(updates, column, edges)
-    present = np.isfinite(runs)
-    centre, low, high = np.full((3, runs.shape[1]), np.nan)
-    patterns, pattern_of = np.unique(present, axis=1, return_inverse=True)
-    for index, members in enumerate(patterns.T):
-        bins = np.flatnonzero(pattern_of.reshape(-1) == index)
-        scores = runs[np.ix_(members, bins)].T  # [b, n] of the n runs that have data in these b bins
-        count = scores.shape[1]
-        if count == 0:
-            continue
-        centre[bins] = interquartile_mean(scores[:, :, None])
-        if count > 1:
-            resampled = generator.integers(count, size=(BAND_REPLICATIONS, count))
-            replicated = interquartile_mean(scores[:, resampled][..., None])
-            low[bins], high[bins] = np.quantile(replicated, BAND_ENDS, axis=-1)
-    return Curve(_centres(edges), centre, low, high, present.sum(axis=0).astype(np.int64))
-
-
-MEAN = Averaging("mean ± standard error over seeds", mean_curve)
-
-
-def interquartile(generator: np.random.Generator) -> Averaging:
-    """Interquartile means with bootstrap bands.
-
-    Args:
-        generator: draws the resamples.
-    """
-    return Averaging(
-        "interquartile mean and its 95% bootstrap band over seeds",
-        lambda updates, column, edges: interquartile_curve(updates, column, edges, generator),
-        ENOUGH_RUNS,
-    )
-
-
-def _centres(edges: Floats) -> Floats:
-    return (edges[:-1] + edges[1:]) / 2.0
-
-
-def _divided(numerator: Floats, denominator: npt.NDArray[np.integer]) -> Floats:
-    """The quotient, NaN where the denominator is not positive."""
-    return np.where(denominator > 0, numerator / np.maximum(denominator, 1), np.nan)
-
-
-def _is_cost(name: str) -> bool:
+def is_cost(name: str) -> bool:
     """Whether a column is a cost_i itself, not its error, limit or total."""
     return name.startswith("cost_") and name.removeprefix("cost_").isdigit()
 
 
 def _deployment(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
     chosen = sweep.phases[sweep.phases["phase"] == Phase.DEPLOYMENT.value]
-    rows = chosen[[*KEY, "episodes"]].assign(measure=Measure.DEPLOYMENT.value)
+    rows = chosen[[*KEY, "episodes"]].assign(measure=Measure.DEPLOYMENT.value, exact=False)
     for name in ("episode_return", *costs):
         rows[name] = chosen[name]
         rows[f"{name}_se"] = chosen[f"{name}_std"] / np.sqrt(chosen["episodes"].astype(np.float64))
@@ -422,8 +264,31 @@ def _deployment(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
 def _frozen(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
     values = sweep.evaluations.rename(columns={"policy": "measure"})
     grouped = values.groupby([*KEY, "measure"], observed=True)
-    rows = grouped.size().rename("episodes").reset_index()
+    rows = grouped.size().rename("episodes").reset_index().assign(exact=False)
     for name in ("episode_return", *costs):
         statistics = grouped[name].agg(["mean", "sem"]).reset_index()
         rows[name], rows[f"{name}_se"] = statistics["mean"], statistics["sem"]
     return rows
+
+
+def _with_exact(sampled: pd.DataFrame, exact: pd.DataFrame) -> pd.DataFrame:
+    """Replace sampled means by exact values where there are some; their standard errors are 0."""
+    if not len(exact):
+        return sampled
+    key = [*KEY, "measure"]
+    rows = sampled[key].merge(exact.rename(columns={"policy": "measure"}), on=key, how="left")
+    known = rows["episode_return"].notna().to_numpy()
+    sampled = sampled.assign(exact=known)
+    for name in (str(column) for column in rows if column not in key):
+        values = rows[name].to_numpy(np.float64)
+        sampled[name] = np.where(known, values, sampled[name])
+        sampled[f"{name}_se"] = np.where(
+            known, np.where(np.isnan(values), np.nan, 0.0), sampled[f"{name}_se"]
+        )
+    return sampled
+
+
+def _costs_of(rows: pd.DataFrame) -> list[str]:
+    """Which i have a column deploy_limit_i."""
+    names = [str(name) for name in rows]
+    return [name.removeprefix("deploy_limit_") for name in names if name.startswith("deploy_limit_")]

@@ -1,7 +1,6 @@
 """RiverGrid (paper, section 5 and figure 1): a grid world in which the short way leads through a river.
 
-Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), float32 [width + height + 4];
-    with ``observation: pose`` which (x, y, heading) of all it is, one-hot, float32 [4 width height].
+Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), float32 [width + height + 4].
 Action: Discrete(3), MiniGrid's first three: 0 turn left, 1 turn right, 2 forward (into a wall: stay).
 Reward: -0.1 a step; +10 instead on the step that reaches a goal.
 Cost: ``river`` 1 for every time step that ends on a river tile, turning and bumping there included; on demand
@@ -51,12 +50,6 @@ HORIZON = 200
 HEADINGS = 4
 LEFT, RIGHT, FORWARD = 0, 1, 2
 CostName = Literal["river", "turns", "mud"]
-ObservationName = Literal["coordinates", "pose"]
-
-
-def _is_coordinates(observation: object) -> bool:
-    """So that the option's default makes no trial another than it was before there was a choice."""
-    return observation == "coordinates"
 
 
 class RiverGridOptions(BaseModel):
@@ -71,12 +64,6 @@ class RiverGridOptions(BaseModel):
         default=("river",),
         min_length=1,
         description="The cost functions in order, river (the paper's), turns and mud (ours), 1 a step each.",
-    )
-    observation: ObservationName = Field(
-        default="coordinates",
-        exclude_if=_is_coordinates,
-        description="What is seen: x, y and heading, each one-hot, so that what a network learns of a tile "
-        "carries over to its row and column; or the pose, one-hot as a whole, as in a table (ours).",
     )
 
     @field_validator("costs")
@@ -140,11 +127,9 @@ def state_index(river_map: RiverMap, x: int, y: int, heading: int) -> int:
     return (x * river_map.height + y) * HEADINGS + heading
 
 
-def river_observations(river_map: RiverMap, observation: ObservationName) -> npt.NDArray[np.float32]:
-    """What an agent sees in each state, float32 [S, width + height + 4], or [S, S] with ``pose``."""
+def river_observations(river_map: RiverMap) -> npt.NDArray[np.float32]:
+    """What an agent sees in each state, float32 [S, width + height + 4]."""
     shape = (river_map.width, river_map.height, HEADINGS)
-    if observation == "pose":
-        return np.eye(math.prod(shape), dtype=np.float32)
     columns = np.indices(shape).reshape(3, -1)
     return np.concatenate(
         [np.eye(size, dtype=np.float32)[index] for size, index in zip(shape, columns, strict=True)], axis=1
@@ -204,7 +189,7 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
     def __init__(self, name: str, river_map: RiverMap, options: RiverGridOptions, *, num_envs: int) -> None:
         model = river_cmdp(river_map, costs=options.costs, horizon=options.horizon)
-        observations = river_observations(river_map, options.observation)
+        observations = river_observations(river_map)
         super().__init__(name, model, observations, num_envs=num_envs)
         self.river_map = river_map
 

@@ -13,7 +13,9 @@ from recrl.orchestrator.files.code_changes import has_other_code, other_code_sen
 from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.grid.plan import select
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.tracking.mlflow_sync import last_report, sync, tracking_uri
+from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.export_file import write_in_own_process
+from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 
 DEFAULT_EPISODES = 100  # of an evaluation, for trials that make none themselves
 
@@ -85,6 +87,6 @@ def _tell_mlflow(store: SweepStore, request: EvaluateRequest, console: Console) 
     uri = tracking_uri(store, request.tracking_uri)
     if last_report(store, uri) is None:
         return
-    report = sync(store, uri)
+    report = sync(store, uri, write_export=write_in_own_process)
     if not report.is_up_to_date:
         say(console, f"MLflow     is not up to date ({report.problem}); later: recrl-sweep sync {store.name}")

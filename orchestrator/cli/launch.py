@@ -18,23 +18,25 @@ from recrl.orchestrator.cli.plan import room, say_plan
 from recrl.orchestrator.cli.progress import say_failures
 from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.cli.results import draw
-from recrl.orchestrator.cli.sweeps import DEFAULT_ROOT, storage_of, wanted
+from recrl.orchestrator.cli.sweeps import DEFAULT_ROOT, wanted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import GridSpec, read_grid
 from recrl.orchestrator.grid.plan import Plan
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.redaction import redacted
+from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.status import Standing, SweepProgress, progress
-from recrl.orchestrator.sweep import Mirror, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep import LaunchSettings, Mirror, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
-from recrl.orchestrator.tracking.mlflow_sync import last_report, tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 
 MIRROR_INTERVAL_SECONDS = 5.0
 
@@ -52,11 +54,9 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
 
     store = SweepStore(request.root, grid.name)
     only = wanted(request.only)
-    storage = storage_of(store, request.storage)
-    if storage is not None:
-        storage.objects.probe()
-        storage.mark(store)
-    executor = _executor(grid, storage, request)
+    place = sweep_place(store, request.storage)
+    place.prepare()
+    executor = _executor(grid, place, request)
     at_once, where = room(grid, request)
     uri = tracking_uri(store, request.tracking_uri) if request.mlflow else None
     stop = threading.Event()
@@ -85,21 +85,20 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
         say(console, "Stopping: running trials save where they are. Once more to stop at once.")
 
     with contextlib.ExitStack() as shown, _listening(stop, say_stopping):
-        result = launch(
+        settings = LaunchSettings(
             grid,
-            store,
+            place,
             executor,
-            stop=stop,
             only=only,
             retry_failed=request.retry_failed,
             rerun_damaged=request.rerun_damaged,
             rerun_changed=request.rerun_changed,
-            storage=storage,
             start_mirror=_mirror_to(uri) if uri else None,
             watch=watch,
             finish=finish,
         )
-    kept = f", a mirror of {storage.objects.uri}" if storage else ""
+        result = launch(settings, stop=stop)
+    kept = f", a mirror of {place.address}" if place.address else ""
     say(console, f"Results    {short(store.folder)}{kept}")
     if uri:
         _say_mirrored(result, store, uri, request, console)
@@ -117,14 +116,14 @@ def _listening(stop: threading.Event, say_stopping: Callable[[], None]) -> Abstr
     return stopping_on_signals(stop, say_stopping) if is_main else contextlib.nullcontext()
 
 
-def _executor(grid: GridSpec, storage: RemoteSweep | None, request: LaunchRequest) -> Executor:
+def _executor(grid: GridSpec, place: SweepPlace, request: LaunchRequest) -> Executor:
     if request.ship_package and not request.address:
         raise RecrlError("--ship-package: needs an --address to ship to")
     if request.executor == "inline":
-        return InlineExecutor(storage)
-    if storage is not None and storage.uri.startswith("memory://"):
+        return InlineExecutor()
+    if place.uri.startswith("memory://"):
         raise RecrlError(
-            f"{storage.uri}: is one process's memory, which others do not see; see --executor inline"
+            f"{place.uri}: is one process's memory, which others do not see; see --executor inline"
         )
     from recrl.orchestrator.ray.executor import RayExecutor  # noqa: PLC0415  (imports ray)
 
@@ -137,7 +136,6 @@ def _executor(grid: GridSpec, storage: RemoteSweep | None, request: LaunchReques
         max_concurrent=request.max_concurrent or grid.resources.max_concurrent,
         teacher=grid.resources.teacher,
         silence_seconds=grid.resources.silence_seconds,
-        storage=storage,
     )
 
 

@@ -9,13 +9,14 @@ from rich.console import Console
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short
 from recrl.orchestrator.cli.requests import GridRequest, LaunchRequest, PlanRequest, ValidateRequest
-from recrl.orchestrator.cli.sweeps import pull, storage_of, wanted
+from recrl.orchestrator.cli.sweeps import wanted
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import other_code_sentence
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import GridSpec, read_grid
 from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, trials_at_once, unmeasured
+from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialState
 
 
@@ -40,9 +41,7 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     """Say what a launch would do; nothing is started, and nothing written but the copy of an object store."""
     grid = read_grid(request.grid)
     store = SweepStore(request.root, grid.name)
-    storage = storage_of(store, request.storage)
-    if storage is not None:
-        pull(storage, store)
+    sweep_place(store, request.storage).refresh()
     plan = make_plan(
         grid.trials(),
         store,

@@ -12,15 +12,16 @@ from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
-from recrl.orchestrator.cli.sweeps import open_store, pull, storage_of
+from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import no_curriculum_sentence
 from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.grid.plan import make_plan
+from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
-from recrl.orchestrator.sweep import REQUEST_SECONDS, request_stop
+from recrl.orchestrator.sweep import REQUEST_SECONDS
 
 
 def run_status(request: StatusRequest, console: Console) -> ExitCode:
@@ -78,16 +79,15 @@ def _listed(store: SweepStore) -> list[TrialSpec]:
 def run_stop(request: StopRequest, console: Console) -> ExitCode:
     """Ask the launch that runs a sweep to save its trials and end, and wait until it has."""
     store = open_store(request)
-    storage = storage_of(store, request.storage)
-    still_runs = request_stop(store, storage)
+    place = sweep_place(store, request.storage)
+    still_runs = place.request_stop()
     if not still_runs():
         say(console, f"{store.name}: no launch runs this sweep")
         return ExitCode.OK
     say(console, f"{store.name}: its trials save where they are")
     while still_runs():
         time.sleep(REQUEST_SECONDS)
-    if storage is not None:
-        pull(storage, store)
+    place.refresh()
     say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
     return ExitCode.OK
 
@@ -99,11 +99,11 @@ def run_logs(request: LogsRequest, console: Console) -> ExitCode:
     if request.folder:
         say(console, str(short(_trial(store, text).folder)))
         return ExitCode.OK
-    storage = storage_of(store, request.storage)
     with contextlib.ExitStack() as following:
         if request.follow:
-            if storage is not None and not store.is_locked():
-                following.enter_context(storage.mirrored(store, threading.Event()))
+            if not store.is_locked():
+                place = sweep_place(store, request.storage)
+                following.enter_context(place.mirrored(threading.Event()))
             _wait_for_start(store, text, console)
         for line in display.lines_of(_trial(store, text), follow=request.follow):
             say(console, line)

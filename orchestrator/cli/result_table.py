@@ -8,7 +8,8 @@ from collections.abc import Hashable
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import GROUP, Sweep
+from recrl.analysis.data.labels import GROUP
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report_tables import number, with_error
 from recrl.analysis.statistics.metrics import Measure, outcomes
 

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from recrl.orchestrator.cli.requests import SweepRequest
-from recrl.orchestrator.errors import RecrlError, StorageError
+from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import read_name
+from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.validation import nearest
 
-if TYPE_CHECKING:
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep
-
 DEFAULT_ROOT = Path("runs")
-
-logger = logging.getLogger("recrl.sweep")
 
 
 def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
@@ -60,35 +54,10 @@ def is_sweep(folder: Path) -> bool:
     return (folder / "sweep.json").exists() or (folder / "trials.jsonl").exists()
 
 
-def storage_of(store: SweepStore, given: str | None) -> RemoteSweep | None:
-    """The object store that a sweep is kept in: as given, or as its folder remembers."""
-    if not given and not store.storage_path.exists():
-        return None
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep  # noqa: PLC0415  (imports fsspec)
-
-    return RemoteSweep(given, store.name) if given else RemoteSweep.of(store)
-
-
-def pull(storage: RemoteSweep, store: SweepStore, *, checkpoints: bool = False) -> None:
-    """Bring the sweep's folder up to what is kept, or say that it is not."""
-    if store.is_locked():
-        return  # the launch that runs here does it all the time
-    try:
-        if storage.is_there():
-            storage.mark(store)
-            storage.pull(store, checkpoints=checkpoints)
-    except StorageError as error:
-        if not store.info_path.exists():
-            raise
-        logger.warning("%s; what follows is as of the last look", error)
-
-
 def open_store(request: SweepRequest, *, checkpoints: bool = False) -> SweepStore:
     """The folder of the sweep that is meant, up to date also where it is a mirror."""
     store = sweep_store(request.root, request.sweep, request.storage)
-    storage = storage_of(store, request.storage)
-    if storage is not None:
-        pull(storage, store, checkpoints=checkpoints)
+    sweep_place(store, request.storage).refresh(checkpoints=checkpoints)
     return store
 
 

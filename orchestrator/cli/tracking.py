@@ -11,7 +11,9 @@ from recrl.orchestrator.cli.requests import SyncRequest, UIRequest
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.tracking.mlflow_sync import sync, tracking_uri
+from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.export_file import write_in_own_process
+from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.ui import open_ui
 
 
@@ -35,12 +37,12 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     """Bring MLflow up to the files."""
     store = open_store(request)
     uri = tracking_uri(store, request.tracking_uri)
-    report = sync(store, uri, rebuild=request.rebuild)
+    report = sync(store, uri, rebuild=request.rebuild, write_export=write_in_own_process)
     if not report.is_up_to_date:
         raise TrackingError(
             f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}"
         )
     say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:
-        say(console, f"without a snapshot ({report.remark}): reading it from a server takes longer")
+        say(console, f"without the export file ({report.remark}): readers of MLflow get the last one")
     return ExitCode.OK

@@ -27,7 +27,7 @@ from recrl.teachers.registry import TEACHERS
 OURS = "recrl"
 NAMED = 5  # trials in a sentence, at most
 FOLDERS = ("agents", "environments", "teachers")
-MODULES = ("orchestrator/trial/trial.py", "orchestrator/spec.py")
+MODULES = ("trial/trial.py", "spec.py")  # of the orchestrator
 SUFFIXES = (".py", ".xml", ".txt")  # of what results depend on
 KINDS = (
     ("task", "recrl.tasks", TASKS),
@@ -47,6 +47,8 @@ def code_of(spec: TrialSpec) -> dict[str, str]:
         names = [] if choice.name in ours else [_module_of(choice.name, group)]
         if isinstance(identity := choice.options.get("id"), str) and ":" in identity:
             names.append(identity)  # of Gymnasium: ``module:name``
+        if isinstance(network := choice.options.get("network"), str):
+            names.append(network)
         for name in filter(None, names):
             package = name.partition(":")[0].partition(".")[0]
             if digest := _package_digest(package):
@@ -122,9 +124,16 @@ def _module_of(name: str, group: str) -> str:
 @functools.cache
 def _own_digest() -> str:
     """That of what results depend on in recrl."""
-    files = [path for name in FOLDERS for path in folder_of(name).rglob("*") if path.suffix in SUFFIXES]
-    trial = [folder_of("orchestrator") / Path(module).name for module in MODULES]
-    return _digest({f"{path.parent.name}/{path.name}": path for path in (*files, *trial)})
+    files = {
+        f"{name}/{path.relative_to(folder_of(name))}": path
+        for name in FOLDERS
+        for path in folder_of(name).rglob("*")
+        if path.suffix in SUFFIXES
+    }
+    trial = {f"orchestrator/{module}": folder_of("orchestrator") / module for module in MODULES}
+    if missing := [str(path) for path in trial.values() if not path.is_file()]:
+        raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is not there")
+    return _digest({**files, **trial})
 
 
 def _package_digest(package: str) -> str:

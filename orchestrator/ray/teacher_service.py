@@ -12,9 +12,10 @@ from typing import Any
 import ray
 from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
 
+from recrl.environments.cmdp import CurriculumStep
 from recrl.orchestrator.errors import TeacherUnavailableError
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherState
+from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
 NAMESPACE = "recrl"
 ANSWER_SECONDS = 30.0
@@ -25,13 +26,13 @@ LONGEST_PAUSE_SECONDS = 5.0
 class TeacherService:
     """Answers for any teacher; which one, and where its trial stands, comes with every question."""
 
-    def start(self, spec: TeacherSpec) -> tuple[Lesson, TeacherState]:
+    def start(self, spec: TeacherSpec) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``."""
         return make_teacher(spec).start()
 
     def step(
         self, spec: TeacherSpec, state: TeacherState, report: ProgressReport
-    ) -> tuple[Lesson, TeacherState]:
+    ) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.step``."""
         return make_teacher(spec).step(state, report)
 
@@ -79,21 +80,21 @@ class RayTeacher:
         self._answer_seconds = answer_seconds
         self._patience_seconds = patience_seconds
 
-    def start(self) -> tuple[Lesson, TeacherState]:
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``; raises TeacherUnavailableError if the service stays away."""
         return self._ask(self._service.start, self._spec)
 
-    def step(self, state: TeacherState, report: ProgressReport) -> tuple[Lesson, TeacherState]:
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.step``; raises TeacherUnavailableError if the service stays away."""
         return self._ask(self._service.step, self._spec, state, report)
 
-    def _ask(self, method: Any, *question: Any) -> tuple[Lesson, TeacherState]:
+    def _ask(self, method: Any, *question: Any) -> tuple[CurriculumStep, TeacherState]:
         """Ask until there is an answer: a pure function may be asked again."""
         deadline = time.monotonic() + self._patience_seconds
         pause = 0.1
         while True:
             try:
-                answer: tuple[Lesson, TeacherState] = ray.get(
+                answer: tuple[CurriculumStep, TeacherState] = ray.get(
                     method.remote(*question), timeout=self._answer_seconds
                 )
                 return answer

@@ -20,7 +20,10 @@ from pathlib import Path
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.redaction import RedactedStream
 from recrl.orchestrator.status import Standing, standing_of
-from recrl.orchestrator.tracking.mlflow_sync import ENVIRONMENT, SyncReport, Tracker, mirror_folder
+from recrl.orchestrator.tracking.client import ENVIRONMENT
+from recrl.orchestrator.tracking.export_file import write_in_own_process
+from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker
+from recrl.orchestrator.tracking.positions import mirror_folder
 
 POLITENESS = 10  # added to the process's nice value: about a tenth of a core that a trial also wants
 LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is away
@@ -88,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stdout, sys.stderr = RedactedStream(sys.stdout), RedactedStream(sys.stderr)
     os.nice(POLITENESS)
     store = SweepStore(arguments.folder.parent, arguments.folder.name)
-    tracker = Tracker(store, os.environ["MLFLOW_TRACKING_URI"])
+    tracker = Tracker(store, os.environ["MLFLOW_TRACKING_URI"], write_in_own_process)
     wait = 0.0  # a launch that had nothing to do is over already: one pass is enough
     while not _is_over(arguments.parent, wait):
         report = _pass(tracker, live=True)

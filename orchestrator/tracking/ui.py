@@ -12,8 +12,10 @@ from dataclasses import dataclass
 
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.store import SweepStore
-from recrl.orchestrator.tracking.mlflow_sync import is_server, last_report, mirror_folder, sync
+from recrl.orchestrator.tracking.address import is_server
+from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 from recrl.orchestrator.tracking.points import charts_page
+from recrl.orchestrator.tracking.positions import mirror_folder
 
 # Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.
 SETTINGS = ("DO_NOT_TRACK=true", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false")

@@ -4,10 +4,11 @@ Knows neither Ray nor MLflow: an executor runs it, a mirror shows it. All of a t
 optimisers, multipliers, teacher, environments, generators, counters, partial episodes) is in one tree, so a
 trial killed anywhere and resumed gives the bytes of one that never stopped.
 
-The walk of an update: collect T x B steps under the lesson in force; append the episodes that finished;
-``agent.update(rollout, episode costs, limits)``; ``teacher.step(state, report)`` gives the next lesson. When
-the budget B is spent the phase is deployment, the limits are d_d, the noise is 0 and the teacher is not asked
-any more; the student goes on learning. At the end the policy is frozen and evaluated.
+The walk of an update: collect T x B environment steps; append the episodes that finished;
+``agent.update(rollout, episode costs, step)`` under the curriculum's step, then ``teacher.step(state,
+report)`` for the next one. When the budget B is spent the phase is deployment, the limits are d_d, the noise
+is 0 and the teacher is not asked any more; the agent goes on learning. At the end the policy is frozen and
+evaluated.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from recrl.agents.agent import Agent, DiscretePolicy, EntropySeeker
+from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import EpisodeStats, Floats, Phase
+from recrl.environments.cmdp import CurriculumStep, EpisodeStats, Floats, Phase
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
@@ -49,7 +50,7 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.heartbeat import Heartbeat
 from recrl.orchestrator.trial.rollout_check import check_rollout
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, last_lesson
+from recrl.teachers.teacher import ProgressReport, Teacher
 
 COMMIT_SECONDS = 20.0
 HEARTBEAT_SECONDS = 2.0
@@ -107,7 +108,7 @@ class Trial:
         tree = writer.restore()
         if tree is None:
             self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
-            self._lesson, self._teacher_state = teacher.start()
+            self._step, self._teacher_state = teacher.start()
             self.update = self.env_steps = self._episodes = 0
             logger.info("started: %s", spec.title)
         else:
@@ -126,15 +127,15 @@ class Trial:
 
     def advance(self) -> None:
         """Do one policy update: collect, record, learn, ask the teacher."""
-        phase, lesson = self.phase, self._lesson
+        phase, step = self.phase, self._step
         clock = time.process_time()
         rollout, finished = self._collector.collect(self._agent, self._generator)
         check_rollout(rollout, self.spec.task.label)
         collect_seconds, clock = time.process_time() - clock, time.process_time()
-        episodes = self._number(finished, phase, lesson)
+        episodes = self._number(finished, phase, step)
         self.env_steps += self.spec.steps_per_update
         costs = episode_costs(finished, self._cmdp.num_costs)
-        metrics = self._agent.update(rollout, costs, lesson.limits.array)
+        metrics = self._agent.update(rollout, costs, step)
         self.update += 1
         for episode in episodes:
             self._writer.append_episode(episode)
@@ -144,24 +145,26 @@ class Trial:
             "end_step": self.env_steps,
             "episodes": len(episodes),
             "episode_return": _mean([episode.episode_return for episode in episodes]),
-            "noise": lesson.policy_noise,
+            "noise": step.policy_noise,
             "time": round(time.time(), 3),
             "collect_seconds": round(collect_seconds, 6),
             "update_seconds": round(time.process_time() - clock, 6),
             **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
-            **{f"limit_{i}": limit for i, limit in enumerate(lesson.limits)},
-            **self._shown_temperature(lesson),
+            **{f"limit_{i}": limit for i, limit in enumerate(step.limits)},
+            **_temperature(step),
         }
         self._writer.append_update({**row, **self._own_metrics(metrics, row)})
         if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
             logger.info("%s", self._told(row))
-        self._next_lesson(episodes, rollout.observations)
+        self._next_step(episodes, rollout.observations)
 
     def save(self) -> None:
         """Commit everything up to the last update, with a checkpoint."""
-        start_limits = self._teacher_state.get("start_limits")
         self._writer.commit(
-            self._state_dict(), update=self.update, env_steps=self.env_steps, start_limits=start_limits
+            self._state_dict(),
+            update=self.update,
+            env_steps=self.env_steps,
+            start_limits=self._step.to_json()["start_limits"],
         )
 
     def evaluate(self) -> None:
@@ -184,7 +187,7 @@ class Trial:
             self._writer.write_policy(table)
 
     def _number(
-        self, finished: Sequence[FinishedEpisode], phase: Phase, lesson: Lesson
+        self, finished: Sequence[FinishedEpisode], phase: Phase, step: CurriculumStep
     ) -> tuple[EpisodeStats, ...]:
         """The finished episodes of a rollout, with their place in the trial."""
         episodes = tuple(
@@ -195,43 +198,41 @@ class Trial:
                 length=episode.length,
                 episode_return=episode.episode_return,
                 costs=episode.costs,
-                limits=lesson.limits,
-                noise=lesson.policy_noise,
+                limits=step.limits,
+                noise=step.policy_noise,
             )
             for offset, episode in enumerate(finished)
         )
         self._episodes += len(episodes)
         return episodes
 
-    def _next_lesson(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
-        """Ask the teacher, or enter deployment; apply the policy noise and the temperature it wants."""
+    def _next_step(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
+        """Ask the teacher, or enter deployment; add the policy noise that the next step asks for."""
         if self.phase is Phase.DEPLOYMENT:
             self._warn_of_hard_landing()
-            self._lesson = Lesson(self.spec.deploy_limits)
+            self._step = self._step.in_deployment(self.spec.deploy_limits)
             return
-        measured = self._teacher_state.get("start_limits")
+        before = self._step
         report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
-        self._lesson, self._teacher_state = self._teacher.step(self._teacher_state, report)
-        if self._teacher_state.get("start_limits") != measured:
-            limits = self._teacher_state["start_limits"]
+        self._step, self._teacher_state = self._teacher.step(self._teacher_state, report)
+        if self._step.start_limits is not None and self._step.start_limits != before.start_limits:
+            limits = self._step.start_limits.to_json()
             self._event("start limits measured", limits=limits)
             if self.spec.is_no_curriculum(limits):
                 self._event("the curriculum is none", limits=limits)
-        if self._lesson.policy_noise > 0.0:
+        if self._step.policy_noise > 0.0:
             flat = observations.reshape(-1, observations.shape[-1])
-            done = self._agent.add_noise(self._lesson.policy_noise, flat)
-            self._event("policy noise", policy_noise=self._lesson.policy_noise, **done)
-        if self._lesson.temperature > 0.0:
-            if not isinstance(self._agent, EntropySeeker):
-                raise TypeError(
-                    f"method {self.spec.method.name} needs an agent that has reward_entropy, "
-                    f"{self.spec.agent.name} has not; choose another of the two"
-                )
-            self._agent.reward_entropy(self._lesson.temperature)
+            done = self._agent.add_noise(self._step.policy_noise, flat)
+            self._event("policy noise", policy_noise=self._step.policy_noise, **done)
+        if self._step.rewards_entropy and not isinstance(self._agent, EntropyRewarded):
+            raise TypeError(
+                f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "
+                "not support; choose another of the two"
+            )
 
     def _warn_of_hard_landing(self) -> None:
         """Record an event if deployment begins with limits that the agent was never near."""
-        before, after = self._lesson.limits, self.spec.deploy_limits
+        before, after = self._step.limits, self.spec.deploy_limits
         if any(
             late > (1.0 + HARD_LANDING) * max(final, 1.0) for late, final in zip(before, after, strict=True)
         ):
@@ -257,10 +258,6 @@ class Trial:
             )
         return metrics
 
-    def _shown_temperature(self, lesson: Lesson) -> dict[str, float]:
-        """The temperature, for teachers that have one."""
-        return {"temperature": lesson.temperature} if "temperature" in self._teacher_state else {}
-
     def _event(self, name: str, **details: Any) -> None:
         event = {"update": self.update, "end_step": self.env_steps, "event": name, **details}
         self._writer.append_event(event)
@@ -272,11 +269,7 @@ class Trial:
             "update": self.update,
             "env_steps": self.env_steps,
             "episodes": self._episodes,
-            "lesson": {
-                "limits": self._lesson.limits.to_json(),
-                "policy_noise": self._lesson.policy_noise,
-                "temperature": self._lesson.temperature,
-            },
+            "curriculum_step": self._step.to_json(),
             "teacher": dict(self._teacher_state),
             "agent": self._agent.state_dict(),
             "environments": self._environments.state_dict(),
@@ -288,7 +281,7 @@ class Trial:
         self.update = tree["update"]
         self.env_steps = tree["env_steps"]
         self._episodes = tree["episodes"]
-        self._lesson = last_lesson(tree["lesson"])
+        self._step = CurriculumStep.from_json(tree["curriculum_step"])
         self._teacher_state = tree["teacher"]
         self._agent.load_state_dict(tree["agent"])
         self._environments.load_state_dict(tree["environments"])
@@ -537,6 +530,11 @@ class _Log(logging.FileHandler):
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
         pass
+
+
+def _temperature(step: CurriculumStep) -> dict[str, float]:
+    """The column of the entropy coefficient; none where the curriculum never rewards entropy."""
+    return {} if step.entropy_coefficient is None else {"temperature": step.entropy_coefficient}
 
 
 def _mean(values: Sequence[float] | Floats) -> float:

@@ -51,7 +51,7 @@ def load_sweep(
     """
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415
     from recrl.orchestrator.cli.sweeps import sweep_store  # noqa: PLC0415
-    from recrl.orchestrator.tracking.mlflow_sync import checked_uri  # noqa: PLC0415
+    from recrl.orchestrator.tracking.address import checked_uri  # noqa: PLC0415
 
     with following(trust):
         if "://" in str(source):

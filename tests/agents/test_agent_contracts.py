@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from recrl.agents.agent import Agent, EntropySeeker, Rollout
+from recrl.agents.agent import Agent, EntropyRewarded, Rollout
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.config import AscentConfig
-from recrl.agents.constraints.multiplier_rules import STARTS
 from recrl.agents.errors import DivergedError
 from recrl.agents.registry import AGENTS, agent_config, make_agent
-from recrl.environments.cmdp import Floats
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.files.checkpoint import decode, encode
 
@@ -40,12 +39,13 @@ class Lessons:
     def collect(self) -> tuple[Rollout, tuple[FinishedEpisode, ...]]:
         return self.collector.collect(self.agent, self.generator)
 
-    def limits(self, value: float = FINITE) -> Floats:
-        return np.full(self.num_costs, value)
+    def step(self, limit: float = FINITE, entropy_coefficient: float | None = None) -> CurriculumStep:
+        return CurriculumStep(CostLimits((limit,) * self.num_costs), entropy_coefficient=entropy_coefficient)
 
-    def update(self, limit: float = FINITE) -> dict[str, float]:
+    def update(self, limit: float = FINITE, entropy_coefficient: float | None = None) -> dict[str, float]:
         rollout, episodes = self.collect()
-        return self.agent.update(rollout, episode_costs(episodes, self.num_costs), self.limits(limit))
+        costs = episode_costs(episodes, self.num_costs)
+        return self.agent.update(rollout, costs, self.step(limit, entropy_coefficient))
 
 
 def flattened(tree: Any) -> list[Any]:
@@ -69,7 +69,7 @@ def test_every_update_returns_the_same_metrics_and_no_infinity(agent: str, task:
         assert not any(math.isinf(value) for value in metrics.values())
         keys.add(tuple(sorted(metrics)))
     rollout, _ = lessons.collect()
-    none_finished = lessons.agent.update(rollout, np.empty((0, lessons.num_costs)), lessons.limits())
+    none_finished = lessons.agent.update(rollout, np.empty((0, lessons.num_costs)), lessons.step())
     keys.add(tuple(sorted(none_finished)))
     assert len(keys) == 1
     for index in range(lessons.num_costs):
@@ -89,8 +89,8 @@ def test_resumed_is_uninterrupted_bit_for_bit(agent: str, task: str) -> None:
     for _ in range(SEVERAL_UPDATES):
         rollout, episodes = lessons.collect()
         costs = episode_costs(episodes, lessons.num_costs)
-        expected = lessons.agent.update(rollout, costs, lessons.limits())
-        found = resumed.agent.update(rollout, costs, lessons.limits())
+        expected = lessons.agent.update(rollout, costs, lessons.step())
+        found = resumed.agent.update(rollout, costs, lessons.step())
         assert repr(found) == repr(expected)
     assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
 
@@ -141,11 +141,11 @@ def test_the_student_knows_no_limit_of_its_own(agent: str, task: str) -> None:
     one, other = Lessons(agent, task), Lessons(agent, task)
     rollout, episodes = one.collect()
     costs = episode_costs(episodes, one.num_costs)
-    one.agent.update(rollout, costs, one.limits(1.0))
-    other.agent.update(rollout, costs, other.limits(2.0))
+    one.agent.update(rollout, costs, one.step(1.0))
+    other.agent.update(rollout, costs, other.step(2.0))
     one.agent.load_state_dict(other.agent.state_dict())
-    assert repr(one.agent.update(rollout, costs, one.limits(2.0))) == repr(
-        other.agent.update(rollout, costs, other.limits(2.0))
+    assert repr(one.agent.update(rollout, costs, one.step(2.0))) == repr(
+        other.agent.update(rollout, costs, other.step(2.0))
     )
 
 
@@ -163,118 +163,23 @@ def test_noise_returns_the_same_metrics_and_keeps_the_student_learning(agent: st
 
 @every_agent
 @every_task
-def test_entropy_that_is_rewarded_rises_in_one_update_and_survives_a_checkpoint(
-    agent: str, task: str
-) -> None:
-    plain, warm, resumed = (Lessons(agent, task, {"compaction": False}) for _ in range(3))
-    for student in (plain, warm, resumed):
-        assert isinstance(student.agent, EntropySeeker)
+def test_entropy_that_is_rewarded_rises_in_that_update_alone(agent: str, task: str) -> None:
+    plain, warm = (Lessons(agent, task, {"compaction": False}) for _ in range(2))
+    for each in (plain, warm):
+        assert isinstance(each.agent, EntropyRewarded)
         for _ in range(2):
-            student.update()
-    warm.agent.reward_entropy(1e4)  # type: ignore[attr-defined]  # asserted above
-    resumed.agent.load_state_dict(decode(encode(warm.agent.state_dict()), source="memory"))
-    kept = 1000.0  # a student that recovers from a violation looks at nothing else
-    entropies = [student.update(kept)["entropy"] for student in (plain, warm, resumed)]
-    assert entropies[1] > entropies[0]
-    assert entropies[2] == entropies[1]
-    cooled = Lessons(agent, task, {"compaction": False})
-    cooled.agent.load_state_dict(warm.agent.state_dict())
-    assert warm.agent.state_dict()["temperature"] == 0.0
+            each.update()
+    kept = 1000.0  # an agent that recovers from a violation looks at nothing else
+    assert warm.update(kept, entropy_coefficient=1e4)["entropy"] > plain.update(kept)["entropy"]
+    resumed = Lessons(agent, task, {"compaction": False})
+    resumed.agent.load_state_dict(warm.agent.state_dict())
     rollout, episodes = warm.collect()
     costs = episode_costs(episodes, warm.num_costs)
-    updates = [each.agent.update(rollout, costs, each.limits()) for each in (warm, cooled)]
-    assert repr(updates[0]) == repr(updates[1])
-
-
-@pytest.mark.parametrize("rule", STARTS)
-def test_a_student_that_waits_sums_up_no_violation_of_a_noisy_policy(rule: str) -> None:
-    options = {
-        **{"multiplier_rule": rule, "multiplier_initial": 0.5, "multiplier_proportional": 0.0},
-        **{"multiplier_waits": True, "multiplier_unit": "cost"},
-    }
-    lessons, resumed = (Lessons("ppo-lag", "two-state", options) for _ in range(2))
-    rollout, _ = lessons.collect()
-    lessons.agent.add_noise(0.1, rollout.observations.reshape(-1, rollout.observations.shape[-1]))
-    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
-    violated = 0.1
-    assert [student.update(violated)["multiplier_0"] for student in (lessons, resumed)] == pytest.approx(
-        [0.5] * 2
+    found, expected = (
+        each.agent.update(rollout, costs, CurriculumStep(warm.step().limits, 0.0, coefficient))
+        for each, coefficient in ((warm, 0.0), (resumed, None))
     )
-    assert lessons.update(violated)["multiplier_0"] > 0.5
-
-
-@pytest.mark.parametrize("agent", ["ppo-lag", "trpo-lag"])
-def test_a_geometric_price_comes_down_faster_from_where_it_is_high(agent: str) -> None:
-    fall = {}
-    for geometric in (False, True):
-        options = {
-            **{"multiplier_initial": 9.0, "multiplier_step": 0.1, "multiplier_proportional": 0.0},
-            "multiplier_geometric": geometric,
-        }
-        lessons = Lessons(agent, "two-state", options)
-        metrics = lessons.update(1e9)
-        fall[geometric] = metrics["multiplier_0"]
-    # Both begin at 9 and differ only in the unit that the multipliers are reported in.
-    assert fall[True] / fall[False] == pytest.approx((10.0 * math.exp(-0.1) - 1.0) / 8.9)
-
-
-def test_a_geometric_price_of_another_rule_is_refused() -> None:
-    with pytest.raises(ValueError, match="with the rule projected it must be false"):
-        Lessons("ppo-lag", "two-state", {"multiplier_rule": "projected", "multiplier_geometric": True})
-
-
-@every_agent
-@pytest.mark.parametrize("task", ["two-state", "continuous-bandit"])
-def test_noise_changes_the_trust_region_of_its_update_alone(agent: str, task: str) -> None:
-    """Two updates, the first after noise, are those of students that had its radius and then their own."""
-    wide, narrow = {"target_kl": 0.02}, {"target_kl": 0.0005}
-    student = Lessons(agent, task, {**narrow, "noisy_target_kl": 0.02})
-    for options in (wide, narrow):
-        other = Lessons(agent, task, options)
-        state = student.agent.state_dict()
-        other.agent.load_state_dict(state)
-        rollout, episodes = student.collect()
-        if options is wide:
-            observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
-            for each in (student, other):
-                each.agent.add_noise(0.1, observations)
-        costs = episode_costs(episodes, 1)
-        metrics = [each.agent.update(rollout, costs, each.limits()) for each in (student, other)]
-        assert metrics[0] == pytest.approx(metrics[1], rel=0, abs=0, nan_ok=True)
-        assert flattened(student.agent.state_dict()) == flattened(other.agent.state_dict())
-    assert metrics[0]["kl"] < 0.002
-
-
-@every_agent
-def test_a_margin_is_a_lower_limit(agent: str) -> None:
-    """A student with a margin learns what one without it does from a limit that is lower by as much."""
-    rule = {"multiplier_rule": "projected", "multiplier_unit": "cost"}  # the others know the limit, too
-    options = rule if agent in {"ppo-lag", "trpo-lag", "focops"} else {}
-    careful, other = (Lessons(agent, "two-state", options | margin) for margin in ({"limit_margin": 2.0}, {}))
-    rollout, episodes = careful.collect()
-    costs = episode_costs(episodes, 1)
-    margin = 2.0 * costs.std(axis=0, ddof=1) / math.sqrt(len(costs))
-    assert margin > 0.0
-    metrics = careful.agent.update(rollout, costs, careful.limits())
-    assert metrics == pytest.approx(other.agent.update(rollout, costs, other.limits() - margin), nan_ok=True)
-
-
-@pytest.mark.parametrize("agent", ["cpo", "pcpo", "trpo"])
-def test_with_a_temperature_a_student_settles(agent: str) -> None:
-    """Where nothing is left to gain, steps to the edge of the trust region lead anywhere."""
-    late = {}
-    for temperature in (0.0, 0.3):
-        options = {"target_kl": 0.05, "temperature": temperature, "critic_steps": 40}
-        lessons = Lessons(agent, "two-state", options)
-        entropies = [lessons.update(math.inf)["entropy"] for _ in range(60)]
-        late[temperature] = max(entropies[30:])
-    assert late[0.3] < 0.01
-    assert late[0.0] > 0.1
-
-
-def test_a_margin_of_the_worst_episodes_is_refused() -> None:
-    with pytest.raises(ValueError, match="with the constraint cvar it must be 0, got 1"):
-        Lessons("cpo", "two-state", {"constraint": "cvar", "limit_margin": 1.0})
+    assert repr(found) == repr(expected)
 
 
 @every_agent
@@ -290,7 +195,7 @@ def test_a_reward_that_is_not_a_number_is_named(agent: str) -> None:
     rewards = rollout.rewards.copy()
     rewards[0, 0] = math.nan
     with pytest.raises(DivergedError, match="rewards and costs must be finite, got 1 of 160 that are not"):
-        lessons.agent.update(replace(rollout, rewards=rewards), episode_costs(episodes, 1), lessons.limits())
+        lessons.agent.update(replace(rollout, rewards=rewards), episode_costs(episodes, 1), lessons.step())
 
 
 @every_agent
@@ -329,8 +234,8 @@ def test_a_student_of_minibatches_resumes_bit_for_bit(agent: str, task: str) -> 
     for _ in range(2):
         rollout, episodes = lessons.collect()
         costs = episode_costs(episodes, lessons.num_costs)
-        expected = lessons.agent.update(rollout, costs, lessons.limits())
-        assert repr(resumed.agent.update(rollout, costs, lessons.limits())) == repr(expected)
+        expected = lessons.agent.update(rollout, costs, lessons.step())
+        assert repr(resumed.agent.update(rollout, costs, lessons.step())) == repr(expected)
         if isinstance(agent_config(agent, options), AscentConfig):
             assert expected["policy_steps"] >= 1.0
     assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
@@ -344,24 +249,8 @@ def test_a_bound_on_the_worst_episodes_returns_the_same_metrics_and_resumes(agen
     resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
     rollout, _ = lessons.collect()
     none_finished = np.empty((0, 2))
-    expected = lessons.agent.update(rollout, none_finished, lessons.limits())
-    assert repr(resumed.agent.update(rollout, none_finished, lessons.limits())) == repr(expected)
-
-
-@pytest.mark.parametrize("agent", ["cpo", "pcpo"])
-@every_task
-def test_a_student_that_judges_its_steps_resumes_bit_for_bit(agent: str, task: str) -> None:
-    options = {"cross_fitting": True}
-    lessons, resumed = Lessons(agent, task, options), Lessons(agent, task, options)
-    keys = {tuple(sorted(lessons.update(limit))) for limit in (FINITE, math.inf, 0.0)}
-    resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
-    rollout, episodes = lessons.collect()
-    for costs in (episode_costs(episodes, lessons.num_costs), np.empty((0, lessons.num_costs))):
-        expected = lessons.agent.update(rollout, costs, lessons.limits())
-        assert repr(resumed.agent.update(rollout, costs, lessons.limits())) == repr(expected)
-        keys.add(tuple(sorted(expected)))
-    assert len(keys) == 1
-    assert flattened(resumed.agent.state_dict()) == flattened(lessons.agent.state_dict())
+    expected = lessons.agent.update(rollout, none_finished, lessons.step())
+    assert repr(resumed.agent.update(rollout, none_finished, lessons.step())) == repr(expected)
 
 
 def held_bytes() -> int:
@@ -392,7 +281,7 @@ def test_a_student_on_a_gpu_learns_what_one_on_a_cpu_learns(agent: str, task: st
     np.testing.assert_array_equal(on_gpu.agent.state_dict()["policy"], on_cpu.agent.state_dict()["policy"])
     rollout, episodes = on_cpu.collect()
     costs = episode_costs(episodes, on_cpu.num_costs)
-    found, expected = (each.agent.update(rollout, costs, each.limits()) for each in (on_gpu, on_cpu))
+    found, expected = (each.agent.update(rollout, costs, each.step()) for each in (on_gpu, on_cpu))
     for key, value in expected.items():
         assert found[key] == pytest.approx(value, rel=0.02, abs=1e-3, nan_ok=True), key
     on_cpu.agent.load_state_dict(on_gpu.agent.state_dict())

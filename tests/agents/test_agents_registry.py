@@ -6,7 +6,8 @@ import sys
 import pytest
 from pydantic import ValidationError
 
-from recrl.agents.config import CPOConfig, PPOLagConfig, StudentConfig
+from recrl.agents.algorithms.configs import CPOConfig, PPOLagConfig
+from recrl.agents.config import ActorCriticConfig
 from recrl.agents.registry import AGENTS, agent_config, find_agent
 from recrl.environments.plugins import UnknownNameError
 
@@ -42,7 +43,7 @@ def test_every_option_is_described_and_its_source_named(name: str) -> None:
 @pytest.mark.parametrize("name", AGENTS)
 def test_every_paper_value_is_an_option_and_is_valid(name: str) -> None:
     config = agent_config(name, {"preset": "paper"})
-    assert isinstance(config, StudentConfig)
+    assert isinstance(config, ActorCriticConfig)
     for option, value in config.paper.items():
         assert getattr(config, option) == value
 

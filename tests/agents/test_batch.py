@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recrl.agents.learning.batch import LearningBatch, distinct_rows
+from recrl.agents.learning.batch import LearningBatch, find_repeated
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 
 ROWS = np.eye(4, dtype=np.float32)
@@ -13,7 +13,7 @@ ACTIONS = np.array([0, 1, 1, 0, 0, 1, 0, 0, 1, 0])
 
 
 def test_distinct_rows_are_found_and_lead_back_to_the_samples() -> None:
-    found = distinct_rows(ROWS[STATES])
+    found = find_repeated(ROWS[STATES])
     assert found is not None
     first, row = found
     assert len(first) == 3
@@ -23,23 +23,29 @@ def test_distinct_rows_are_found_and_lead_back_to_the_samples() -> None:
 def test_rows_that_seldom_repeat_are_left_alone() -> None:
     observations = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
     observations[:10] = observations[10:20]
-    assert distinct_rows(observations) is None
+    assert find_repeated(observations) is None
 
 
 @pytest.mark.parametrize("actions", [ACTIONS, np.linspace(-1.0, 1.0, 10, dtype=np.float32)[:, None]])
 @pytest.mark.parametrize("compact", [True, False])
 def test_weights_and_sums_are_means_over_samples(actions: np.ndarray, compact: bool) -> None:
-    batch = LearningBatch.gather(ROWS[STATES], actions, compact=compact)
-    assert float(batch.row_weights.sum()) == pytest.approx(1.0)
+    batch = LearningBatch.deduplicate(ROWS[STATES], actions, compact=compact)
+    assert float(batch.observation_weights.sum()) == pytest.approx(1.0)
     values = np.random.default_rng(0).normal(size=(10, 2))
-    np.testing.assert_allclose(batch.per_row(values).sum(axis=0), values.mean(axis=0))
-    np.testing.assert_allclose(batch.per_decision(values).numpy().sum(axis=0), values.mean(axis=0), atol=1e-6)
-    rows = batch.rows if batch.decision_rows is None else batch.rows[batch.decision_rows]
+    np.testing.assert_allclose(batch.per_observation(values).sum(axis=0), values.mean(axis=0))
+    np.testing.assert_allclose(batch.per_pair(values).numpy().sum(axis=0), values.mean(axis=0), atol=1e-6)
+    rows = (
+        batch.unique_observations
+        if batch.pair_observations is None
+        else batch.unique_observations[batch.pair_observations]
+    )
     if compact and actions is ACTIONS:
-        assert (len(batch.rows), len(rows), len(batch.actions)) == (3, 6, 6)
+        assert (len(batch.unique_observations), len(rows), len(batch.actions)) == (3, 6, 6)
     else:
         assert len(rows) == len(batch.actions) == 10
-    np.testing.assert_array_equal(batch.per_sample(batch.rows.numpy().astype(np.float64)), ROWS[STATES])
+    np.testing.assert_array_equal(
+        batch.per_sample(batch.unique_observations.numpy().astype(np.float64)), ROWS[STATES]
+    )
 
 
 def test_surrogates_are_the_same_with_and_without_collapsing() -> None:
@@ -48,12 +54,16 @@ def test_surrogates_are_the_same_with_and_without_collapsing() -> None:
     ratios = np.exp(log_ratios)[STATES, ACTIONS]
     expected = np.minimum(ratios * advantages, np.clip(ratios, 0.8, 1.2) * advantages).mean()
     for compact in (True, False):
-        batch = LearningBatch.gather(ROWS[STATES], ACTIONS, compact=compact)
-        rows = batch.rows if batch.decision_rows is None else batch.rows[batch.decision_rows]
+        batch = LearningBatch.deduplicate(ROWS[STATES], ACTIONS, compact=compact)
+        rows = (
+            batch.unique_observations
+            if batch.pair_observations is None
+            else batch.unique_observations[batch.pair_observations]
+        )
         chosen = torch.from_numpy(np.exp(log_ratios)).float()[rows.argmax(dim=1), batch.actions]
         signed = SignedAdvantages.split(batch, advantages)
         assert clipped_surrogate(chosen, signed, 0.2).item() == pytest.approx(expected, abs=1e-6)
-        plain = surrogate(chosen, batch.per_decision(advantages)).item()
+        plain = surrogate(chosen, batch.per_pair(advantages)).item()
         assert plain == pytest.approx((ratios * advantages).mean(), abs=1e-6)
 
 
@@ -68,7 +78,7 @@ def test_the_clipped_surrogate_is_pessimistic_by_hand() -> None:
 def distinct_batch(num_samples: int = 10) -> LearningBatch:
     """Each sample its own row: the number of the sample."""
     observations = np.arange(num_samples, dtype=np.float32)[:, None]
-    return LearningBatch.gather(observations, np.arange(num_samples), compact=True)
+    return LearningBatch.deduplicate(observations, np.arange(num_samples), compact=True)
 
 
 def test_a_pass_has_every_sample_once_in_a_new_order() -> None:
@@ -79,8 +89,8 @@ def test_a_pass_has_every_sample_once_in_a_new_order() -> None:
     parts = batch.parts(4, generator)
     for _ in range(2):
         found = [next(parts) for _ in range(3)]
-        assert [len(part.rows) for part in found] == [4, 3, 3]
-        passes.append([row for part in found for row in part.rows[:, 0].tolist()])
+        assert [len(part.unique_observations) for part in found] == [4, 3, 3]
+        passes.append([row for part in found for row in part.unique_observations[:, 0].tolist()])
         assert sorted(passes[-1]) == list(range(10))
     assert passes[0] != passes[1]
 
@@ -88,10 +98,10 @@ def test_a_pass_has_every_sample_once_in_a_new_order() -> None:
 def test_a_minibatch_picks_its_own_of_the_samples_values() -> None:
     part = distinct_batch().minibatch(np.array([7, 2]))
     values = 10.0 * np.arange(10.0)
-    assert part.rows.tolist() == [[7.0], [2.0]]
+    assert part.unique_observations.tolist() == [[7.0], [2.0]]
     assert part.actions.tolist() == [7, 2]
-    assert part.per_row(values).tolist() == part.per_decision(values).tolist() == [35.0, 10.0]
-    assert float(part.row_weights.sum()) == 1.0
+    assert part.per_observation(values).tolist() == part.per_pair(values).tolist() == [35.0, 10.0]
+    assert float(part.observation_weights.sum()) == 1.0
 
 
 @pytest.mark.parametrize("size", [None, 10, 100])
@@ -103,14 +113,21 @@ def test_a_batch_no_larger_than_a_minibatch_is_not_parted(size: int | None) -> N
 
 
 def test_repeated_rows_are_not_parted() -> None:
-    batch = LearningBatch.gather(ROWS[STATES], ACTIONS, compact=True)
+    batch = LearningBatch.deduplicate(ROWS[STATES], ACTIONS, compact=True)
     assert next(batch.parts(1, np.random.default_rng(0))) is batch
 
 
 def test_more_distinct_rows_than_asked_for_leave_the_samples_alone() -> None:
-    batch = LearningBatch.gather(ROWS[STATES], ACTIONS, compact=True, most_rows=2)
-    assert len(batch.rows) == 10
-    assert len(LearningBatch.gather(ROWS[STATES], ACTIONS, compact=True, most_rows=3).rows) == 3
+    batch = LearningBatch.deduplicate(ROWS[STATES], ACTIONS, compact=True, most_observations=2)
+    assert len(batch.unique_observations) == 10
+    assert (
+        len(
+            LearningBatch.deduplicate(
+                ROWS[STATES], ACTIONS, compact=True, most_observations=3
+            ).unique_observations
+        )
+        == 3
+    )
 
 
 def test_thinning_keeps_the_samples_shares() -> None:
@@ -118,10 +135,10 @@ def test_thinning_keeps_the_samples_shares() -> None:
     rows, weights = distinct_batch(100).thinned(20, generator)
     assert len(set(rows[:, 0].tolist())) == 20
     assert weights.tolist() == pytest.approx([0.05] * 20)
-    repeated = LearningBatch.gather(
+    repeated = LearningBatch.deduplicate(
         np.repeat(np.eye(30, dtype=np.float32), 4, 0), np.zeros(120, np.int64), compact=True
     )
     rows, weights = repeated.thinned(20, generator)
     assert len(rows) <= 20
     assert float(weights.sum()) == pytest.approx(1.0)
-    assert repeated.thinned(30, generator)[0] is repeated.rows
+    assert repeated.thinned(30, generator)[0] is repeated.unique_observations

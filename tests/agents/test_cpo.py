@@ -7,8 +7,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
+from recrl.agents.algorithms.configs import CPOConfig
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
-from recrl.agents.config import CPOConfig
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.learning.actor_critic import improve_and_measure
 from recrl.agents.learning.batch import LearningBatch
@@ -32,7 +32,7 @@ def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floa
     actions = policy.sample(observations, generator)
     liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
     advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    return policy, LearningBatch.gather(observations, actions, compact=True), advantages
+    return policy, LearningBatch.deduplicate(observations, actions, compact=True), advantages
 
 
 def improve(
@@ -47,12 +47,13 @@ def improve(
         np.zeros(2),
         math.nan if math.isnan(gaps[0]) else LENGTH,
     )
-    rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA), num_costs=2)
-    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
+    rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
+    experience = Experience.of(policy, batch, advantages, constraints)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
     old = StochasticPolicy(3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0))
-    moved = old.distribution(batch.rows).divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]
-    metrics["kl"] = float(torch.dot(batch.row_weights, moved))
+    rows = batch.unique_observations
+    moved = old.distribution(rows).divergence(policy.distribution(rows))  # type: ignore[arg-type]
+    metrics["kl"] = float(torch.dot(batch.observation_weights, moved))
     return metrics, before.astype(np.float64), policy.parameters.to_numpy().astype(np.float64)
 
 

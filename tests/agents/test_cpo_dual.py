@@ -103,31 +103,6 @@ def test_the_same_constraint_twice_changes_nothing() -> None:
     assert step(twice, -EAST, costs) == pytest.approx(step(once, -EAST, NORTH[None]))
 
 
-@pytest.mark.parametrize(
-    ("temperature", "violation", "expected"),
-    [
-        (0.5, -2.0, [1.0, 0.0]),  # the step would be 1 / T = 2 long: the trust region ends it
-        (4.0, -2.0, [0.25, 0.0]),  # 1 / T
-        (4.0, 0.6, [0.25, -0.6]),  # the violation is mended all the same
-        (4.0, 1.5, [0.0, -1.0]),  # and recovery is as long as it may be
-    ],
-)
-def test_with_a_temperature_a_step_ends_with_the_gain(
-    temperature: float, violation: float, expected: list[float]
-) -> None:
-    problem = reduced(-EAST, NORTH[None], np.array([violation]), 0.5)
-    solution = solve_dual(replace(problem, temperature=temperature))
-    assert step(solution, -EAST, NORTH[None]) == pytest.approx(np.array(expected), abs=1e-9)
-
-
-def test_with_a_temperature_a_gradient_of_rounding_errors_moves_nothing() -> None:
-    rounding = 1e-7 * EAST
-    problem = reduced(-rounding, NORTH[None], np.array([0.0]), 0.5)
-    assert step(solve_dual(problem), -rounding, NORTH[None]) == pytest.approx(EAST)
-    solution = solve_dual(replace(problem, temperature=0.5))
-    assert step(solution, -rounding, NORTH[None]) == pytest.approx(2.0 * rounding)
-
-
 def published(problem: StepProblem) -> tuple[float, float]:
     """1 / lam and nu / lam for k = 1 by safety-starter-agents' case distinction."""
     q, r, s = problem.squared_gradient, problem.mixed[0], problem.gram[0, 0]
@@ -174,7 +149,6 @@ class RandomProblem:
         costs: b_i, [k, n].
         violations: c, [k].
         radius: delta.
-        temperature: T.
     """
 
     metric: Floats
@@ -182,7 +156,6 @@ class RandomProblem:
     costs: Floats
     violations: Floats
     radius: float = 0.1
-    temperature: float = 0.0
 
     @classmethod
     def draw(cls, generator: np.random.Generator, num_costs: int) -> Self:
@@ -203,11 +176,10 @@ class RandomProblem:
             self.costs @ by_costs,
             self.violations,
             self.radius,
-            self.temperature,
         )
 
     def objective(self, x: Floats) -> float:
-        return float(self.gradient @ x + 0.5 * self.temperature * x @ self.metric @ x)
+        return float(self.gradient @ x)
 
     def step(self, solution: DualSolution) -> Floats:
         direction = solution.gradient_weight * self.gradient + solution.constraint_weights @ self.costs
@@ -231,7 +203,7 @@ class RandomProblem:
         result = minimize(  # type: ignore[call-overload]
             self.objective,
             start,
-            jac=lambda x: self.gradient + self.temperature * self.metric @ x,
+            jac=lambda _: self.gradient,
             method="SLSQP",
             constraints=[
                 {
@@ -289,11 +261,7 @@ def test_the_step_is_the_independent_solvers(num_costs: int) -> None:
     while compared.total() < 250:  # 1,000 with all k
         drawn = RandomProblem.draw(generator, num_costs)
         # With few constraints, few problems of the usual size have no feasible step.
-        problem = replace(
-            drawn,
-            violations=drawn.violations * generator.choice([1.0, 4.0]),
-            temperature=generator.choice([0.0, 1.0, 10.0]),
-        )
+        problem = replace(drawn, violations=drawn.violations * generator.choice([1.0, 4.0]))
         solution = solve_dual(problem.reduced())
         if solution.case is StepCase.RECOVERY:
             compared[solution.case] += 1

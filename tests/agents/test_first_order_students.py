@@ -7,16 +7,16 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 
+from recrl.agents.algorithms.configs import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.algorithms.focops import FirstOrderConstrainedOptimisation, projection_objective
 from recrl.agents.algorithms.ipo import (
     InteriorPointPolicyOptimisation,
     barrier,
-    barrier_gain,
+    barrier_surrogate_objective,
     relief_of,
     slopes,
 )
-from recrl.agents.algorithms.p3o import PenalisedProximalPolicyOptimisation, penalised_gain
-from recrl.agents.config import FOCOPSConfig, IPOConfig, P3OConfig
+from recrl.agents.algorithms.p3o import PenalisedProximalPolicyOptimisation, penalised_surrogate_objective
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.learning.batch import LearningBatch
@@ -28,7 +28,7 @@ from recrl.environments.cmdp import Floats
 STATES = np.array([0, 0, 1, 1, 1, 2])
 ACTIONS = np.array([0, 1, 0, 1, 1, 0])
 ADVANTAGES = np.array([[1.0, 2.0], [-1.0, 0.0], [2.0, 1.0], [0.0, 0.0], [-3.0, 1.0], [1.0, 2.0]])
-BATCH = LearningBatch.gather(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=False)
+BATCH = LearningBatch.deduplicate(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=False)
 CLIP, KAPPA = 0.2, 5.0
 
 
@@ -45,14 +45,14 @@ def test_p3os_gain_is_the_one_computed_by_hand() -> None:
     ratios = torch.tensor([1.0, 1.0, 1.5, 1.0, 1.0, 1.0])
     # Reward: only sample 2 has moved, its ratio counts as 1.2: (0.2 * 2) / 6 spreads.
     # Cost: its centred advantage is 0, so the surrogate stays 0 and the violation 0.3 stands.
-    gain = penalised_gain(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
+    gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
     value, price = gain(ratios)
     assert float(value) == pytest.approx((0.4 / 6.0 - KAPPA * 0.3) / SPREAD, rel=1e-5)
     assert price == KAPPA
 
 
 def test_p3o_is_pessimistic_about_cost() -> None:
-    gain = penalised_gain(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
+    gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
     # Sample 1 has the reward advantage -1 and the cost advantage -1: the ratio 1.6 saves no more cost than
     # 1.2 would, and loses all the reward.
     value, _ = gain(torch.tensor([1.0, 1.6, 1.0, 1.0, 1.0, 1.0]))
@@ -60,7 +60,7 @@ def test_p3o_is_pessimistic_about_cost() -> None:
 
 
 def test_a_constraint_that_holds_costs_p3o_nothing() -> None:
-    gain = penalised_gain(BATCH, REWARDS, COSTS, violation(-1.0), clip=CLIP, factor=KAPPA)
+    gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(-1.0), clip=CLIP, factor=KAPPA)
     value, price = gain(torch.ones(6))
     assert float(value) == pytest.approx(0.0, abs=1e-6)
     assert price == 0.0
@@ -87,7 +87,7 @@ def test_the_barriers_slopes_are_its_finite_differences() -> None:
 
 def test_ipos_gain_is_the_one_computed_by_hand() -> None:
     config = IPOConfig(barrier_sharpness=10.0, barrier_slope=20.0, clip=CLIP)
-    value, price = barrier_gain(BATCH, REWARDS, COSTS, violation(-0.5), config)(torch.ones(6))
+    value, price = barrier_surrogate_objective(BATCH, REWARDS, COSTS, violation(-0.5), config)(torch.ones(6))
     slack = 0.5 / SPREAD
     assert float(value) == pytest.approx(math.log(slack) / 10.0, rel=1e-5)
     assert price == pytest.approx(1.0 / (10.0 * slack), rel=1e-5)
@@ -113,8 +113,8 @@ def test_focops_weighs_what_is_gained_against_how_far_the_policy_moves() -> None
     ratios = torch.tensor([1.2, 1.8, 1.0, 1.0, 1.0, 1.0])
     advantages = np.array([3.0, 5.0, 0.0, 0.0, 0.0, 1.0])
     constraints = Constraints(np.ones(1), np.ones(1), np.zeros(1), 1.0)
-    experience = Experience(BATCH, old, torch.zeros(6), ADVANTAGES, constraints, num_envs=1)
-    objective = projection_objective(experience, advantages, temperature=2.0, radius=0.1)
+    experience = Experience(BATCH, old, torch.zeros(6), ADVANTAGES, constraints)
+    objective = projection_objective(experience, advantages, focops_lambda=2.0, radius=0.1)
     divergence = 0.6 * math.log(1.2) + 0.4 * math.log(0.8)
     expected = (1.2 * 3.0 / 2.0 + 1.0 / 2.0 - divergence) / 6.0
     assert float(objective(now, ratios)) == pytest.approx(expected, rel=1e-5)
@@ -127,7 +127,7 @@ def test_focops_keeps_its_trust_region_however_long_a_step_is() -> None:
             3, Discrete(2), NetworkForm((8,), orthogonal), 1.0, torch.Generator().manual_seed(0)
         )
         constraints = Constraints(np.array([math.inf]), np.array([-math.inf]), np.zeros(1), 10.0)
-        experience = Experience.of(policy, BATCH, ADVANTAGES, constraints, num_envs=1)
+        experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
         config = FOCOPSConfig(target_kl=0.01, policy_learning_rate=0.1, trust_region=name)
         rule = FirstOrderConstrainedOptimisation(config, policy, 1)
         found[name] = improve_and_measure(rule, policy, experience, np.random.default_rng(0))["kl"]
@@ -148,7 +148,7 @@ def improved(name: str, gap: float, limit: float = 5.0) -> tuple[dict[str, float
     constraints = Constraints(
         np.array([limit]), np.array([gap]), np.zeros(1), math.nan if math.isnan(gap) else 10.0
     )
-    experience = Experience.of(policy, BATCH, ADVANTAGES, constraints, num_envs=1)
+    experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
     metrics = improve_and_measure(rules[name], policy, experience, np.random.default_rng(0))
     return metrics, bool(np.any(policy.parameters.to_numpy() != before))
 

@@ -8,17 +8,18 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
+from recrl.agents.algorithms.configs import IPOConfig
 from recrl.agents.algorithms.focops import projection_objective
-from recrl.agents.algorithms.ipo import barrier_gain
-from recrl.agents.algorithms.p3o import penalised_gain
-from recrl.agents.algorithms.ppo_lag import combined_gain, separate_gain
-from recrl.agents.config import IPOConfig
+from recrl.agents.algorithms.ipo import barrier_surrogate_objective
+from recrl.agents.algorithms.p3o import penalised_surrogate_objective
+from recrl.agents.algorithms.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning import networks
 from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.gradient_ascent import Objective, with_entropy
-from recrl.agents.learning.networks import Critics, FlatParameters, NetworkForm, orthogonal
+from recrl.agents.learning.networks import FlatParameters, NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import Floats
@@ -42,10 +43,10 @@ def moved_policy(space: Space[object], compact: bool) -> tuple[StochasticPolicy,
     policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0))
     observations = generator.normal(size=(8, 3))[generator.integers(8, size=30)]
     actions = policy.sample(observations, generator)  # type: ignore[arg-type]
-    batch = LearningBatch.gather(observations, actions, compact=compact)  # type: ignore[arg-type]
+    batch = LearningBatch.deduplicate(observations, actions, compact=compact)  # type: ignore[arg-type]
     constraints = Constraints(np.array([1.0, 1.0]), np.array([0.3, -0.5]), np.zeros(2), 2.0)
     advantages = generator.normal(size=(30, 3))
-    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
+    experience = Experience.of(policy, batch, advantages, constraints)
     policy.parameters.values.add_(0.1 * torch.randn(len(policy.parameters.values)))
     return policy, experience
 
@@ -60,9 +61,7 @@ def clipped(experience: Experience) -> Objective:
 
 
 def plain(experience: Experience) -> Objective:
-    return of_ratios(
-        partial(surrogate, advantages=experience.batch.per_decision(experience.advantages[:, 1]))
-    )
+    return of_ratios(partial(surrogate, advantages=experience.batch.per_pair(experience.advantages[:, 1])))
 
 
 def lagrangian(
@@ -73,25 +72,27 @@ def lagrangian(
 
 
 def p3o(experience: Experience) -> Objective:
-    gain = penalised_gain(experience.batch, *experience.in_reward_spreads(), clip=CLIP, factor=5.0)
+    gain = penalised_surrogate_objective(
+        experience.batch, *experience.in_reward_spreads(), clip=CLIP, factor=5.0
+    )
     return of_ratios(lambda ratios: gain(ratios)[0])
 
 
 def ipo(experience: Experience) -> Objective:
     config = IPOConfig(barrier_sharpness=10.0, clip=CLIP)
-    gain = barrier_gain(experience.batch, *experience.in_reward_spreads(), config)
+    gain = barrier_surrogate_objective(experience.batch, *experience.in_reward_spreads(), config)
     return of_ratios(lambda ratios: gain(ratios)[0])
 
 
 def focops(experience: Experience) -> Objective:
-    return projection_objective(experience, experience.advantages[:, 0], temperature=0.5, radius=0.2)
+    return projection_objective(experience, experience.advantages[:, 0], focops_lambda=0.5, radius=0.2)
 
 
 OBJECTIVES: dict[str, Callable[[Experience], Objective]] = {
     "ppo": clipped,
     "trust region": plain,
-    "ppo-lag combined": partial(lagrangian, gain=combined_gain),
-    "ppo-lag separate": partial(lagrangian, gain=separate_gain),
+    "ppo-lag combined": partial(lagrangian, gain=combined_surrogate_objective),
+    "ppo-lag separate": partial(lagrangian, gain=separate_surrogate_objective),
     "p3o": p3o,
     "ipo": ipo,
     "focops": focops,
@@ -126,12 +127,12 @@ def test_an_objectives_gradient_is_its_finite_differences(
     def of_policy(distribution: Distribution) -> torch.Tensor:
         return objective(distribution, experience.ratios(distribution))
 
-    now = policy.evaluate(experience.batch.rows)
+    now = policy.evaluate(experience.batch.unique_observations)
     ratios = experience.ratios(now.distribution)
     assert float(ratios.detach().max()) > 1.0 + CLIP and float(ratios.detach().min()) < 1.0 - CLIP
     exact = now.gradient(of_policy(now.distribution)).clone().numpy()
     expected = differences(
-        policy.parameters, lambda: float(of_policy(policy.distribution(experience.batch.rows)))
+        policy.parameters, lambda: float(of_policy(policy.distribution(experience.batch.unique_observations)))
     )
     assert np.abs(expected).max() > 1e-3
     np.testing.assert_allclose(exact, expected, atol=1e-7)

@@ -9,11 +9,9 @@ import torch
 
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
-    MultiplierState,
     pid,
     projected_ascent,
     relative_gaps,
-    restarted,
     softplus_adam,
     start_pid,
     start_projected_ascent,
@@ -65,41 +63,6 @@ def test_pid_adds_its_three_terms() -> None:
     assert state["multipliers"] == pytest.approx([1.2 + 0.22 + 2.0])
     state = pid(state, np.array([11.0]), **gains)
     assert state["multipliers"] == pytest.approx([1.1 + 0.33])  # a falling gap is not differentiated
-
-
-def summed_geometrically(state: MultiplierState, gap: float, limit: float, maximum: float = 100.0) -> float:
-    """The integral after one more gap, with K_I = 0.1 and no other gain."""
-    after = pid(
-        state,
-        np.array([gap]),
-        largest=limit,
-        proportional=0.0,
-        integral=0.1,
-        derivative=0.0,
-        maximum=maximum,
-        geometric=True,
-    )
-    return float(after["integral"][0])
-
-
-def test_a_geometric_integral_moves_by_shares_of_what_it_is() -> None:
-    high, low = start_pid(1, 7.0), start_pid(1, 0.0)
-    assert summed_geometrically(high, 2.0, 4.0) == pytest.approx(8.0 * math.exp(0.2) - 1.0)
-    assert summed_geometrically(low, 2.0, 4.0) == pytest.approx(math.exp(0.2) - 1.0)
-    assert summed_geometrically(high, -4.0, 4.0) == pytest.approx(8.0 * math.exp(-0.4) - 1.0)
-    assert summed_geometrically(high, 1e6, 4.0) == pytest.approx(8.0 * math.exp(0.4) - 1.0)  # no wind-up
-
-
-def test_a_geometric_integral_comes_back_the_way_it_went() -> None:
-    integral = 0.5
-    for gap in (1.0, 2.0, -1.0, -2.0):
-        integral = summed_geometrically(start_pid(1, integral), gap, 2.0)
-    assert integral == pytest.approx(0.5)
-
-
-def test_a_geometric_integral_is_held_within_what_a_multiplier_can_be() -> None:
-    assert summed_geometrically(start_pid(1, 2.9), 5.0, 5.0, maximum=3.0) == 3.0
-    assert summed_geometrically(start_pid(1, 0.1), -5.0, 5.0) == 0.0
 
 
 def test_pid_does_not_wind_up() -> None:
@@ -157,12 +120,3 @@ def test_no_limit_means_no_multiplier_and_leaves_no_trace(rule: str) -> None:
     assert state["multipliers"][1] > 1.0
     for key in set(state) - {"multipliers", "last_gap"}:
         assert state[key][0] == start[key][0]
-
-
-@pytest.mark.parametrize("rule", STARTS)
-def test_a_restart_touches_only_the_dimensions_it_names(rule: str) -> None:
-    start = STARTS[rule](2, 1.0)
-    moved = {key: values + 3.0 for key, values in start.items()}
-    state = restarted(moved, start, np.array([True, False]))
-    for key in start:
-        np.testing.assert_array_equal(state[key], [start[key][0], moved[key][1]])

@@ -8,7 +8,7 @@ import pytest
 
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import CostLimits, Floats
+from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector, optimal_return
 
 
@@ -65,7 +65,7 @@ def last_quarter(lesson: Lesson, seed: int) -> tuple[float, Floats]:
     for update in range(lesson.updates):
         rollout, episodes = collector.collect(agent, generator)
         costs = episode_costs(episodes, len(lesson.limits))
-        agent.update(rollout, costs, np.array(lesson.limits))
+        agent.update(rollout, costs, CurriculumStep(CostLimits(lesson.limits)))
         if update >= 0.75 * lesson.updates:
             kept += episodes
     returns = [episode.episode_return for episode in kept]

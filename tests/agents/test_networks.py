@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from recrl.agents.learning import networks
+from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.networks import (
     FEW_COLUMNS,
     INITIALISERS,
     Adam,
-    Critics,
     FlatParameters,
     NetworkForm,
     TanhStack,

@@ -9,6 +9,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 from scipy.optimize import nnls
 
+from recrl.agents.algorithms.configs import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.algorithms.crpo import (
     ConstraintRectifiedPolicyOptimisation,
     most_violated,
@@ -17,7 +18,6 @@ from recrl.agents.algorithms.crpo import (
 )
 from recrl.agents.algorithms.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
-from recrl.agents.config import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.learning.batch import LearningBatch
@@ -31,10 +31,10 @@ SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
 EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
 
-def step(gradient: Floats, costs: Floats, violations: list[float], temperature: float = 0.0) -> Floats:
+def step(gradient: Floats, costs: Floats, violations: list[float]) -> Floats:
     """PCPO's step with H = I and a trust region of radius 1."""
     problem = StepProblem(
-        float(gradient @ gradient), costs @ gradient, costs @ costs.T, np.array(violations), 0.5, temperature
+        float(gradient @ gradient), costs @ gradient, costs @ costs.T, np.array(violations), 0.5
     )
     solution = projected_step(problem)
     return -(solution.gradient_weight * gradient + solution.constraint_weights @ costs)
@@ -51,22 +51,6 @@ def step(gradient: Floats, costs: Floats, violations: list[float], temperature: 
 )
 def test_the_step_is_the_one_computed_by_hand(violation: float, expected: list[float]) -> None:
     assert step(-EAST, EAST[None], [violation]) == pytest.approx(np.array(expected), abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("temperature", "violation", "expected"),
-    [
-        (0.5, -2.0, [1.0, 0.0]),  # the reward's step would be 1 / T = 2 long: the trust region ends it
-        (4.0, -2.0, [0.25, 0.0]),  # 1 / T
-        (4.0, -0.125, [0.125, 0.0]),  # and moved back to where the constraint begins
-        (4.0, 0.5, [-0.5, 0.0]),  # what is violated is mended all the same
-    ],
-)
-def test_with_a_temperature_the_rewards_step_ends_with_the_gain(
-    temperature: float, violation: float, expected: list[float]
-) -> None:
-    found = step(-EAST, EAST[None], [violation], temperature)
-    assert found == pytest.approx(np.array(expected), abs=1e-12)
 
 
 def test_the_projection_leaves_what_no_constraint_concerns() -> None:
@@ -127,7 +111,7 @@ def test_every_projected_step_stays_in_the_trust_region(num_costs: int) -> None:
 
 def rule_of(name: str, num_costs: int) -> PolicyRule:
     if name == "pcpo":
-        return ProjectionBasedConstrainedPolicyOptimisation(PCPOConfig(target_kl=DELTA), num_costs)
+        return ProjectionBasedConstrainedPolicyOptimisation(PCPOConfig(target_kl=DELTA))
     if name == "crpo":
         return ConstraintRectifiedPolicyOptimisation(CRPOConfig(target_kl=DELTA))
     return TRPOLagrangian(TRPOLagConfig(target_kl=DELTA), num_costs)
@@ -145,14 +129,14 @@ def improved(
     actions = policy.sample(observations, generator)
     liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
     advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    batch = LearningBatch.gather(observations, actions, compact=True)
-    before, old = policy.parameters.to_numpy(), policy.distribution(batch.rows)
+    batch = LearningBatch.deduplicate(observations, actions, compact=True)
+    before, old = policy.parameters.to_numpy(), policy.distribution(batch.unique_observations)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)
-    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
+    experience = Experience.of(policy, batch, advantages, constraints)
     metrics = improve_and_measure(rule_of(name, 2), policy, experience, np.random.default_rng(0))
-    moved = old.divergence(policy.distribution(batch.rows))  # type: ignore[arg-type]
-    metrics["kl"] = float(torch.dot(batch.row_weights, moved))
+    moved = old.divergence(policy.distribution(batch.unique_observations))  # type: ignore[arg-type]
+    metrics["kl"] = float(torch.dot(batch.observation_weights, moved))
     return metrics, (policy.parameters.to_numpy() - before).astype(np.float64)
 
 
@@ -183,11 +167,11 @@ def test_without_a_finished_episode_the_multipliers_stay_and_the_policy_goes_on(
     assert metrics["multiplier_0"] == 0.0
 
 
-def crpo_sizes(gradient: list[float], violation: float, temperature: float) -> tuple[float, float]:
+def crpo_sizes(gradient: list[float], violation: float, kl_price: float) -> tuple[float, float]:
     """How long CRPO's steps up the reward and down the cost are, with H = I, b = (1, 0), and radius 1."""
     g, costs = np.array(gradient), EAST[None]
     problem = StepProblem(float(g @ g), -costs @ g, costs @ costs.T, np.array([violation]), 0.5)
-    config = CRPOConfig(temperature=temperature)
+    config = CRPOConfig(kl_price=kl_price)
     return step_up(problem, config).gradient_weight, step_down(problem, 0, config).constraint_weights[0]
 
 
@@ -202,7 +186,7 @@ def test_crpos_steps_go_beyond_the_limit_for_what_is_left_to_gain() -> None:
     assert crpo_sizes([0.6, 0.8], 0.1, 1.0)[1] == pytest.approx(0.1 + 0.4 * 0.6)
 
 
-def test_crpos_steps_are_as_long_as_the_trust_region_far_from_limits_and_without_a_temperature() -> None:
+def test_crpos_steps_are_as_long_as_the_trust_region_far_from_limits_and_without_a_price() -> None:
     assert crpo_sizes([0.6, 0.8], -9.0, 1.0)[0] == pytest.approx(1.0)
     assert crpo_sizes([0.6, 0.8], 9.0, 1.0)[1] == pytest.approx(1.0)
     assert crpo_sizes([1.0, 0.0], 0.01, 0.0) == pytest.approx((1.0, 1.0))

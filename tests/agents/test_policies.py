@@ -9,7 +9,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
 from recrl.agents.learning.distributions import Categorical, Gaussian, mean_divergence
-from recrl.agents.learning.networks import NetworkForm, orthogonal
+from recrl.agents.learning.networks import NetworkForm, TanhStack, orthogonal
 from recrl.agents.learning.noise import matching_log_std, matching_scale, off_greedy_mass
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
 
@@ -91,6 +91,7 @@ def test_sampled_gaussian_actions_have_the_policys_moments() -> None:
 
 def test_a_sure_policy_never_does_anything_else() -> None:
     policy = policy_for(THREE_ACTIONS)
+    assert isinstance(policy.stack, TanhStack)
     policy.stack.biases[-1].copy_(torch.tensor([[[0.0, 500.0, 0.0]]]))
     actions = policy.sample(random_rows(1000).numpy(), np.random.default_rng(0))
     assert set(actions.tolist()) == {1}

@@ -7,16 +7,16 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
+from recrl.agents.algorithms.configs import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.ppo import ProximalPolicyOptimisation
 from recrl.agents.algorithms.trpo import TrustRegionPolicyOptimisation, step_up
-from recrl.agents.config import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.actor_critic import PolicyRule, improve_and_measure
 from recrl.agents.learning.advantages import penalised_advantages
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Categorical
-from recrl.agents.learning.gradient_ascent import Objective, climb, with_entropy, with_prices
+from recrl.agents.learning.gradient_ascent import Objective, gradient_ascent, with_entropy, with_prices
 from recrl.agents.learning.networks import Adam, NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
@@ -35,26 +35,26 @@ def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floa
     actions = policy.sample(observations, generator)
     liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
     advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    return policy, LearningBatch.gather(observations, actions, compact=True), advantages
+    return policy, LearningBatch.deduplicate(observations, actions, compact=True), advantages
 
 
-def rule_of(name: str, policy: StochasticPolicy, temperature: float = 0.0) -> PolicyRule:
+def rule_of(name: str, policy: StochasticPolicy) -> PolicyRule:
     if name == "ppo":
         return ProximalPolicyOptimisation(PPOConfig(target_kl=DELTA), policy)
     if name == "trpo":
-        return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA, temperature=temperature))
-    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, temperature=temperature), num_costs=2)
+        return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA))
+    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
 
 
 def improved(
-    name: str, space: Space[object], gaps: list[float], limits: list[float], temperature: float = 0.0
+    name: str, space: Space[object], gaps: list[float], limits: list[float]
 ) -> tuple[dict[str, float], Floats]:
     """The metrics, and the policy's parameters afterwards."""
     policy, batch, advantages = sampled(space)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)
-    experience = Experience.of(policy, batch, advantages, constraints, num_envs=1)
-    rule = rule_of(name, policy, temperature)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    rule = rule_of(name, policy)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
     return metrics, policy.parameters.to_numpy().astype(np.float64)
 
@@ -71,45 +71,42 @@ def test_neither_limits_nor_costs_nor_finished_episodes_change_a_control(
         np.testing.assert_array_equal(improved(name, space, gaps, limits)[1], reference)
 
 
-@pytest.mark.parametrize("temperature", [0.0, 20.0])
 @pytest.mark.parametrize("space", SPACES)
-def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object], temperature: float) -> None:
+def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object]) -> None:
     gaps, unlimited = [-math.inf, -math.inf], [math.inf, math.inf]
-    found, after = improved("trpo", space, gaps, unlimited, temperature)
-    expected, after_cpo = improved("cpo", space, gaps, unlimited, temperature)
-    longest, _ = improved("trpo", space, gaps, unlimited)
-    assert (found["step_norm"] < 0.5 * longest["step_norm"]) == (temperature > 0.0)
+    found, after = improved("trpo", space, gaps, unlimited)
+    expected, after_cpo = improved("cpo", space, gaps, unlimited)
     np.testing.assert_allclose(after, after_cpo, atol=1e-5)
     assert found["surrogate_reward"] == pytest.approx(expected["surrogate_reward"], rel=1e-3)
     assert found["step_norm"] == pytest.approx(expected["step_norm"], rel=1e-3)
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_with_a_temperature_a_step_is_as_long_as_the_gain_is_large_up_to_the_trust_region(
+def test_with_a_price_of_the_kl_a_step_is_as_long_as_the_gain_is_large_up_to_the_trust_region(
     space: Space[object],
 ) -> None:
-    def stepped(size: float, temperature: float) -> float:
+    def stepped(size: float, kl_price: float) -> float:
         policy, batch, advantages = sampled(space)
-        experience = Experience.of(policy, batch, advantages, UNKNOWN, num_envs=1)
+        experience = Experience.of(policy, batch, advantages, UNKNOWN)
         objective = size * (advantages[:, 0] - advantages[:, 0].mean())
         generator = np.random.default_rng(0)
         config = TRPOConfig(target_kl=DELTA)
-        return step_up(policy, experience, objective, config, generator, temperature=temperature)["step_norm"]
+        return step_up(policy, experience, objective, config, generator, kl_price=kl_price)["step_norm"]
 
-    edge = stepped(1.0, temperature=0.0)
-    assert stepped(1e-3, temperature=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
-    assert stepped(1e3, temperature=1.0) == pytest.approx(edge, rel=1e-3)
-    small = stepped(1e-3, temperature=1.0)
+    edge = stepped(1.0, kl_price=0.0)
+    assert stepped(1e-3, kl_price=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
+    assert stepped(1e3, kl_price=1.0) == pytest.approx(edge, rel=1e-3)
+    small = stepped(1e-3, kl_price=1.0)
     assert small < 0.1 * edge
-    assert stepped(2e-3, temperature=1.0) == pytest.approx(2.0 * small, rel=1e-3)
-    assert stepped(1e-3, temperature=2.0) == pytest.approx(0.5 * small, rel=1e-3)
+    assert stepped(2e-3, kl_price=1.0) == pytest.approx(2.0 * small, rel=1e-3)
+    assert stepped(1e-3, kl_price=2.0) == pytest.approx(0.5 * small, rel=1e-3)
 
 
 def test_where_no_action_is_better_trpo_stays() -> None:
     policy, batch, advantages = sampled(SPACES[0])
     before = policy.parameters.to_numpy()
     constraints = Constraints(np.array([1.0]), np.array([0.0]), np.zeros(1), 10.0)
-    experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints, num_envs=1)
+    experience = Experience.of(policy, batch, np.zeros((400, 2)), constraints)
     metrics = improve_and_measure(rule_of("trpo", policy), policy, experience, np.random.default_rng(0))
     np.testing.assert_array_equal(policy.parameters.to_numpy(), before)
     assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
@@ -126,14 +123,14 @@ def climbed(**options: object) -> tuple[float, bool, set[int]]:
     sizes = set()
 
     def objective(part: Experience) -> Objective:
-        weights = part.batch.per_decision(advantages[:, 0])
-        sizes.add(len(part.batch.rows))
+        weights = part.batch.per_pair(advantages[:, 0])
+        sizes.add(len(part.batch.unique_observations))
         return lambda _, ratios: ratios @ weights
 
-    metrics = climb(
+    metrics = gradient_ascent(
         policy,
         Adam(policy.parameters, 0.01),
-        Experience.of(policy, batch, advantages, UNKNOWN, num_envs=1),
+        Experience.of(policy, batch, advantages, UNKNOWN),
         objective,
         config=PPOConfig.model_validate(options),
         generator=np.random.default_rng(0),
@@ -158,14 +155,14 @@ def test_with_minibatches_the_steps_are_those_of_the_passes_if_they_are_more() -
 
 def test_an_entropy_bonus_adds_the_mean_entropy_in_nats() -> None:
     _, batch, _ = sampled(SPACES[0])
-    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.rows), 4), dim=1))
+    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.unique_observations), 4), dim=1))
     objective = with_entropy(lambda ratios: ratios.sum(), batch, 0.5)
     assert float(objective(uniform, torch.ones(2))) == pytest.approx(2.0 + 0.5 * math.log(4.0), rel=1e-5)
 
 
 def test_a_priced_gain_is_divided_by_one_and_its_price() -> None:
     _, batch, _ = sampled(SPACES[0])
-    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.rows), 4), dim=1))
+    uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.unique_observations), 4), dim=1))
     objective = with_prices(lambda ratios: (ratios.sum(), 3.0))
     assert float(objective(uniform, torch.ones(2))) == 0.5
 

@@ -13,7 +13,7 @@ def test_paper_is_recommended_with_every_deviation_switched() -> None:
         switched = {
             each.option: options_of(student, "paper")[each.option]
             for each in deviations()
-            if student in each.students
+            if student in each.agents
         }
         assert {**options_of(student, "recommended"), **switched} == options_of(student, "paper")
         assert all(options_of(student, "recommended")[option] != value for option, value in switched.items())

@@ -14,6 +14,7 @@ import pytest
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.constraints.multiplier_rules import STARTS
 from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
 LAGRANGIANS = [(agent, rule) for agent in ("ppo-lag", "trpo-lag", "focops") for rule in STARTS]
@@ -35,7 +36,7 @@ def learnt(
     student = make_agent(agent, environments.cmdp, options, np.random.SeedSequence(7))
     collector, generator = Collector(environments, num_steps=40), np.random.default_rng(2)
     collector.reset(seed=1)
-    limits = np.full(environments.cmdp.num_costs, cost * LIMITS[task])
+    step = CurriculumStep(CostLimits((cost * LIMITS[task],) * environments.cmdp.num_costs))
     for _ in range(updates):
         rollout, episodes = collector.collect(student, generator)
         scaled = replace(
@@ -44,7 +45,7 @@ def learnt(
             costs=cost * rollout.costs,
             carried_costs=cost * rollout.carried_costs,
         )
-        student.update(scaled, cost * episode_costs(episodes, environments.cmdp.num_costs), limits)
+        student.update(scaled, cost * episode_costs(episodes, environments.cmdp.num_costs), step)
     policy: npt.NDArray[np.float32] = student.state_dict()["policy"]
     return policy
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from recrl.analysis import report
+from recrl.analysis import report, report_files
 from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.sweep_data import Sweep, drawn_columns
 from recrl.analysis.figures import styles
@@ -67,8 +67,8 @@ def test_figures_and_tables_are_drawn_from_it(
             if picture is not None
         )
         assert np.abs(one - other).max() <= 4, stem  # a rounded curve has other soft edges
-    written, _ = report.write_tables(sweep, tmp_path / "files")
-    report.write_tables(small, tmp_path / "compact")
+    written, _ = report_files.write_tables(sweep, tmp_path / "files")
+    report_files.write_tables(small, tmp_path / "compact")
     for path in written:
         if path.name != "bounds.csv":  # sums over rounded updates
             assert path.read_bytes() == (tmp_path / "compact" / path.name).read_bytes(), path.name

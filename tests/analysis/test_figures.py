@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 from recrl.analysis.data import sweep_data
-from recrl.analysis.data.sweep_data import METHOD_ORDER, Sweep
+from recrl.analysis.data.labels import METHOD_ORDER
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
@@ -128,20 +130,43 @@ def test_the_frontier_is_sampled_where_it_bends() -> None:
     assert len(asked) < 25
 
 
-def test_final_policies_lie_under_the_frontier_at_their_means(finished: Sweep) -> None:
+def test_final_policies_lie_under_the_frontier_left_of_the_shaded_region(finished: Sweep) -> None:
     figure = return_against_cost(finished)
     assert figure is not None
     assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["river-a, ppo-lag", "river-a, cpo"]
-    frontier = np.asarray(lines_of(figure.axes[0], OPTIMUM_COLOUR)[0].get_xydata())
+    panel = figure.axes[0]
+    frontier = np.asarray(lines_of(panel, OPTIMUM_COLOUR)[0].get_xydata())
     assert [5.0, 14.0] in frontier.tolist()
-    means = [np.asarray(marks.get_offsets()).tolist() for marks in figure.axes[0].collections[1::2]]
-    assert means[0] == [pytest.approx([(0.5 + 0.5 + 4.8) / 3, -22 / 3])]  # none
-    assert means[1] == [pytest.approx([4.8, 8.0])]
+    runs = [np.asarray(marks.get_offsets()).tolist() for marks in panel.collections]
+    assert runs[0] == [[4.8, 8.0], [0.5, -15.0], [0.5, -15.0]]  # none
+    assert runs[1] == [[4.8, 8.0]] * 3
+    shaded = [patch for patch in panel.patches if isinstance(patch, Rectangle)]
+    assert [patch.get_x() for patch in shaded] == [5.0]
 
 
-def test_without_a_known_optimum_there_is_no_frontier(finished: Sweep) -> None:
+def test_without_a_known_optimum_there_are_policies_and_limits_but_no_frontier(finished: Sweep) -> None:
     trials = finished.trials.assign(optimal_return=np.nan)
-    assert return_against_cost(dataclasses.replace(finished, trials=trials)) is None
+    figure = return_against_cost(dataclasses.replace(finished, trials=trials))
+    assert figure is not None
+    assert len(np.asarray(lines_of(figure.axes[0], OPTIMUM_COLOUR)[0].get_xydata())) == 0
+    assert lines_of(figure.axes[0], LIMIT_COLOUR)[0].get_xdata() == [5.0, 5.0]
+
+
+def test_each_cost_has_its_own_row(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(seeds=1, num_costs=2, tasks=["a"], agents=["cpo"], methods=["linear"])
+    figure = return_against_cost(sweep_data.load(store))
+    assert figure is not None
+    assert [axes.get_xlabel() for axes in figure.axes] == ["episode cost 1", "episode cost 2"]
+
+
+def test_costs_equal_to_the_limit_do_not_fill_a_panel_with_rounding_errors(panel: Sweep) -> None:
+    updates = panel.updates.assign(cost_0=5.001, episode_return=14.001)
+    drawn = learning_curves.learning_curves(dataclasses.replace(panel, updates=updates), "cpo")
+    _, returns, costs, magnified = drawn.axes[:4]
+    assert magnified.get_ylim()[0] <= 4.0
+    assert magnified.get_ylim()[1] >= 6.0
+    assert np.diff(returns.get_ylim()) >= 0.8
+    assert all(any(isinstance(it, Rectangle) for it in axes.patches) for axes in (costs, magnified))
 
 
 def test_diagnostics_show_limit_cost_multiplier_and_noise(finished: Sweep) -> None:

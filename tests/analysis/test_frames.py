@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from recrl.analysis.data import sweep_data
-from recrl.analysis.data.sweep_data import KEY, Sweep
+from recrl.analysis.data.labels import KEY
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.environments.cmdp import Phase
 from recrl.environments.registry import optimal_return
 from recrl.orchestrator.files.store import SweepStore

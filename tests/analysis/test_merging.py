@@ -10,7 +10,7 @@ import pytest
 from recrl.analysis import report
 from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.merging import merge
-from recrl.analysis.data.sweep_data import Sweep, TrialFacts
+from recrl.analysis.data.sweep_data import Rows, Sweep, TrialFacts
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -38,7 +38,7 @@ def without_rows(trials: Sequence[TrialFacts]) -> Sweep:
     """A part whose trials have learnt nothing yet."""
     none = pd.DataFrame()
     return sweep_data.assemble(
-        "part", trials, phases=none, updates=none, evaluations=none, events=none, policies=none
+        "part", trials, Rows(phases=none, updates=none, evaluations=none, events=none, policies=none)
     )
 
 

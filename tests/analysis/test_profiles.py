@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.figures.profiles import performance_profiles
+from recrl.analysis.figures.profiles import feasible_scores, performance_profiles
 from recrl.analysis.figures.styles import STYLES
 from recrl.analysis.statistics.metrics import Measure, outcomes
 
@@ -24,6 +24,18 @@ def test_a_profile_falls_by_a_run_at_the_return_of_each_run(finished: Sweep) -> 
     returns = rows["episode_return"].to_numpy()
     assert shares == pytest.approx([(returns > threshold).mean() for threshold in thresholds])
     assert (shares[0], shares[-1]) == (1.0, 0.0)
+
+
+def test_infeasible_runs_count_as_the_worst(finished: Sweep) -> None:
+    rows = outcomes(finished).query("measure == 'stochastic'").head(3).assign(feasible=[True, False, True])
+    scores = feasible_scores(rows)[:, 0]
+    assert scores[1] == -np.inf
+    assert scores[[0, 2]].tolist() == rows["episode_return"].iloc[[0, 2]].tolist()
+    high = finished.evaluations.assign(cost_0=100.0)
+    figure = performance_profiles(dataclasses.replace(finished, evaluations=high), Measure.STOCHASTIC)
+    assert figure is not None
+    methods = [line for line in figure.axes[0].get_lines() if len(np.asarray(line.get_xdata())) > 2]
+    assert all(np.asarray(line.get_ydata()).max() == 0.0 for line in methods)
 
 
 def test_without_a_complete_trial_there_is_no_profile(finished: Sweep) -> None:

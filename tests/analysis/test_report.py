@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from recrl.analysis import report
+from recrl.analysis import report, report_files
 from recrl.analysis.data import sweep_data
 from recrl.analysis.report import NothingToDrawError
 from recrl.orchestrator.files.store import SweepStore
@@ -28,6 +28,8 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
     assert [path.name for path in written] == [
         "report.html",
         "report.md",
+        "return-against-cost.pdf",
+        "return-against-cost.png",
         "learning-curves_my-cpo.pdf",
         "learning-curves_my-cpo.png",
         "curricula.pdf",
@@ -36,12 +38,11 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "diagnostics_river-a_my-cpo.png",
         "bounds_my-cpo.pdf",
         "bounds_my-cpo.png",
-        "return-against-cost.pdf",
-        "return-against-cost.png",
         "performance-profiles.pdf",
         "performance-profiles.png",
         "training.csv",
         "bounds.csv",
+        "verdicts.csv",
         "outcomes.csv",
         "outcomes.parquet",
         "summary.csv",
@@ -49,7 +50,10 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "outcomes.tex",
     ]
     text = written[1].read_text().splitlines()
-    assert text[2] == "4 trials: 1 running, 2 complete, 1 failed."
+    assert text[2] == "- river-a: none of 2 final policies solves it."
+    assert text[6].startswith("| river-a | my cpo | none | feasible | -3.50 ± 11.50 | – | 14.00 |")
+    assert "4 trials: 1 running, 2 complete, 1 failed." in text
+    assert text.index("## Warnings") < text.index("## Figures") < text.index("## Provenance")
     assert (
         "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
     )
@@ -68,7 +72,7 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
     names = [path.name for path in report.sketch(sweep, tmp_path)]
     assert "curricula.png" in names
     assert "outcomes.csv" not in names
-    assert "No trial is complete yet: no table." in (tmp_path / "report.md").read_text()
+    assert "No trial is complete yet: no verdict." in (tmp_path / "report.md").read_text()
     for stem in ("bounds_cpo", "return-against-cost", "performance-profiles"):
         assert report.drawings(sweep)[stem]() is None
 
@@ -82,10 +86,10 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     sweep = sweep_data.load(store)
     sketched = report.sketch(sweep, tmp_path / "sketch")
     pictures = {path.name for path in sketched if path.suffix == ".png"}
-    assert pictures == {"learning-curves_cpo.png", "curricula.png"}
+    assert pictures == {"return-against-cost.png", "learning-curves_cpo.png", "curricula.png"}
     assert not any(path.suffix == ".pdf" for path in sketched)
     tables = {path.name for path in sketched if path.suffix in (".csv", ".tex", ".parquet")}
-    assert tables == {path.name for path in report.write_tables(sweep, tmp_path / "tables")[0]}
+    assert tables == {path.name for path in report_files.write_tables(sweep, tmp_path / "tables")[0]}
     assert f"- {report.UNFINISHED}" in sketched[1].read_text().splitlines()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from recrl.analysis import report
+from recrl.analysis import report, report_files
 from recrl.analysis.data import export
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
@@ -44,7 +44,7 @@ def test_every_committed_figure_has_its_drawing(rivergrid: Sweep) -> None:
 
 
 def test_tables_are_rewritten_byte_by_byte(rivergrid: Sweep, tmp_path: Path) -> None:
-    written, _ = report.write_tables(rivergrid, tmp_path)
+    written, _ = report_files.write_tables(rivergrid, tmp_path)
     names = {path.name for path in written if path.suffix != ".parquet"}
     assert names == {path.name for path in (RESULTS / "figures").iterdir() if path.suffix in (".csv", ".tex")}
     for name in names:

@@ -23,11 +23,17 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
         "cost": "1.933 ± 1.433",
         "limit of cost": "5.00",
         "optimum": "14.00",
-        "gap": "21.33 ± 7.67",
-        "cost ≤ limit": "3 of 3 (44–100%)",
-        "within one s.e.": "3 of 3",
-        "at the optimum": "0 of 3 (0–56%)",
+        "regret": "21.33 ± 7.67",
+        "feasible": "3 of 3",
+        "solved": "0 of 3",
     }
+
+
+def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(finished: Sweep) -> None:
+    summary = metrics.summary(metrics.outcomes(finished)).assign(seeds=5, feasible_seeds=4, optimal_seeds=5)
+    row = report_tables.outcome_table(summary, Measure.STOCHASTIC).iloc[0]
+    assert row["regret"] == "–"
+    assert row["solved"].startswith("5 of 5 (")
 
 
 def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:

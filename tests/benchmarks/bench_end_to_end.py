@@ -35,9 +35,9 @@ from gymnasium.vector.utils import batch_space
 
 from recrl.agents.agent import Policy
 from recrl.agents.collection import Collector, episode_costs
-from recrl.agents.config import StudentConfig
+from recrl.agents.config import ActorCriticConfig
 from recrl.agents.registry import agent_config, make_agent
-from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
 from recrl.environments.vector import CMDPVectorEnv
@@ -47,7 +47,7 @@ UPDATE, SAFETY_GYM = (
 )
 NUM_ENVS, NUM_STEPS = 20, 1000
 NUM_OBSERVATIONS, NUM_ACTIONS = 72, 2
-LIMITS = np.array([25.0])
+STEP = CurriculumStep(CostLimits((25.0,)))
 WIDTHS = ([256, 256], [64, 64])
 # OmniSafe's steps per CPU second on CarGoal2, 20,000 steps, 256 x 256, one update, one core.
 OMNISAFE = {"ppo-lag": 89.0, "cpo": 118.0}
@@ -192,7 +192,7 @@ def measure(task: str, agent_name: str, widths: list[int], updates: int) -> Meas
     environments = TimedSteps(made, rival.steps if rival else None)
     options = {"hidden_sizes": widths}
     config = agent_config(agent_name, options)
-    assert isinstance(config, StudentConfig)
+    assert isinstance(config, ActorCriticConfig)
     agent = make_agent(agent_name, environments.cmdp, options, np.random.SeedSequence(0))
     collector = Collector(environments, num_steps=NUM_STEPS)
     collector.reset(seed=0)
@@ -204,7 +204,7 @@ def measure(task: str, agent_name: str, widths: list[int], updates: int) -> Meas
         start = time.thread_time()
         rollout, episodes = collector.collect(policy, generator)
         middle = time.thread_time()
-        metrics = agent.update(rollout, episode_costs(episodes, 1), LIMITS)
+        metrics = agent.update(rollout, episode_costs(episodes, 1), STEP)
         collecting += middle - start
         updating += time.thread_time() - middle
         flops += UPDATE["update_flops"](config, metrics, NUM_ENVS * NUM_STEPS)

@@ -33,8 +33,8 @@ from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.launch import MIRROR_INTERVAL_SECONDS
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
-from recrl.orchestrator.tracking.mlflow_sync import tracking_uri
 from recrl.orchestrator.trial.trial import run_trial
 from recrl.teachers.registry import make_teacher
 

@@ -26,8 +26,10 @@ from typing import Any
 
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.ray import executor
-from recrl.orchestrator.ray.executor import RayExecutor, local_cluster
+from recrl.orchestrator.ray.clusters import local_cluster
+from recrl.orchestrator.ray.executor import RayExecutor
 from recrl.orchestrator.ray.teacher_service import start_teacher_service
 from recrl.orchestrator.spec import TrialSpec
 from tests.benchmarks.bench_memory import name_of
@@ -101,7 +103,7 @@ def watch_trials(specs: Sequence[TrialSpec], root: Path, title: str, seconds: fl
         stop.set()
 
     with beside(watch, name="watch"):
-        RayExecutor(num_cpus=len(specs)).run(specs, store, stop)
+        RayExecutor(num_cpus=len(specs)).run(specs, LocalSweep(store), stop)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

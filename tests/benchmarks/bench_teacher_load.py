@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_teacher_load.py [--trials 1000] [--updates 30]
 
-Fake trials: threads of a few worker processes, each of which asks the service for one lesson after the other
+Fake trials: threads of a few worker processes, each of which asks the service for one step after the other
 with 30 finished episodes, as a trial does, but trains nothing. First without pause, which says how many
 questions a second the service answers; then with a pause between questions as long as a policy update takes,
 which says how long a trial waits, and the same with the service killed midway. Every trial's lessons and
@@ -29,14 +29,15 @@ from typing import Any
 import numpy as np
 import ray
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.files.store import SweepStore
-from recrl.orchestrator.ray.executor import local_cluster, look_seconds
+from recrl.orchestrator.ray.clusters import local_cluster
+from recrl.orchestrator.ray.hang_watchdog import look_seconds
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.status import SILENCE_SECONDS
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherState
+from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
 PROCESSES = 4
 EPISODES = 30
@@ -48,7 +49,7 @@ SERVICE = "load"
 class Walk:
     """What a fake trial saw: its lessons, the state at the end, and how long each question took."""
 
-    lessons: tuple[Lesson, ...]
+    lessons: tuple[CurriculumStep, ...]
     state: TeacherState
     seconds: tuple[float, ...]
 
@@ -93,14 +94,14 @@ def walk(teacher: Any, trial: int, updates: int, pause: float) -> Walk:
     """Ask for a whole trial's lessons, with pauses between a half and one and a half times ``pause``."""
     told = reports(trial, updates)
     waits = np.random.default_rng([trial, 1]).uniform(0.5, 1.5, updates) * pause
-    lesson, state = teacher.start()
-    lessons, seconds = [lesson], []
+    step, state = teacher.start()
+    lessons, seconds = [step], []
     for report, wait in zip(told, waits, strict=True):
         time.sleep(wait)
         before = time.perf_counter()
-        lesson, state = teacher.step(state, report)
+        step, state = teacher.step(state, report)
         seconds.append(time.perf_counter() - before)
-        lessons.append(lesson)
+        lessons.append(step)
     return Walk(tuple(lessons), state, tuple(seconds))
 
 
@@ -160,7 +161,7 @@ def bench_service(*, trials: int, updates: int, pause: float, kill: bool) -> Non
     )
     print(
         f"  {same} of {trials} trials got exactly the lessons of a teacher of their own, "
-        f"{changes} changes of the lesson among them"
+        f"{changes} changes of the step among them"
     )
     if not kill:
         print(f"  the service used {cpu / len(seconds) * 1e3:.2f} ms of a core a question")

@@ -21,8 +21,9 @@ import numpy as np
 from recrl.environments.cmdp import CostLimits, Phase
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
-from recrl.orchestrator.tracking.mlflow_sync import last_report, tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 STEPS_PER_UPDATE = 3200
 STUDENT_METRICS = (

@@ -32,19 +32,20 @@ from gymnasium.spaces import Box
 
 from recrl.agents.agent import Rollout
 from recrl.agents.collection import Collector, episode_costs
-from recrl.agents.config import AscentConfig, StudentConfig, TrustRegionConfig
-from recrl.agents.learning.batch import distinct_rows
-from recrl.agents.learning.networks import Adam, Critics, NetworkForm, xavier
+from recrl.agents.config import ActorCriticConfig, AscentConfig, TrustRegionConfig
+from recrl.agents.learning.batch import find_repeated
+from recrl.agents.learning.critics import Critics
+from recrl.agents.learning.networks import Adam, NetworkForm, xavier
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.registry import AGENTS, agent_config, make_agent
-from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
 NUM_ENVS, NUM_STEPS, UPDATES = 16, 200, 30
-LIMITS = np.array([5.0])
+STEP = CurriculumStep(CostLimits((5.0,)))
 OPTIONS: list[dict[str, Any]] = [{}, {"compaction": False}]
 NUM_OBSERVATIONS, NUM_ACTIONS = 72, 2
-LARGE_LIMITS, EPISODE_STEPS = np.array([25.0]), 1000
+LARGE_STEP, EPISODE_STEPS = CurriculumStep(CostLimits((25.0,))), 1000
 HIDDEN = (256, 256)
 # The policy is evaluated before and after its improvement, the critics before theirs.
 EVALUATIONS = 2
@@ -69,11 +70,11 @@ def measure(agent_name: str, options: dict[str, Any]) -> tuple[list[float], list
         before = time.thread_time()
         rollout, episodes = collector.collect(agent, generator)
         middle = time.thread_time()
-        metrics = agent.update(rollout, episode_costs(episodes, 1), LIMITS)
+        metrics = agent.update(rollout, episode_costs(episodes, 1), STEP)
         collecting.append((middle - before) * 1e3)
         updating.append((time.thread_time() - middle) * 1e3)
         steps.append(metrics["policy_steps"])
-        found = distinct_rows(rollout.observations.reshape(NUM_ENVS * NUM_STEPS, -1))
+        found = find_repeated(rollout.observations.reshape(NUM_ENVS * NUM_STEPS, -1))
         rows = max(rows, NUM_ENVS * NUM_STEPS if found is None else len(found[0]))
     return collecting, updating, float(np.mean(steps)), rows
 
@@ -119,7 +120,7 @@ def pass_flops(rows: float, sizes: tuple[int, ...]) -> float:
     return forward_flops(rows, sizes) + backward_flops(rows, sizes)
 
 
-def update_flops(config: StudentConfig, metrics: dict[str, float], samples: int) -> float:
+def update_flops(config: ActorCriticConfig, metrics: dict[str, float], samples: int) -> float:
     """Of all products that one update with two critics asks for."""
     critic = (NUM_OBSERVATIONS, *config.hidden_sizes, 1)
     policy = (NUM_OBSERVATIONS, *config.hidden_sizes, NUM_ACTIONS)
@@ -163,7 +164,7 @@ def measure_large(agent_name: str, preset: str, samples: int) -> tuple[float, fl
     """Seconds of one update, those of its bounds, bare and square, and the policy steps it took."""
     options = {"preset": preset, "hidden_sizes": list(HIDDEN)}
     config = agent_config(agent_name, options)
-    assert isinstance(config, StudentConfig)
+    assert isinstance(config, ActorCriticConfig)
     box = Box(-np.inf, np.inf, (NUM_OBSERVATIONS,), np.float32)
     cmdp = CMDPSpec("noise", box, Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32), ("cost",), EPISODE_STEPS)
     agent = make_agent(agent_name, cmdp, options, np.random.SeedSequence(0))
@@ -181,7 +182,7 @@ def measure_large(agent_name: str, preset: str, samples: int) -> tuple[float, fl
 
     square_rates = [flops_a_millisecond()]
     with patch.object(Adam, "step", step_and_pause):
-        spent = milliseconds(lambda: metrics.update(agent.update(rollout, costs, LARGE_LIMITS))) - sum(turns)
+        spent = milliseconds(lambda: metrics.update(agent.update(rollout, costs, LARGE_STEP))) - sum(turns)
     square_rates.append(flops_a_millisecond())
     bare_rate = pass_flops(rows, (NUM_OBSERVATIONS, *HIDDEN, 1)) / float(np.mean(turns))
     flops = update_flops(config, metrics, samples) / 1e3

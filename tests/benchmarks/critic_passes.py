@@ -26,11 +26,11 @@ from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.learning.actor_critic import ActorCritic
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import Floats
+from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector
 
 NUM_ENVS, NUM_STEPS = 20, 1000
-LIMITS = np.array([25.0])
+STEP = CurriculumStep(CostLimits((25.0,)))
 COLUMNS = [
     "student",
     "passes",
@@ -49,7 +49,7 @@ def explained(agent: ActorCritic, rollout: Rollout) -> Floats:
     """The share of the variance of the targets that the critics explain, of the reward and each cost."""
     observations = rollout.observations.reshape(-1, rollout.observations.shape[-1])
     actions = rollout.actions.reshape(len(observations), *rollout.actions.shape[2:])
-    batch = LearningBatch.gather(observations, actions, compact=False)
+    batch = LearningBatch.deduplicate(observations, actions, compact=False)
     found = agent._estimate(rollout, rollout.costs, batch)
     share: Floats = 1.0 - found.advantages.var(axis=0) / found.targets.var(axis=0)
     return share
@@ -71,7 +71,7 @@ def learn(student: str, task: str, passes: int, *, samples: int, seed: int, upda
         told = explained(agent, rollout)
         costs = episode_costs(episodes, 1)
         before = time.process_time()
-        agent.update(rollout, costs, LIMITS)
+        agent.update(rollout, costs, STEP)
         seconds = time.process_time() - before
         earned = float(np.mean([episode.episode_return for episode in episodes]))
         steps = update * NUM_ENVS * NUM_STEPS

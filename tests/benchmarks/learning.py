@@ -28,7 +28,7 @@ from recrl.agents.agent import Agent, DiscretePolicy
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import make_agent
 from recrl.agents.spaces import environment_actions
-from recrl.environments.cmdp import CostLimits, Floats
+from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.finite.exact_solver import evaluate_policy
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector, optimal_return
@@ -147,7 +147,8 @@ def learn(lesson: Lesson, seed: int) -> list[Value]:
     values = []
     for update in range(lesson.updates):
         rollout, episodes = collector.collect(agent, generator)
-        agent.update(rollout, episode_costs(episodes, len(exercise.limits)), np.array(exercise.limits))
+        step = CurriculumStep(CostLimits(exercise.limits))
+        agent.update(rollout, episode_costs(episodes, len(exercise.limits)), step)
         if update >= 0.75 * lesson.updates:
             values.append(true_value(agent, environments))
     return values

@@ -23,6 +23,7 @@ import torch
 
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
 mpl.use("Agg")
@@ -47,7 +48,7 @@ def learn(student: str, preset: str, seed: int, updates: int) -> pd.DataFrame:
     for update in range(1, updates + 1):
         rollout, episodes = collector.collect(agent, generator)
         before = time.process_time()
-        agent.update(rollout, episode_costs(episodes, 1), np.array(exercise.limits))
+        agent.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits(exercise.limits)))
         seconds += time.process_time() - before
         value = LEARNING["true_value"](agent, environments)
         steps = update * environments.num_envs * exercise.num_steps

@@ -27,6 +27,7 @@ import torch
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
 mpl.use("Agg")
@@ -81,7 +82,7 @@ def learn(curve: Curve, seed: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     start = time.process_time()
     for update in range(1, curve.total_steps // steps_per_update + 1):
         rollout, episodes = collector.collect(agent, generator)
-        agent.update(rollout, episode_costs(episodes, 1), np.array([np.inf]))
+        agent.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits.unlimited(1)))
         if episodes:
             earned = float(np.mean([episode.episode_return for episode in episodes]))
             rows.append((curve.task, seed, update * steps_per_update, earned))

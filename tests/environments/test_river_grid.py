@@ -14,26 +14,22 @@ from gymnasium.utils.env_checker import check_env
 from minigrid.minigrid_env import MiniGridEnv
 
 from recrl.environments.cmdp import CostLimits
+from recrl.environments.registration import register_all
 from recrl.environments.registry import make_vector, optimal_return
 from recrl.environments.rivergrid.grid_world import (
     FORWARD,
     LEFT,
     RIGHT,
     CostName,
-    ObservationName,
     RiverGridMapOptions,
-    RiverGridOptions,
     RiverGridVectorEnv,
     state_index,
 )
 from recrl.environments.rivergrid.maps import MAPS, MapGenerator, generate_map, parse_map
 from recrl.environments.rivergrid.minigrid_env import RiverGridEnv, render_frame
 
-IDENTIFIERS = [
-    "recrl.environments.registration:recrl/RiverGrid-1a-v0",
-    "recrl.environments.registration:recrl/RiverGrid-1b-v0",
-    "recrl.environments.registration:recrl/RiverGrid-v0",
-]
+register_all()
+IDENTIFIERS = ["recrl/RiverGrid-1a-v0", "recrl/RiverGrid-1b-v0", "recrl/RiverGrid-v0"]
 
 
 def episode(name: str, actions: Sequence[int], **options: Any) -> tuple[list[float], list[list[float]], bool]:
@@ -117,21 +113,6 @@ def test_the_observation_is_one_hot_x_y_and_heading() -> None:
     assert observation.tolist() == [*(0, 1, 0, 0), *(0, 0, 0, 1, 0), *(0, 0, 0, 1)]
 
 
-def test_the_pose_is_one_hot_as_a_whole() -> None:
-    options = {"map": "####\n#.~#\n#.G#\n#^.#\n####", "observation": "pose"}
-    environment = make_vector("rivergrid", 1, options=options)
-    observation = environment.reset(seed=0)[0][0]
-    assert observation.shape == (4 * 5 * 4,)
-    assert np.flatnonzero(observation).tolist() == [(1 * 5 + 3) * 4 + 3]  # x = 1, y = 3, north
-    assert observation.sum() == 1.0
-
-
-def test_a_trial_is_known_by_its_observation_only_where_it_is_not_the_first() -> None:
-    assert "observation" not in RiverGridOptions().model_dump()
-    assert RiverGridOptions(observation="pose").model_dump()["observation"] == "pose"
-
-
-@pytest.mark.parametrize("observation", ["coordinates", "pose"])
 @pytest.mark.parametrize("costs", [("river",), ("mud", "turns", "river")])
 @pytest.mark.parametrize(
     "drawing",
@@ -144,11 +125,11 @@ def test_a_trial_is_known_by_its_observation_only_where_it_is_not_the_first() ->
     ids=["1a", "1b", "mud", "random-0", "random-1", "random-2", "random-3"],
 )
 def test_the_fast_environment_equals_minigrids_step_for_step(
-    drawing: str, costs: tuple[CostName, ...], observation: ObservationName
+    drawing: str, costs: tuple[CostName, ...]
 ) -> None:
     horizon = 40
-    slow = RiverGridEnv(drawing, max_steps=horizon, costs=costs, observation=observation)
-    options = RiverGridMapOptions(map=drawing, horizon=horizon, costs=costs, observation=observation)
+    slow = RiverGridEnv(drawing, max_steps=horizon, costs=costs)
+    options = RiverGridMapOptions(map=drawing, horizon=horizon, costs=costs)
     fast = RiverGridVectorEnv("rivergrid", parse_map(drawing), options, num_envs=2)
     generator = np.random.default_rng(0)
     slow_observation, _ = slow.reset(seed=1)

@@ -31,9 +31,11 @@ from recrl.orchestrator.cli.main import main as recrl_sweep
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.sweep import launch
-from recrl.orchestrator.tracking.mlflow_sync import sync, tracking_uri
+from recrl.orchestrator.sweep import LaunchSettings, launch
+from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.trial.trial import run_recorded
 
 GRID = """\
@@ -199,7 +201,8 @@ def make(folder: Path, *, interrupted: bool, limit: float = 0.5) -> Path:
     (folder / "grid.yaml").write_text(GRID.format(name=NAME, limit=limit))
     grid = read_grid(folder / "grid.yaml")
     store = SweepStore(folder / "runs", NAME)
-    launch(grid, store, _Interrupted() if interrupted else InlineExecutor(), stop=threading.Event())
+    executor = _Interrupted() if interrupted else InlineExecutor()
+    launch(LaunchSettings(grid, LocalSweep(store), executor), stop=threading.Event())
     return folder
 
 
@@ -207,10 +210,10 @@ def make(folder: Path, *, interrupted: bool, limit: float = 0.5) -> Path:
 class _Interrupted:
     """An executor that stops the last trial half way, with two checkpoints."""
 
-    def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
+    def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         for spec in specs:
             answers = itertools.chain([False] * STOPPED_AFTER, itertools.repeat(spec is specs[-1]))
-            run_recorded(spec, store.trial(spec), should_stop=lambda: next(answers), commit_seconds=0.0)  # noqa: B023
+            run_recorded(spec, place.store.trial(spec), should_stop=lambda: next(answers), commit_seconds=0.0)  # noqa: B023
 
 
 def say(folder: Path, arguments: Sequence[str]) -> Said:

@@ -21,8 +21,9 @@ from recrl.orchestrator.errors import LostLeaseError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.scratch import EMPTY_SECONDS, LOCK, scratch_folder
 from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.sweep import launch
+from recrl.orchestrator.sweep import LaunchSettings, launch
 from recrl.orchestrator.trial.heartbeat import Heartbeat
 from recrl.orchestrator.trial.trial import run_recorded
 
@@ -165,8 +166,8 @@ def test_what_a_full_disk_keeps_from_being_said_hides_nothing(
     small_disk: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Dying:
-        def run(self, specs: object, store: SweepStore, stop: threading.Event) -> None:
-            store.trial(SPEC).begin(SPEC).store.reserve_path.unlink()
+        def run(self, specs: object, place: SweepPlace, stop: threading.Event) -> None:
+            place.store.trial(SPEC).begin(SPEC).store.reserve_path.unlink()
             fill(small_disk)
             raise ArithmeticError("the first error")
 
@@ -178,7 +179,8 @@ def test_what_a_full_disk_keeps_from_being_said_hides_nothing(
     )
     grid = parse_grid(text.encode(), source="grid.yaml")
     with pytest.raises(ArithmeticError, match="the first error"):
-        launch(grid, SweepStore(small_disk, "sweep"), Dying(), stop=threading.Event())
+        place = LocalSweep(SweepStore(small_disk, "sweep"))
+        launch(LaunchSettings(grid, place, Dying()), stop=threading.Event())
     with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\); it starts anew"):
         SweepStore(small_disk, "sweep").trial(SPEC).set_status(TrialState.WAITING)
 

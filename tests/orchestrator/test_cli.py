@@ -28,7 +28,7 @@ seeds: 1
 run: {total_steps: 160, deploy_fraction: 0.5, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
 UNLUCKY_STUDENT = """\
-from recrl.agents.config import PPOLagConfig
+from recrl.agents.algorithms.configs import PPOLagConfig
 from recrl.agents.registry import AgentEntry
 
 def make(cmdp, config, seed):
@@ -495,8 +495,8 @@ def test_a_module_that_is_nowhere_is_a_sentence(folder: Path, capsys: pytest.Cap
     (folder / "grid.yaml").write_text(GRID.replace("two-state", "'my_nav:make'"))
     assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.startswith(
-        "grid.yaml:2: tasks.0.name: cannot import 'my_nav:make': there is no module my_nav; start the "
-        "command in the folder that holds it, name that folder in PYTHONPATH, or install the module's package\n"
+        "grid.yaml:2: tasks.0.name: cannot import 'my_nav:make': there is no module my_nav; "
+        "start the command in the folder that holds it, name that folder in PYTHONPATH, or install the module's package\n"
     )
 
 

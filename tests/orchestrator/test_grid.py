@@ -1,6 +1,7 @@
 """A grid file is checked whole: every mistake at once, each with its line; what is right is a product."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -354,9 +355,19 @@ def test_the_grids_we_ship_are_right(path: Path) -> None:
     assert len(grid.trials()) == SHIPPED[path.stem]
 
 
+# Grids of results are archives: some name options and a curriculum that no longer exist.
+REMOVED = re.compile(
+    "cross_fitting|limit_margin|multiplier_(geometric|reset|waits)|noisy_target_kl|temperature|observation"
+    "|'annealed'"
+)
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "results").glob("*/*.yaml")), ids=lambda path: path.stem)
-def test_the_grids_of_our_results_still_are_right(path: Path) -> None:
-    assert read_grid(path).trials()
+def test_the_grids_of_our_results_are_right_but_for_what_was_removed_since(path: Path) -> None:
+    try:
+        assert read_grid(path).trials()
+    except GridError as error:
+        assert all(REMOVED.search(problem) for problem in error.problems), error.problems
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))

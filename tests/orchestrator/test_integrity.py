@@ -23,8 +23,9 @@ from recrl.orchestrator.files.small_files import read_sealed, write_sealed
 from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.plan import Work, make_plan
+from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.sweep import SweepResult, launch
+from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
 from recrl.orchestrator.trial.trial import run_recorded
 
 GRID = """\
@@ -45,18 +46,19 @@ def run(store: SweepStore, *, updates: int | None = None, **options: Any) -> Swe
     """Launch the grid; its trials are stopped after so many updates."""
 
     class Stopping:
-        def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
+        def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
             for spec in specs:
                 run_recorded(
                     spec,
-                    store.trial(spec),
+                    place.store.trial(spec),
                     should_stop=partial(next, iter([False] * (updates or 0)), True),
                     commit_seconds=0.0,
                 )
 
     executor: Executor = InlineExecutor() if updates is None else Stopping()
     grid = parse_grid(GRID.encode(), source="grid.yaml")
-    return launch(grid, store, executor, stop=threading.Event(), **options)
+    settings = LaunchSettings(grid, LocalSweep(store), executor, **options)
+    return launch(settings, stop=threading.Event())
 
 
 def results(store: SweepStore) -> dict[str, bytes]:
@@ -437,7 +439,7 @@ def test_a_row_with_other_columns_names_the_agent(
 
 
 FICKLE = """\
-from recrl.agents.config import PPOLagConfig
+from recrl.agents.algorithms.configs import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import make_ppo_lag
 from recrl.agents.registry import AgentEntry
 

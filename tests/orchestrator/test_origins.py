@@ -22,7 +22,8 @@ from recrl.orchestrator.files.code_changes import (
 )
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.sweep import launch
+from recrl.orchestrator.places import LocalSweep, SweepPlace
+from recrl.orchestrator.sweep import LaunchSettings, launch
 
 TASK = """\
 from recrl.environments.registry import Task
@@ -110,16 +111,16 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
     (spec,) = grid.trials()
 
     class Stopping(InlineExecutor):
-        def run(self, specs: object, store: SweepStore, stop: threading.Event) -> None:
+        def run(self, specs: object, place: SweepPlace, stop: threading.Event) -> None:
             from recrl.orchestrator.trial.trial import run_recorded  # noqa: PLC0415
 
             answers = iter([False])
-            run_recorded(spec, store.trial(spec), should_stop=lambda: next(answers, True))
+            run_recorded(spec, place.store.trial(spec), should_stop=lambda: next(answers, True))
 
-    launch(grid, store, Stopping(), stop=threading.Event())
+    launch(LaunchSettings(grid, LocalSweep(store), Stopping()), stop=threading.Event())
     first = code_of(spec)
     change(folder)
-    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    launch(LaunchSettings(grid, LocalSweep(store), InlineExecutor()), stop=threading.Event())
     attempts = store.trial(spec).provenance()
     assert [attempt["attempt"] for attempt in attempts] == [1, 2]
     assert [attempt["code"] for attempt in attempts] == [first, code_of(spec)]

@@ -20,27 +20,26 @@ import pytest
 import ray
 from ray.exceptions import RayActorError
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
+from recrl.orchestrator.files.stop_file import StopFile
 from recrl.orchestrator.files.store import SweepStore
-from recrl.orchestrator.ray import executor
+from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.ray import hang_watchdog
+from recrl.orchestrator.ray.clusters import existing_cluster, local_cluster
 from recrl.orchestrator.ray.executor import (
-    LONGEST_PAUSE_SECONDS,
     RayExecutor,
-    StopFile,
-    _Silence,
-    existing_cluster,
-    local_cluster,
-    pause_seconds,
 )
+from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit
 from recrl.orchestrator.ray.teacher_service import RayTeacher, start_teacher_service
+from recrl.orchestrator.ray.tune_callbacks import LONGEST_PAUSE_SECONDS, pause_seconds
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, Teacher, TeacherSpec
+from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 
 LINEAR = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
@@ -72,7 +71,7 @@ def cluster() -> Iterator[None]:
 def inline(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     """The undisturbed trials, one after the other in this process."""
     store = SweepStore(tmp_path_factory.mktemp("inline"), "sweep")
-    InlineExecutor().run((*SWEEP, LONG), store, threading.Event())
+    InlineExecutor().run((*SWEEP, LONG), LocalSweep(store), threading.Event())
     return store
 
 
@@ -105,7 +104,7 @@ def test_equal_bytes_in_reused_workers_and_failures_stop_nobody(
     tmp_path: Path, inline: SweepStore, capfd: pytest.CaptureFixture[str]
 ) -> None:
     store = SweepStore(tmp_path, "sweep")
-    RayExecutor(max_failures=0).run((BROKEN, *SWEEP, CRASHING), store, threading.Event())
+    RayExecutor(max_failures=0).run((BROKEN, *SWEEP, CRASHING), LocalSweep(store), threading.Event())
     assert_equal_bytes(SWEEP, store, inline)
     assert len({store.trial(spec).record().pid for spec in SWEEP}) <= 2
     failed = store.trial(BROKEN).record()
@@ -135,13 +134,13 @@ def test_a_stopped_sweep_is_finished_by_the_next_run_with_other_workers(
         stop.set()
 
     with once(lambda: store.trial(LONG).record().update >= 20, ask_to_stop):
-        RayExecutor().run((LONG, *SWEEP), store, stop)
+        RayExecutor().run((LONG, *SWEEP), LocalSweep(store), stop)
     assert time.monotonic() - stopped_at[0] < 20.0
     record = store.trial(LONG).record()
     assert record.status is TrialState.WAITING
     assert 20 <= record.update < LONG.num_updates
     left = [spec for spec in (*reversed(SWEEP), LONG) if not store.trial(spec).record().status.is_finished]
-    RayExecutor(max_concurrent=1, teacher="inline").run(left, store, threading.Event())
+    RayExecutor(max_concurrent=1, teacher="inline").run(left, LocalSweep(store), threading.Event())
     assert_equal_bytes((LONG, *SWEEP), store, inline)
 
 
@@ -158,7 +157,7 @@ def test_a_killed_worker_and_a_killed_teacher_leave_no_trace(tmp_path: Path, inl
         os.kill(killed[0], signal.SIGKILL)
 
     with once(lambda: store.trial(LONG).record().update >= 40, kill):
-        RayExecutor(commit_seconds=0.1).run([LONG], store, threading.Event())
+        RayExecutor(commit_seconds=0.1).run([LONG], LocalSweep(store), threading.Event())
     assert killed
     assert store.trial(LONG).record().attempt == 2
     assert store.trial(LONG).record().pid not in killed
@@ -170,7 +169,7 @@ def test_trials_in_an_object_store_outlive_their_workers_and_their_folders(
     tmp_path: Path, inline: SweepStore
 ) -> None:
     mirror = SweepStore(tmp_path / "mirror", "sweep")
-    storage = RemoteSweep((tmp_path / "bucket").as_uri(), "sweep")
+    place = RemoteSweep((tmp_path / "bucket").as_uri(), mirror)
     never, killed = threading.Event(), []
 
     def kill() -> None:
@@ -181,8 +180,8 @@ def test_trials_in_an_object_store_outlive_their_workers_and_their_folders(
         record = mirror.trial(LONG).record()
         return record.status is TrialState.RUNNING and bool(record.committed.get("updates.csv"))
 
-    with storage.mirrored(mirror, never, every=0.1), once(is_halfway, kill):
-        RayExecutor(commit_seconds=0.2, storage=storage).run([LONG], mirror, never)
+    with place.mirrored(never, every=0.1), once(is_halfway, kill):
+        RayExecutor(commit_seconds=0.2).run([LONG], place, never)
     assert killed
     assert mirror.trial(LONG).record().attempt == 2
     assert "resumed after update " in mirror.trial(LONG).log_path.read_text()
@@ -195,12 +194,12 @@ def process_of(actor: Any) -> int:
     return process
 
 
-def lessons(teacher: Teacher, reports: Sequence[ProgressReport]) -> Iterator[Lesson]:
-    lesson, state = teacher.start()
-    yield lesson
+def lessons(teacher: Teacher, reports: Sequence[ProgressReport]) -> Iterator[CurriculumStep]:
+    step, state = teacher.start()
+    yield step
     for report in reports:
-        lesson, state = teacher.step(state, report)
-        yield lesson
+        step, state = teacher.step(state, report)
+        yield step
 
 
 def curriculum(cost: float) -> tuple[TeacherSpec, list[ProgressReport]]:
@@ -232,9 +231,9 @@ def curriculum(cost: float) -> tuple[TeacherSpec, list[ProgressReport]]:
 @pytest.mark.usefixtures("cluster")
 def test_inline_own_shared_and_killed_teachers_give_identical_limits() -> None:
     expected = [list(lessons(make_teacher(spec), reports)) for spec, reports in map(curriculum, (6.0, 4.0))]
-    assert len({lesson.limits for lesson in expected[0]}) > 2
+    assert len({step.limits for step in expected[0]}) > 2
 
-    def own(cost: float) -> list[Lesson]:
+    def own(cost: float) -> list[CurriculumStep]:
         spec, reports = curriculum(cost)
         return list(lessons(RayTeacher(spec, start_teacher_service(f"own-{cost}")), reports))
 
@@ -242,7 +241,7 @@ def test_inline_own_shared_and_killed_teachers_give_identical_limits() -> None:
 
     service = start_teacher_service("shared")
     pupils = [lessons(RayTeacher(spec, service), reports) for spec, reports in map(curriculum, (6.0, 4.0))]
-    shared: list[tuple[Lesson, ...]] = []
+    shared: list[tuple[CurriculumStep, ...]] = []
     for update, pair in enumerate(zip(*pupils, strict=True)):
         shared.append(pair)
         if update == 10:
@@ -274,7 +273,7 @@ def test_what_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
         ClusterError,
         match=r"^a trial asks for 3 CPU, 0 GPU, this cluster has 2 CPU, 0 GPU; ask for less or add machines$",
     ):
-        RayExecutor(cpus_per_trial=3).run(SWEEP, SweepStore(tmp_path, "sweep"), threading.Event())
+        RayExecutor(cpus_per_trial=3).run(SWEEP, LocalSweep(SweepStore(tmp_path, "sweep")), threading.Event())
 
 
 @pytest.mark.usefixtures("cluster")
@@ -391,7 +390,7 @@ def test_a_process_is_silent_only_after_it_has_spoken_of_its_trial(tmp_path: Pat
     process = subprocess.Popen(["ray::trial", "60"], executable=shutil.which("sleep"))
     try:
         files.begin(LONG)  # by a process that is dead, and left its record so
-        silence = _Silence(store, 0.0, None)
+        silence = HangWatchdog(LocalSweep(store), 0.0)
         silence.begin(tune_trial)
         files.write_record(replace(files.record(), pid=process.pid))
         for _ in range(3):
@@ -420,9 +419,9 @@ def test_a_process_that_never_speaks_of_its_trial_is_ended_by_ray_after_a_longer
     )
     ended: list[Any] = []
     clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr(executor, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(hang_watchdog, "time", SimpleNamespace(monotonic=lambda: clock.now))
     monkeypatch.setattr(ray, "kill", ended.append)
-    silence = _Silence(store, 100.0, None)
+    silence = HangWatchdog(LocalSweep(store), 100.0)
     silence.begin(tune_trial)
     found = []
     for clock.now in (101.0, 490.0, 501.0, 510.0, 2000.0):

@@ -24,11 +24,14 @@ from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.grid.grid import GridSpec, parse_grid
+from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.remote.remote_sweep import SILENT_SECONDS, RemoteSweep, StopObject
+from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from recrl.orchestrator.remote.remote_trial import Upload
+from recrl.orchestrator.remote.stop_object import StopObject
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep import SweepResult, launch, request_stop
+from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
 from recrl.orchestrator.trial.trial import run_recorded
 from tests.faults.unreliable import Unreliable
 
@@ -56,15 +59,9 @@ class Machine:
     storage: RemoteSweep
 
     def launch(self, *, stop: threading.Event | None = None, retry_failed: bool = False) -> SweepResult:
-        self.storage.mark(self.store)
-        return launch(
-            grid(),
-            self.store,
-            InlineExecutor(self.storage),
-            stop=stop or threading.Event(),
-            retry_failed=retry_failed,
-            storage=self.storage,
-        )
+        self.storage.mark()
+        settings = LaunchSettings(grid(), self.storage, InlineExecutor(), retry_failed=retry_failed)
+        return launch(settings, stop=stop or threading.Event())
 
 
 def grid() -> GridSpec:
@@ -76,14 +73,15 @@ def never() -> bool:
 
 
 def machine(folder: Path, name: str, kind: str = "file") -> Machine:
-    return Machine(SweepStore(folder / name, "small"), RemoteSweep(f"{kind}://{folder}/bucket", "small"))
+    store = SweepStore(folder / name, "small")
+    return Machine(store, RemoteSweep(f"{kind}://{folder}/bucket", store))
 
 
 @pytest.fixture(scope="module")
 def local(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     """The same sweep in a folder."""
     store = SweepStore(tmp_path_factory.mktemp("local"), "small")
-    launch(grid(), store, InlineExecutor(), stop=threading.Event())
+    launch(LaunchSettings(grid(), LocalSweep(store), InlineExecutor()), stop=threading.Event())
     return store
 
 
@@ -117,8 +115,8 @@ def test_a_sweep_in_an_object_store_is_the_sweep_of_a_folder(tmp_path: Path, loc
     assert result.progress.is_complete
     assert_equal(one.store, local)
     other = machine(tmp_path, "other")
-    other.storage.mark(other.store)
-    other.storage.pull(other.store)
+    other.storage.mark()
+    other.storage.pull()
     assert_equal(other.store, local)
     assert other.store.specs() == local.specs()
     again = other.launch()
@@ -130,8 +128,8 @@ def test_a_damaged_mirror_says_that_it_is_one(tmp_path: Path, local: SweepStore)
     one = machine(tmp_path, "one")
     one.launch()
     other = machine(tmp_path, "other")
-    other.storage.mark(other.store)
-    other.storage.pull(other.store)
+    other.storage.mark()
+    other.storage.pull()
     trial = other.store.trial(grid().trials()[0])
     whole = trial.episodes_path.read_bytes()
     trial.episodes_path.write_bytes(whole[:-1])
@@ -141,22 +139,16 @@ def test_a_damaged_mirror_says_that_it_is_one(tmp_path: Path, local: SweepStore)
     )
     shutil.rmtree(other.store.folder)
     again = machine(tmp_path, "other")
-    again.storage.mark(again.store)
-    again.storage.pull(again.store)
+    again.storage.mark()
+    again.storage.pull()
     assert_equal(again.store, local)
 
 
 def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
     here = machine(tmp_path, "here")
     with pytest.raises(RecrlError, match="trials of a sweep that is kept there are not run again: "):
-        launch(
-            grid(),
-            here.store,
-            InlineExecutor(here.storage),
-            stop=threading.Event(),
-            storage=here.storage,
-            rerun_damaged=True,
-        )
+        settings = LaunchSettings(grid(), here.storage, InlineExecutor(), rerun_damaged=True)
+        launch(settings, stop=threading.Event())
     assert not here.store.folder.exists()
 
 
@@ -171,7 +163,7 @@ def test_a_trial_stopped_again_and_again_on_other_machines_equals_itself(
             run_recorded(spec, trial, should_stop=partial(next, answers))
         assert not trial.folder.exists()  # what a machine had is gone
     seen = machine(tmp_path, "seen")
-    seen.storage.pull(seen.store)
+    seen.storage.pull()
     assert seen.store.trial(spec).record().attempt == 4
     assert_equal_trial(seen.store.trial(spec), local.trial(spec))
 
@@ -180,13 +172,16 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
     spec = grid().trials()[0]
     program = (
         "import json, sys, threading\n"
-        "from recrl.orchestrator.remote.remote_sweep import RemoteSweep\n"
+        "from pathlib import Path\n"
+        "from recrl.orchestrator.files.store import SweepStore\n"
+        "from recrl.orchestrator.remote.opening import place_at\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
         "from recrl.orchestrator.trial.trial import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
         "asked = iter(range(99))\n"
         "hang = lambda: next(asked) >= 3 and threading.Event().wait()\n"
-        "with RemoteSweep(sys.argv[1], 'small').working_copy(spec, hang) as trial:\n"
+        "place = place_at(SweepStore(Path('nowhere'), 'small'), sys.argv[1])\n"
+        "with place.working_copy(spec, hang) as trial:\n"
         "    run_recorded(spec, trial, should_stop=hang, commit_seconds=0.0)\n"
     )
     first, seen = machine(tmp_path, "first"), machine(tmp_path, "seen")
@@ -196,7 +191,7 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
     while seen.store.trial(spec).saved_update < 3 and time.monotonic() < deadline:
         with suppress(subprocess.TimeoutExpired):
             process.wait(0.1)
-        seen.storage.pull(seen.store, checkpoints=True)
+        seen.storage.pull(checkpoints=True)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     assert seen.store.trial(spec).record().status is TrialState.RUNNING  # it had no time to say otherwise
@@ -217,7 +212,7 @@ def test_a_storage_that_is_down_for_a_while_loses_nothing(
         Unreliable.plan += ["refused", "cut"] * 4
         run_recorded(spec, trial, should_stop=never, commit_seconds=0.0)
     assert "cannot be written (OSError: the network is down); it is tried again for 15 minutes" in caplog.text
-    here.storage.pull(here.store)
+    here.storage.pull()
     assert_equal_trial(here.store.trial(spec), local.trial(spec))
 
 
@@ -234,7 +229,7 @@ def test_a_storage_that_stays_down_is_given_up_and_the_trial_goes_on_later(
         Unreliable.plan += ["refused"] * 1000
         run_recorded(spec, trial, should_stop=never)
     Unreliable.plan.clear()
-    here.storage.pull(here.store)
+    here.storage.pull()
     assert here.store.trial(spec).record().status is not TrialState.COMPLETE
     here.launch()
     assert_equal(here.store, local)
@@ -255,21 +250,21 @@ def test_an_attempt_that_was_taken_over_ends_itself(tmp_path: Path) -> None:
             os.sched_yield()
         with pytest.raises(LostLeaseError):
             writer.commit({}, update=2, env_steps=80)
-    there.storage.pull(there.store)
+    there.storage.pull()
     assert there.store.trial(spec).record().update == 0
 
 
 def test_one_launch_at_a_time_and_a_dead_one_frees_the_sweep(tmp_path: Path) -> None:
     one, other = machine(tmp_path, "one"), machine(tmp_path, "other")
     with one.storage.held(threading.Event()):
-        assert other.storage.is_held()
+        assert other.storage.lease.is_held()
         with pytest.raises(SweepBusyError) as error, other.storage.held(threading.Event()):
             pass
         assert str(error.value).startswith(
             f"file://{tmp_path}/bucket/small: this sweep is already being run by process {os.getpid()} on "
         )
         assert str(error.value).endswith("the sweep is free after 90 seconds of silence)")
-    assert not other.storage.is_held()
+    assert not other.storage.lease.is_held()
     elsewhere = {"host": "elsewhere", "pid": 1, "token": "1", "boot": "1"}
     for holder, free in (
         ({**elsewhere, "at": time.time()}, False),
@@ -277,15 +272,15 @@ def test_one_launch_at_a_time_and_a_dead_one_frees_the_sweep(tmp_path: Path) -> 
         ({}, True),
     ):
         one.storage.objects.write("launch.json", json.dumps(holder).encode())
-        assert other.storage.is_held() is not free
+        assert other.storage.lease.is_held() is not free
         if free:
             with other.storage.held(threading.Event()):
-                assert other.storage.is_held()
+                assert other.storage.lease.is_held()
 
 
 def test_a_launch_that_is_taken_over_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.LOOK_SECONDS", 0.01)
-    monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.BEAT_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.BEAT_SECONDS", 0.01)
     here, stop = machine(tmp_path, "here"), threading.Event()
     with here.storage.held(stop):
         taken = json.dumps(
@@ -294,15 +289,15 @@ def test_a_launch_that_is_taken_over_stops(tmp_path: Path, monkeypatch: pytest.M
         while not stop.is_set():
             here.storage.objects.write("launch.json", taken)
             stop.wait(0.05)
-    assert here.storage.is_held()  # by the other one
+    assert here.storage.lease.is_held()  # by the other one
 
 
 def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LOOK_SECONDS", 0.01)
     here, there, stop = machine(tmp_path, "here"), machine(tmp_path, "there"), threading.Event()
-    assert not request_stop(there.store, there.storage)()
+    assert not there.storage.request_stop()()
     with here.storage.held(stop):
-        still_runs = request_stop(there.store, there.storage)
+        still_runs = there.storage.request_stop()
         assert stop.wait(30.0)
         assert still_runs()
     assert not still_runs()
@@ -333,7 +328,7 @@ def test_workers_hear_of_the_end_of_their_own_run_and_of_all_earlier_ones(
             assert not sign.is_set()
             sign.set()
             assert not worker.is_set()  # it asked a moment ago
-            monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.STOP_QUESTION_SECONDS", 0.0)
+            monkeypatch.setattr("recrl.orchestrator.remote.stop_object.STOP_QUESTION_SECONDS", 0.0)
             assert worker.is_set()
     assert objects.keys_in() == []
 
@@ -344,11 +339,11 @@ def test_what_only_the_launch_knows_of_a_trial_is_seen_elsewhere(tmp_path: Path)
     for spec in (crashed, silent):
         with here.storage.working_copy(spec, never) as trial:
             trial.begin(spec)
-    here.storage.pull(here.store)
+    here.storage.pull()
     here.store.trial(crashed).set_status(TrialState.FAILED, error="failures of its process: 4")
     here.store.trial(silent).set_status(TrialState.WAITING)
-    here.storage.settle([crashed, silent], here.store)
-    there.storage.pull(there.store)
+    here.storage.settle([crashed, silent])
+    there.storage.pull()
     record = there.store.trial(crashed).record()
     assert (record.status, record.error) == (TrialState.FAILED, "failures of its process: 4")
     assert there.store.trial(silent).record().status is TrialState.WAITING
@@ -362,11 +357,11 @@ def test_a_launch_that_was_taken_over_leaves_the_trials_of_the_other_alone(tmp_p
     with there.storage.held(threading.Event()):
         trial.begin(spec)
         upload.push()
-        here.storage.pull(here.store)
+        here.storage.pull()
         here.store.trial(spec).set_status(TrialState.WAITING)
-        here.storage.settle([spec], here.store)
+        here.storage.settle([spec])
         upload.push()
-    here.storage.settle([spec], here.store)
+    here.storage.settle([spec])
     with pytest.raises(LostLeaseError):  # of a launch that is over
         upload.push()
 
@@ -397,11 +392,11 @@ def test_the_command_line_takes_the_address_once(
 def test_a_folder_is_the_mirror_of_one_address_or_none(tmp_path: Path, local: SweepStore) -> None:
     here = machine(tmp_path, "here")
     with pytest.raises(RecrlError, match=r": this sweep is kept in that folder, not at file://"):
-        here.storage.mark(local)
-    here.storage.mark(here.store)
-    here.storage.mark(here.store)
+        RemoteSweep(here.storage.uri, local).mark()
+    here.storage.mark()
+    here.storage.mark()
     with pytest.raises(RecrlError, match=r": this sweep is kept at file://.*/bucket, not at file:///other; "):
-        RemoteSweep("file:///other", "small").mark(here.store)
+        RemoteSweep("file:///other", here.store).mark()
 
 
 @pytest.mark.parametrize(

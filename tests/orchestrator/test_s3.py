@@ -12,9 +12,10 @@ from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
-from recrl.orchestrator.sweep import launch
+from recrl.orchestrator.sweep import LaunchSettings, launch
 
 pytestmark = pytest.mark.filterwarnings("default")  # theirs
 s3fs: Any = pytest.importorskip(
@@ -57,13 +58,13 @@ def server() -> Iterator[Any]:
 def test_a_sweep_on_s3_is_the_sweep_of_a_folder(tmp_path: Path) -> None:
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     local = SweepStore(tmp_path / "local", "small")
-    launch(grid, local, InlineExecutor(), stop=threading.Event())
-    storage = RemoteSweep("s3://results/runs", "small")
-    storage.objects.probe()
+    launch(LaunchSettings(grid, LocalSweep(local), InlineExecutor()), stop=threading.Event())
     mirror = SweepStore(tmp_path / "mirror", "small")
-    launch(grid, mirror, InlineExecutor(storage), stop=threading.Event(), storage=storage)
+    place = RemoteSweep("s3://results/runs", mirror)
+    place.prepare()
+    launch(LaunchSettings(grid, place, InlineExecutor()), stop=threading.Event())
     elsewhere = SweepStore(tmp_path / "elsewhere", "small")
-    RemoteSweep("s3://results/runs", "small").pull(elsewhere)
+    RemoteSweep("s3://results/runs", elsewhere).pull()
     [spec] = grid.trials()
     for store in (mirror, elsewhere):
         assert store.trial(spec).episodes_path.read_bytes() == local.trial(spec).episodes_path.read_bytes()

@@ -15,9 +15,10 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import GridSpec, parse_grid
 from recrl.orchestrator.grid.plan import Plan, Work
+from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.status import SweepProgress
-from recrl.orchestrator.sweep import SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch, stopping_on_signals
 
 GRID = """\
 name: small
@@ -31,7 +32,7 @@ run: {total_steps: 120, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 # A user's own student that breaks down as long as a file called "broken" is in the working directory.
 FRAGILE_STUDENT = """\
 from pathlib import Path
-from recrl.agents.config import PPOLagConfig
+from recrl.agents.algorithms.configs import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import make_ppo_lag
 from recrl.agents.registry import AgentEntry
 
@@ -55,7 +56,8 @@ def _grid(text: str = GRID) -> GridSpec:
 
 def _launch(store: SweepStore, grid: GridSpec | None = None, *, retry_failed: bool = False) -> SweepResult:
     stop = threading.Event()
-    return launch(grid or _grid(), store, InlineExecutor(), stop=stop, retry_failed=retry_failed)
+    settings = LaunchSettings(grid or _grid(), LocalSweep(store), InlineExecutor(), retry_failed=retry_failed)
+    return launch(settings, stop=stop)
 
 
 def _results(store: SweepStore) -> dict[str, bytes]:
@@ -71,18 +73,18 @@ def _results(store: SweepStore) -> dict[str, bytes]:
 class StopAfterOne:
     """An executor during which someone asks to stop while the first trial runs."""
 
-    def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
-        InlineExecutor().run(specs[:1], store, stop)
+    def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
+        InlineExecutor().run(specs[:1], place, stop)
         stop.set()
-        InlineExecutor().run(specs[1:], store, stop)
+        InlineExecutor().run(specs[1:], place, stop)
 
 
 @dataclass(frozen=True)
 class Unavailable:
     """An executor that dies with a trial in its hands."""
 
-    def run(self, specs: Sequence[TrialSpec], store: SweepStore, stop: threading.Event) -> None:
-        store.trial(specs[0]).begin(specs[0])
+    def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
+        place.store.trial(specs[0]).begin(specs[0])
         raise ClusterError("the cluster is gone")
 
 
@@ -127,7 +129,7 @@ def test_the_folder_says_what_was_launched(store: SweepStore) -> None:
 
 
 def test_a_stopped_sweep_goes_on_with_the_same_call(store: SweepStore, tmp_path: Path) -> None:
-    stopped = launch(_grid(), store, StopAfterOne(), stop=threading.Event())
+    stopped = launch(LaunchSettings(_grid(), LocalSweep(store), StopAfterOne()), stop=threading.Event())
     assert stopped.stopped
     assert not stopped.progress.is_complete
     again = _launch(store)
@@ -179,7 +181,9 @@ def test_two_launches_of_a_sweep_at_once_are_refused(store: SweepStore) -> None:
 
 def test_a_wrong_selection_leaves_no_trace(store: SweepStore) -> None:
     with pytest.raises(RecrlError, match="--only: no trial has method 'dynamic'"):
-        launch(_grid(), store, InlineExecutor(), stop=threading.Event(), only={"method": ["dynamic"]})
+        only = {"method": ["dynamic"]}
+        settings = LaunchSettings(_grid(), LocalSweep(store), InlineExecutor(), only=only)
+        launch(settings, stop=threading.Event())
     assert not store.folder.exists()
 
 
@@ -193,15 +197,15 @@ def test_the_mirror_is_stopped_patiently_after_the_figures(store: SweepStore) ->
     def finish(after: SweepProgress) -> None:
         order.append(f"complete: {after.is_complete}, mirror stopped: {bool(mirror.patience)}")
 
-    result = launch(
+    settings = LaunchSettings(
         _grid(),
-        store,
+        LocalSweep(store),
         InlineExecutor(),
-        stop=threading.Event(),
         start_mirror=lambda _: mirror,
         watch=watch,
         finish=finish,
     )
+    result = launch(settings, stop=threading.Event())
     assert order == ["2 to do", "complete: True, mirror stopped: False"]
     assert result.mirrored
     assert mirror.patience == [120.0]
@@ -211,7 +215,8 @@ def test_the_mirror_is_stopped_patiently_after_the_figures(store: SweepStore) ->
 def test_the_mirror_is_stopped_hastily_otherwise(store: SweepStore, executor: Executor) -> None:
     mirror = Bystander()
     try:
-        launch(_grid(), store, executor, stop=threading.Event(), start_mirror=lambda _: mirror)
+        settings = LaunchSettings(_grid(), LocalSweep(store), executor, start_mirror=lambda _: mirror)
+        launch(settings, stop=threading.Event())
     except ClusterError:
         assert isinstance(executor, Unavailable)
     assert mirror.patience == [10.0]

@@ -21,8 +21,9 @@ from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
+from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
-from recrl.orchestrator.tracking.mlflow_sync import run_status, sync, tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.points import (
     Summary,
     final_points,
@@ -32,7 +33,7 @@ from recrl.orchestrator.tracking.points import (
     rows_after,
     thinned,
 )
-from recrl.orchestrator.tracking.snapshot import SNAPSHOT_TAG
+from recrl.orchestrator.tracking.run_states import run_status
 from recrl.orchestrator.tracking.ui import open_ui, ui_command, ui_url
 from tests.faults.committing import commit_file
 
@@ -270,12 +271,11 @@ def history(store: SweepStore, run: Run) -> dict[str, list[tuple[int, int, float
 
 def everything(store: SweepStore) -> dict[str, Any]:
     """All that MLflow shows of a sweep, but for names that MLflow made up itself."""
-    made_up = {"mlflow.parentRunId", SNAPSHOT_TAG}  # the snapshot has the runs' identities in it
     return {
         name: {
             "points": history(store, run),
             "params": run.data.params,
-            "tags": {key: value for key, value in run.data.tags.items() if key not in made_up},
+            "tags": {key: value for key, value in run.data.tags.items() if key != "mlflow.parentRunId"},
             "status": run.info.status,
             "end": run.info.end_time,
             "artifacts": sorted(file.path for file in connect(store).list_artifacts(run.info.run_id)),

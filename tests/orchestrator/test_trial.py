@@ -17,11 +17,12 @@ import pandas as pd
 import pytest
 
 from recrl.agents.registry import AGENTS, make_agent
-from recrl.environments.cmdp import CostLimits
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.orchestrator.files.store import SweepStore, TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.trial.trial import run_recorded
-from recrl.teachers.registry import TEACHERS
+from recrl.teachers.registry import TEACHERS, make_teacher
+from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
 SMALL = {"hidden_sizes": [16]}
 QUICK = {**SMALL, "critic_steps": 4}  # for what holds however long critics are fitted
@@ -205,6 +206,33 @@ def test_what_entropy_was_worth_is_recorded_and_ends_with_the_heat(tmp_path: Pat
     assert "temperature" not in run(tmp_path).updates()
 
 
+class Opaque:
+    """A user's teacher whose state has keys of our own teachers, and means other things by them."""
+
+    def __init__(self, spec: TeacherSpec) -> None:
+        self._teacher = make_teacher(spec)
+
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
+        return self._hidden(*self._teacher.start())
+
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
+        return self._hidden(*self._teacher.step(state["limits"], report))
+
+    def _hidden(self, step: CurriculumStep, state: TeacherState) -> tuple[CurriculumStep, TeacherState]:
+        return step, {"limits": state, "temperature": "warm", "start_limits": "mine", "policy_noise": 3.0}
+
+
+def test_a_teachers_state_is_opaque_to_the_trial(undisturbed: TrialStore, tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep").trial(SPEC)
+    teacher = Opaque(SPEC.teacher)
+    assert run_recorded(SPEC, store, should_stop=stop_after(5), teacher=teacher) is TrialState.WAITING
+    assert run_recorded(SPEC, store, should_stop=never, teacher=teacher) is TrialState.COMPLETE
+    assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
+    assert list(store.updates()) == list(undisturbed.updates())
+    assert store.record().start_limits == undisturbed.record().start_limits
+    assert [event["event"] for event in store.events()] == ["start limits measured"]
+
+
 def test_a_student_whose_entropy_cannot_be_rewarded_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -216,7 +244,7 @@ def test_a_student_whose_entropy_cannot_be_rewarded_is_named(
     spec = replace(SPEC, method=Choice("cooling"))
     store = SweepStore(tmp_path, "sweep").trial(spec)
     assert run_recorded(spec, store, should_stop=never) is TrialState.FAILED
-    assert "method cooling needs an agent that has reward_entropy, ppo-lag has not" in store.record().error
+    assert "method cooling rewards entropy, which agent ppo-lag does not support" in store.record().error
 
 
 def test_both_frozen_policies_are_evaluated(undisturbed: TrialStore) -> None:

@@ -1,4 +1,4 @@
-"""The README's worked examples, as their readers use them: packages of their own, found by entry point."""
+"""The worked examples, as their readers use them: packages of their own, found by entry point."""
 
 import subprocess
 import sys
@@ -11,15 +11,16 @@ from recrl.orchestrator.errors import GridError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep import launch
+from recrl.orchestrator.sweep import LaunchSettings, launch
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
-README = Path(__file__).parents[2] / "README.md"
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
 GRID = """\
 name: plugged
 tasks: [{name: corridor, deploy_limits: 3, options: {length: 6}}]
-agents: [{name: priced, options: {price: 2.0}}]
+agents: [{name: fixed-multiplier, options: {multiplier: 2.0}}]
 methods: [{name: plateau, options: {hold: 0.25}}]
 seeds: 1
 run: {num_envs: 4, rollout_steps: 20, total_steps: 1600, evaluation_episodes: 4}
@@ -28,12 +29,14 @@ run: {num_envs: 4, rollout_steps: 20, total_steps: 1600, evaluation_episodes: 4}
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the three examples, installed by pip."""
+    """A folder with the examples, installed by pip."""
     target = tmp_path_factory.mktemp("site-packages")
     sources = tmp_path_factory.mktemp("sources")
     options = ["--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
     copies = []
-    for source in sorted(EXAMPLES.iterdir()):  # copies, because a build leaves its litter at the source
+    for source in sorted(
+        it.parent for it in EXAMPLES.glob("*/pyproject.toml")
+    ):  # copies, because a build leaves its litter at the source
         copies.append(sources / source.name)
         copies[-1].mkdir()
         for file in source.glob("*.*"):
@@ -50,7 +53,7 @@ def test_a_trial_of_ones_own_task_student_and_teacher_runs(
     monkeypatch.syspath_prepend(str(installed))
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
-    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    launch(LaunchSettings(grid, LocalSweep(store), InlineExecutor()), stop=threading.Event())
     (trial,) = store.trials()
     assert trial.record().status is TrialState.COMPLETE
     updates = trial.updates()
@@ -64,14 +67,44 @@ def test_options_of_ones_own_are_checked_before_anything_starts(
     installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(installed))
-    wrong = GRID.replace("price: 2.0", "prize: 2.0").replace("hold: 0.25", "hold: 1.5")
+    wrong = GRID.replace("multiplier: 2.0", "multiplyer: 2.0").replace("hold: 0.25", "hold: 1.5")
     with pytest.raises(GridError) as refusal:
         parse_grid(wrong.encode(), source="grid.yaml")
-    assert "unknown key; did you mean 'price'?" in str(refusal.value)
+    assert "unknown key; did you mean 'multiplier'?" in str(refusal.value)
     assert "methods.0.options.hold" in str(refusal.value)
 
 
+def test_a_curriculum_that_reads_episodes_lowers_its_limit(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(installed))
+    text = GRID.replace("{name: plateau, options: {hold: 0.25}}", "{name: halving, options: {episodes: 12}}")
+    text = text.replace("deploy_limits: 3", "deploy_limits: 0.5")
+    grid = parse_grid(text.encode(), source="grid.yaml")
+    store = SweepStore(tmp_path, grid.name)
+    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    (trial,) = store.trials()
+    limits = trial.updates()["limit_0"]
+    assert limits.iloc[0] == float("inf") and limits.iloc[-1] == 0.5
+    assert limits.is_monotonic_decreasing and limits.nunique() > 3
+
+
+def test_an_agent_learns_with_a_network_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES / "residual_network"))
+    own = "{name: ppo-lag, options: {network: 'residual_network:residual_network'}}"
+    text = GRID.replace("{name: fixed-multiplier, options: {multiplier: 2.0}}", own)
+    text = text.replace("{name: plateau, options: {hold: 0.25}}", "none")
+    text = text.replace("name: corridor", "name: two-state, options: {horizon: 20}").replace(
+        ", options: {length: 6}", ""
+    )
+    grid = parse_grid(text.encode(), source="grid.yaml")
+    store = SweepStore(tmp_path, grid.name)
+    launch(grid, store, InlineExecutor(), stop=threading.Event())
+    assert store.trials()[0].record().status is TrialState.COMPLETE
+
+
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*/*.py")), ids=lambda path: path.stem)
-def test_an_example_is_short_and_the_readme_leads_to_it(path: Path) -> None:
-    assert len(path.read_text().splitlines()) < 40
-    assert f"({path.relative_to(README.parent)})" in README.read_text()
+def test_an_example_is_short_and_the_documentation_shows_it(path: Path) -> None:
+    assert len(path.read_text().splitlines()) < 60
+    pages = "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
+    assert str(path.relative_to(ROOT)) in pages

@@ -8,35 +8,40 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.teachers.dynamic import (
     DynamicConfig,
+    decide,
     has_converged,
     is_precise,
-    judge,
     keeps_limit,
     next_limit,
     steps_left,
 )
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherState
-from recrl.teachers.windows import Stretch
+from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
+from recrl.teachers.windows import WindowStatistics
 
 SPLIT_AT_100 = (slice(0, 100), slice(100, None))
 
-# An episode of a simulated student, (return, costs), from the lesson and the update's index.
-Student = Callable[[Lesson, int], tuple[float, tuple[float, ...]]]
+# An episode of a simulated student, (return, costs), from the step and the update's index.
+Student = Callable[[CurriculumStep, int], tuple[float, tuple[float, ...]]]
 
 
-def window(mean_return: float, *costs: float, episodes: int = 4, scatter: float = 0.0) -> Stretch:
-    return Stretch(100, episodes, mean_return, costs, (scatter,) * len(costs))
+def window(mean_return: float, *costs: float, episodes: int = 4, scatter: float = 0.0) -> WindowStatistics:
+    return WindowStatistics(100, episodes, mean_return, costs, (scatter,) * len(costs))
 
 
-def judged(
-    old: Stretch, new: Stretch, *, limits: tuple[float, ...], deploy: tuple[float, ...], **options: Any
+def decided(
+    old: WindowStatistics,
+    new: WindowStatistics,
+    *,
+    limits: tuple[float, ...],
+    deploy: tuple[float, ...],
+    **options: Any,
 ) -> tuple[tuple[float, ...], float]:
     """Limits and noise after a judgement with five steps left."""
-    lesson = judge(
+    step = decide(
         old,
         new,
         limits=CostLimits(limits),
@@ -44,7 +49,7 @@ def judged(
         remaining=5,
         config=DynamicConfig.model_validate(options),
     )
-    return lesson.limits.values, lesson.policy_noise
+    return step.limits.values, step.policy_noise
 
 
 @dataclass(frozen=True)
@@ -62,31 +67,31 @@ def play(
     train: tuple[float, ...],
     deploy: tuple[float, ...],
     updates: int,
-    episodes: Callable[[Lesson], int] = lambda lesson: 16,
+    episodes: Callable[[CurriculumStep], int] = lambda step: 16,
     **options: Any,
 ) -> Run:
     """A closed loop over a budget of ``updates`` updates, of one environment step each."""
     teacher = make_teacher(
         TeacherSpec("dynamic", options, CostLimits(train), CostLimits(deploy), train_steps=updates)
     )
-    lesson, state = teacher.start()
+    step, state = teacher.start()
     run = Run([], [], state)
     for update in range(1, updates + 1):
         finished = []
-        for b in range(episodes(lesson)):
-            episode_return, costs = student(lesson, update)
+        for b in range(episodes(step)):
+            episode_return, costs = student(step, update)
             finished.append(
-                EpisodeStats(b, Phase.TRAINING, update, 1, episode_return, costs, lesson.limits, 0.0)
+                EpisodeStats(b, Phase.TRAINING, update, 1, episode_return, costs, step.limits, 0.0)
             )
-        lesson, state = teacher.step(state, ProgressReport(update, update, tuple(finished)))
-        run.limits.append(lesson.limits.values)
-        run.noise.append(lesson.policy_noise)
+        step, state = teacher.step(state, ProgressReport(update, update, tuple(finished)))
+        run.limits.append(step.limits.values)
+        run.noise.append(step.policy_noise)
     return Run(run.limits, run.noise, state)
 
 
-def obedient(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+def obedient(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
     """An ideal student: its costs are at the limits at once."""
-    return 9.5, lesson.limits.values
+    return 9.5, step.limits.values
 
 
 # Line 5: convergence.
@@ -142,7 +147,7 @@ def test_a_mean_cost_may_exceed_its_limit_by_the_tolerance() -> None:
 def test_the_tolerance_by_its_names(tolerance: str, cost: float, kept: bool) -> None:
     crossing = window(9.5, cost, scatter=0.12)  # standard error sqrt(0.12 / 3 / 4) = 0.1
     noise = 0.0 if kept else 0.3
-    assert judged(crossing, crossing, limits=(5.0,), deploy=(5.0,), adherence_tolerance=tolerance) == (
+    assert decided(crossing, crossing, limits=(5.0,), deploy=(5.0,), adherence_tolerance=tolerance) == (
         (5.0,),
         noise,
     )
@@ -150,13 +155,13 @@ def test_the_tolerance_by_its_names(tolerance: str, cost: float, kept: bool) -> 
 
 def test_the_relative_tolerance_is_a_standard_error_where_episodes_are_few() -> None:
     few = window(9.5, 6.0, scatter=12.0)  # standard error 1
-    assert judged(few, few, limits=(5.0,), deploy=(5.0,)) == ((5.0,), 0.0)
+    assert decided(few, few, limits=(5.0,), deploy=(5.0,)) == ((5.0,), 0.0)
 
 
 def test_the_relative_tolerance_of_a_small_limit_is_that_of_the_floor() -> None:
     careful, careless = window(9.5, 0.1), window(9.5, 0.11)
-    assert judged(careful, careful, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.0)
-    assert judged(careless, careless, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.3)
+    assert decided(careful, careful, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.0)
+    assert decided(careless, careless, limits=(0.0,), deploy=(0.0,)) == ((0.0,), 0.3)
 
 
 # Line 7: the step.
@@ -186,7 +191,9 @@ def test_a_dimension_that_is_never_constrained_stays_so() -> None:
 
 
 def test_steps_left_are_estimated_from_the_last_window() -> None:
-    last = Stretch(env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    last = WindowStatistics(
+        env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,)
+    )
     assert steps_left(last, env_steps=4000, train_steps=5000, unit="windows") == 1  # 3 windows fit
     assert steps_left(last, env_steps=4000, train_steps=5000, unit="episodes") == 19
 
@@ -195,36 +202,36 @@ def test_steps_left_are_estimated_from_the_last_window() -> None:
 
 
 def test_a_converged_student_that_keeps_its_limit_gets_a_lower_one() -> None:
-    assert judged(window(9.0, 60.0), window(9.5, 55.0), limits=(60.0,), deploy=(5.0,)) == ((45.0,), 0.0)
+    assert decided(window(9.0, 60.0), window(9.5, 55.0), limits=(60.0,), deploy=(5.0,)) == ((45.0,), 0.0)
 
 
 @pytest.mark.parametrize("new", [window(5.0, 55.0), window(9.5, 40.0)], ids=["return", "cost"])
-def test_a_student_that_still_changes_is_left_alone(new: Stretch) -> None:
-    assert judged(window(9.0, 60.0), new, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
+def test_a_student_that_still_changes_is_left_alone(new: WindowStatistics) -> None:
+    assert decided(window(9.0, 60.0), new, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
 
 
 def test_a_converged_student_above_its_limit_gets_noise() -> None:
     stuck = window(9.5, 5.0)
-    assert judged(stuck, stuck, limits=(1.0,), deploy=(1.0,), policy_noise=0.2) == ((1.0,), 0.2)
+    assert decided(stuck, stuck, limits=(1.0,), deploy=(1.0,), policy_noise=0.2) == ((1.0,), 0.2)
 
 
 def test_a_window_without_episodes_is_no_evidence() -> None:
     nothing = window(0.0, 0.0, episodes=0)
-    assert judged(nothing, nothing, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
+    assert decided(nothing, nothing, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
 
 
 def test_a_dimension_never_blocks_another() -> None:
     kept, stuck, moving = window(9.5, 55.0, 9.0), window(9.5, 55.0, 9.0), window(9.5, 55.0, 20.0)
-    assert judged(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0)) == ((45.0, 5.0), 0.3)
-    assert judged(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0)) == ((45.0, 30.0), 0.0)
+    assert decided(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0)) == ((45.0, 5.0), 0.3)
+    assert decided(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0)) == ((45.0, 30.0), 0.0)
 
 
 def test_jointly_all_dimensions_wait_for_the_last() -> None:
     kept, stuck, moving = window(9.5, 55.0, 9.0), window(9.5, 55.0, 9.0), window(9.5, 55.0, 20.0)
     joint = {"dimensions": "joint"}
-    assert judged(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0), **joint) == ((60.0, 5.0), 0.3)
-    assert judged(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((60.0, 30.0), 0.0)
-    assert judged(kept, kept, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((45.0, 8.2), 0.0)
+    assert decided(kept, stuck, limits=(60.0, 5.0), deploy=(5.0, 5.0), **joint) == ((60.0, 5.0), 0.3)
+    assert decided(kept, moving, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((60.0, 30.0), 0.0)
+    assert decided(kept, kept, limits=(60.0, 30.0), deploy=(5.0, 5.0), **joint) == ((45.0, 8.2), 0.0)
 
 
 # The clock.
@@ -250,7 +257,7 @@ def test_an_ideal_student_is_led_to_d_d_two_windows_before_the_end(
     options: dict[str, Any], episodes: int, updates_in_a_window: int, deploy: float
 ) -> None:
     run = play(
-        obedient, train=(250.0,), deploy=(deploy,), updates=285, episodes=lambda lesson: episodes, **options
+        obedient, train=(250.0,), deploy=(deploy,), updates=285, episodes=lambda step: episodes, **options
     )
     steps = [before[0] - after[0] for before, after in zip(run.limits, run.limits[1:], strict=False)]
     assert run.limits[-1 - 2 * updates_in_a_window] == (deploy,)
@@ -267,15 +274,15 @@ def test_a_student_that_stays_and_then_crosses_is_judged_in_both_regimes(
     """RiverGrid: 16 long episodes a batch as long as the agent stays, 500 short ones once it crosses."""
     batch = iter([16] * 100 + [500] * 185)
 
-    def crosses_after_100(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
-        return (-20.0, (80.0,)) if update <= 100 else (9.5, (min(40.0, lesson.limits[0]),))
+    def crosses_after_100(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
+        return (-20.0, (80.0,)) if update <= 100 else (9.5, (min(40.0, step.limits[0]),))
 
     run = play(
         crosses_after_100,
         train=(100.0,),
         deploy=(5.0,),
         updates=285,
-        episodes=lambda lesson: next(batch),
+        episodes=lambda step: next(batch),
         **options,
     )
     kicks_before, kicks_after = (sum(noise > 0.0 for noise in run.noise[part]) for part in SPLIT_AT_100)
@@ -296,7 +303,7 @@ def test_literal_steps_leave_an_ideal_student_far_above_d_d() -> None:
         train=(250.0,),
         deploy=(25.0,),
         updates=1000,
-        episodes=lambda lesson: 1,
+        episodes=lambda step: 1,
         preset="paper",
         window=10,
     )
@@ -344,11 +351,11 @@ def test_the_preset_paper_is_algorithm_2_episode_by_episode(seed: int) -> None:
     costs = [round(float(cost * generator.uniform(0.95, 1.05)), 3) for cost in np.repeat(levels, 25)]
     expected = algorithm_2(costs, train=60.0, deploy=20.0, window=5, tolerance=0.1)
     run = play(
-        lambda lesson, update: (1.0, (costs[update - 1],)),
+        lambda step, update: (1.0, (costs[update - 1],)),
         train=(60.0,),
         deploy=(20.0,),
         updates=len(costs),
-        episodes=lambda lesson: 1,
+        episodes=lambda step: 1,
         preset="paper",
         window=5,
     )
@@ -366,7 +373,7 @@ def test_the_preset_paper_is_algorithm_2_episode_by_episode(seed: int) -> None:
 def test_literally_the_clock_begins_anew_also_where_nothing_changes() -> None:
     """At d_d line 7 changes nothing; line 11 resets the clock all the same, so a jump is answered later."""
 
-    def jumps(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+    def jumps(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
         return 9.5, (5.0 if update <= 12 else 7.0,)
 
     def kicked_first(clock_reset: str) -> int:
@@ -375,7 +382,7 @@ def test_literally_the_clock_begins_anew_also_where_nothing_changes() -> None:
             train=(5.0,),
             deploy=(5.0,),
             updates=60,
-            episodes=lambda lesson: 1,
+            episodes=lambda step: 1,
             window=4,
             cost_tolerance=0.5,
             adherence_tolerance="none",
@@ -394,7 +401,7 @@ def test_a_stuck_student_is_kicked_again_and_again_but_not_after_the_end(
     after_noise: int, kicks: list[int]
 ) -> None:
     run = play(
-        lambda lesson, update: (9.5, (5.0,)),
+        lambda step, update: (9.5, (5.0,)),
         train=(1.0,),
         deploy=(1.0,),
         updates=40,
@@ -409,12 +416,12 @@ def kicked_at(**options: Any) -> list[int]:
     """When a student is kicked that costs 5.9 at first, and 9, 8, 7, 6, 5, 5, 5 ... after each noise."""
     last_noise: list[int] = []
 
-    def settles(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
-        if lesson.policy_noise > 0.0 and update not in last_noise:
+    def settles(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
+        if step.policy_noise > 0.0 and update not in last_noise:
             last_noise.append(update)
         return 9.5, (max(5.0, 9.0 - (update - last_noise[-1])) if last_noise else 5.9,)
 
-    run = play(settles, train=(5.0,), deploy=(5.0,), updates=100, episodes=lambda lesson: 1, **options)
+    run = play(settles, train=(5.0,), deploy=(5.0,), updates=100, episodes=lambda step: 1, **options)
     return [update for update, noise in enumerate(run.noise, start=1) if noise > 0.0]
 
 
@@ -433,9 +440,9 @@ def test_a_student_that_noise_frees_reaches_d_d() -> None:
     kicks = 0
     seen = 0
 
-    def crosses_until_kicked(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+    def crosses_until_kicked(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
         nonlocal kicks, seen
-        if lesson.policy_noise > 0.0 and seen != update:
+        if step.policy_noise > 0.0 and seen != update:
             kicks, seen = kicks + 1, update
         return (9.5, (5.0,)) if kicks < 2 else (9.0, (0.0,))
 
@@ -445,17 +452,17 @@ def test_a_student_that_noise_frees_reaches_d_d() -> None:
 
 
 def test_a_perfectly_safe_student_is_not_waited_for_for_ever() -> None:
-    run = play(lambda lesson, update: (0.0, (0.0,)), train=(100.0,), deploy=(25.0,), updates=50)
+    run = play(lambda step, update: (0.0, (0.0,)), train=(100.0,), deploy=(25.0,), updates=50)
     assert run.limits[9] == (25.0,)
 
 
 def test_a_student_that_never_converges_meets_d_d_at_the_end() -> None:
-    run = play(lambda lesson, update: (2.0**update, (1.0,)), train=(100.0,), deploy=(25.0,), updates=50)
+    run = play(lambda step, update: (2.0**update, (1.0,)), train=(100.0,), deploy=(25.0,), updates=50)
     assert run.limits[-2:] == [(100.0,), (25.0,)]
 
 
 def test_an_infinite_start_is_kept_until_the_first_judgement_or_measured() -> None:
-    def costs_65(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
+    def costs_65(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
         return 9.5, (65.0,)
 
     kept = play(costs_65, train=(math.inf,), deploy=(5.0,), updates=40, start_fraction=0.0)
@@ -468,8 +475,8 @@ def test_an_infinite_start_is_kept_until_the_first_judgement_or_measured() -> No
 
 
 def test_a_difficult_dimension_delays_an_easy_one_by_at_most_a_window() -> None:
-    def second_is_hopeless(lesson: Lesson, update: int) -> tuple[float, tuple[float, ...]]:
-        return 9.5, (lesson.limits[0], 40.0 + 20.0 * (update % 7))
+    def second_is_hopeless(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
+        return 9.5, (step.limits[0], 40.0 + 20.0 * (update % 7))
 
     alone = play(obedient, train=(100.0,), deploy=(5.0,), updates=200)
     for deploy, train in ((1.0, 1.0), (1.0, 90.0), (1.0, math.inf)):
@@ -480,7 +487,7 @@ def test_a_difficult_dimension_delays_an_easy_one_by_at_most_a_window() -> None:
 
 
 def test_the_state_stays_small() -> None:
-    run = play(obedient, train=(250.0,), deploy=(5.0,), updates=100, episodes=lambda lesson: 100)
+    run = play(obedient, train=(250.0,), deploy=(5.0,), updates=100, episodes=lambda step: 100)
     assert run.state["history"] == []
     for options in ({}, {"window": 80, "window_unit": "episodes"}):
         teacher = make_teacher(
@@ -499,7 +506,7 @@ def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
     """Eight episodes of a policy whose cost scatters as much as its mean look converged by chance."""
     generator = np.random.default_rng(0)
 
-    def noisy(number: int) -> Stretch:
+    def noisy(number: int) -> WindowStatistics:
         costs = generator.exponential(50.0, number)
         episodes = [
             EpisodeStats(
@@ -507,31 +514,31 @@ def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
             )
             for b, cost in enumerate(costs)
         ]
-        return Stretch.of_update(episodes, env_steps=8000, num_costs=1)
+        return WindowStatistics.of_update(episodes, env_steps=8000, num_costs=1)
 
     config = DynamicConfig()
     assert not any(is_precise(noisy(8), config) for _ in range(100))
     assert all(is_precise(noisy(100), config) for _ in range(20))
     assert is_precise(window(9.5, 5.0, episodes=1), config)  # deterministic: one episode says it all
-    assert not is_precise(Stretch(100, 0, 0.0, (0.0,), (0.0,)), config)
+    assert not is_precise(WindowStatistics(100, 0, 0.0, (0.0,), (0.0,)), config)
 
 
 def test_a_noisy_agent_is_held_where_it_is_until_a_hundred_episodes_say_that_it_has_converged() -> None:
     generator = np.random.default_rng(1)
     spec = TeacherSpec("dynamic", {"window": 2}, CostLimits((200.0,)), CostLimits((25.0,)), 1_000_000)
     teacher = make_teacher(spec)
-    lesson, state = teacher.start()
+    step, state = teacher.start()
     changes, episodes_at_change, total = 0, [], 0
     for update in range(1, 240):
-        limits = lesson.limits
+        limits = step.limits
         costs = generator.exponential(80.0, 4)
         episodes = tuple(
             EpisodeStats(b, Phase.TRAINING, 0, 1000, float(cost) / 10.0, (float(cost),), limits, 0.0)
             for b, cost in enumerate(costs)
         )
         total += len(episodes)
-        lesson, state = teacher.step(state, ProgressReport(update, 4096 * update, episodes))
-        if lesson.limits != limits and 4096 * update < 1_000_000:
+        step, state = teacher.step(state, ProgressReport(update, 4096 * update, episodes))
+        if step.limits != limits and 4096 * update < 1_000_000:
             changes += 1
             episodes_at_change.append(total)
     assert 2 <= changes <= 6

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.teachers.registry import TEACHERS, make_teacher
-from recrl.teachers.teacher import Lesson, ProgressReport, TeacherSpec, TeacherState
+from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
 # Every teacher under its defaults, and the dynamic one also where its settings lead elsewhere.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
@@ -23,7 +23,6 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
     ("dynamic", {"window": 1, "return_tolerance": 1.0, "cost_tolerance": 1.0}),
     ("dynamic", {"window": 2, "window_unit": "episodes", "start_fraction": 0.0}),
     ("dynamic", {"preset": "paper", "window": 2, "return_tolerance": 0.5}),
-    ("annealed", {"measured_at": 0.3, "arrival": 1.0, "noise_hold": 0.5, "noise_end": 0.5}),
 ]
 CONTRACT = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 TRAIN_STEPS = 100
@@ -91,7 +90,9 @@ def histories(draw: st.DrawFn) -> History:
     return History(CostLimits(tuple(train)), CostLimits(tuple(deploy)), tuple(reports))
 
 
-def played(spec: TeacherSpec, reports: tuple[ProgressReport, ...]) -> list[tuple[Lesson, TeacherState]]:
+def played(
+    spec: TeacherSpec, reports: tuple[ProgressReport, ...]
+) -> list[tuple[CurriculumStep, TeacherState]]:
     """All answers of a teacher, the first before any report."""
     teacher = make_teacher(spec)
     answers = [teacher.start()]
@@ -121,11 +122,11 @@ def test_limits_stay_between_d_d_and_d_t(history: History) -> None:
     for spec in history.specs():
         unlimited = CostLimits.unlimited(len(spec.train_limits))
         highest = unlimited if spec.name == "unconstrained" else spec.train_limits
-        for lesson, state in played(spec, history.reports):
-            start = CostLimits.from_json(state["start_limits"] or unlimited.to_json())
-            ordered = zip(spec.deploy_limits, lesson.limits, start, strict=True)
+        for step, _ in played(spec, history.reports):
+            start = step.start_limits or unlimited
+            ordered = zip(spec.deploy_limits, step.limits, start, strict=True)
             assert all(deploy <= limit <= first for deploy, limit, first in ordered)
-            measured = zip(lesson.limits, highest, strict=True)
+            measured = zip(step.limits, highest, strict=True)
             assert all(limit <= train for limit, train in measured)
 
 
@@ -136,9 +137,10 @@ def test_limits_are_d_d_without_noise_from_the_end_of_the_budget_on(history: His
     end = ProgressReport(last.update + 1, max(TRAIN_STEPS, last.env_steps + 1), last.episodes)
     reports = (*history.reports, end)
     for spec in history.specs():
-        for report, (lesson, _) in zip(reports, played(spec, reports)[1:], strict=True):
+        for report, (step, _) in zip(reports, played(spec, reports)[1:], strict=True):
             if report.env_steps >= TRAIN_STEPS:
-                assert lesson == Lesson(history.deploy_limits, 0.0)
+                assert (step.limits, step.policy_noise) == (history.deploy_limits, 0.0)
+                assert not step.rewards_entropy
 
 
 @CONTRACT
@@ -162,9 +164,9 @@ def test_the_same_update_again_gets_the_same_answer(history: History) -> None:
         teacher = make_teacher(spec)
         _, state = teacher.start()
         for report in history.reports:
-            lesson, state = teacher.step(state, report)
-            assert teacher.step(state, report) == (lesson, state)
-            assert teacher.step(state, replace(report, episodes=())) == (lesson, state)
+            step, state = teacher.step(state, report)
+            assert teacher.step(state, report) == (step, state)
+            assert teacher.step(state, replace(report, episodes=())) == (step, state)
 
 
 @CONTRACT
@@ -178,8 +180,8 @@ def test_a_resumed_teacher_goes_on_as_if_uninterrupted(history: History, data: s
         for report, uninterrupted in zip(history.reports[cut:], answers[cut + 1 :], strict=True):
             restored = json.loads(json.dumps(state, allow_nan=False))
             assert restored == state
-            lesson, state = teacher.step(restored, report)
-            assert (lesson, state) == uninterrupted
+            step, state = teacher.step(restored, report)
+            assert (step, state) == uninterrupted
 
 
 @CONTRACT
@@ -218,8 +220,8 @@ def test_a_static_limit_depends_on_its_own_dimension_only(history: History) -> N
     for i in range(len(history.train_limits)):
         alone = history.of_dimension(i)
         for spec, own in zip(history.specs(static_only=True), alone.specs(static_only=True), strict=True):
-            together = [lesson.limits[i] for lesson, _ in played(spec, history.reports)]
-            assert together == [lesson.limits[0] for lesson, _ in played(own, alone.reports)]
+            together = [step.limits[i] for step, _ in played(spec, history.reports)]
+            assert together == [step.limits[0] for step, _ in played(own, alone.reports)]
 
 
 @CONTRACT
@@ -235,12 +237,12 @@ def test_no_dimension_keeps_an_obedient_one_from_d_d(
     limits = CostLimits((50.0, other_train)), CostLimits((deploy, 0.0))
     for options in (options for name, options in VARIANTS if name == "dynamic" and "preset" not in options):
         teacher = make_teacher(TeacherSpec("dynamic", options, *limits, TRAIN_STEPS))
-        lesson, state = teacher.start()
+        step, state = teacher.start()
         for update, other in zip(range(1, TRAIN_STEPS), cycle(other_costs), strict=False):
-            costs = (lesson.limits[0], other)
-            episode = EpisodeStats(update, Phase.TRAINING, update, 1, 9.5, costs, lesson.limits, 0.0)
-            lesson, state = teacher.step(state, ProgressReport(update, update, (episode,)))
-        assert lesson.limits[0] == deploy
+            costs = (step.limits[0], other)
+            episode = EpisodeStats(update, Phase.TRAINING, update, 1, 9.5, costs, step.limits, 0.0)
+            step, state = teacher.step(state, ProgressReport(update, update, (episode,)))
+        assert step.limits[0] == deploy
 
 
 @pytest.mark.parametrize("name", TEACHERS)
@@ -260,6 +262,6 @@ def test_a_cost_that_is_never_constrained_stays_so(name: str, options: dict[str,
     limits = CostLimits((math.inf, 5.0)), CostLimits((math.inf, 5.0))
     episode = EpisodeStats(0, Phase.TRAINING, 1, 1, 0.0, (3.0, 3.0), limits[1], 0.0)
     reports = tuple(ProgressReport(update, update, (episode,)) for update in range(1, 120))
-    for lesson, state in played(TeacherSpec(name, options, *limits, TRAIN_STEPS), reports):
-        assert lesson.limits[0] == math.inf
-        assert state["start_limits"] is not None
+    for step, _ in played(TeacherSpec(name, options, *limits, TRAIN_STEPS), reports):
+        assert step.limits[0] == math.inf
+        assert step.start_limits is not None

@@ -1,5 +1,7 @@
 """Teachers by name, their settings, and what importing them brings in."""
 
+import json
+import math
 import subprocess
 import sys
 from types import ModuleType
@@ -8,12 +10,12 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from recrl.environments.cmdp import CostLimits
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.plugins import UnknownNameError
 from recrl.teachers.dynamic import PAPER, DynamicConfig
 from recrl.teachers.registry import TEACHERS, TeacherKind, make_teacher, teacher_config
 from recrl.teachers.static import NoConfig, step_teacher
-from recrl.teachers.teacher import Lesson, TeacherSpec
+from recrl.teachers.teacher import TeacherSpec
 
 # What a user's module offers under an import path.
 MINE = TeacherKind("d_t, then d_d.", NoConfig, step_teacher)
@@ -25,7 +27,6 @@ def spec(name: str, **options: Any) -> TeacherSpec:
 
 def test_the_names() -> None:
     assert sorted(TEACHERS) == [
-        "annealed",
         "cooling",
         "cosine",
         "dynamic",
@@ -39,8 +40,8 @@ def test_the_names() -> None:
 
 @pytest.mark.parametrize("name", TEACHERS)
 def test_every_teacher_is_made_from_its_spec(name: str) -> None:
-    lesson, state = make_teacher(spec(name)).start()
-    assert len(lesson.limits) == 1
+    step, state = make_teacher(spec(name)).start()
+    assert len(step.limits) == 1
     assert state["update"] == 0
 
 
@@ -66,8 +67,8 @@ def test_an_import_path_leads_to_a_teacher(monkeypatch: pytest.MonkeyPatch) -> N
     module.mine = MINE  # type: ignore[attr-defined]
     module.broken = step_teacher  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "somebodys_package", module)
-    lesson, _ = make_teacher(spec("somebodys_package:mine")).start()
-    assert lesson.limits == CostLimits((50.0,))
+    step, _ = make_teacher(spec("somebodys_package:mine")).start()
+    assert step.limits == CostLimits((50.0,))
     with pytest.raises(
         TypeError, match=r"'somebodys_package:broken' must be a recrl.*TeacherKind, got <func"
     ):
@@ -136,5 +137,21 @@ def test_a_spec_that_makes_no_sense_is_refused(
 @pytest.mark.parametrize("noise", [-0.1, 1.1])
 def test_noise_beyond_its_range_is_refused(noise: float) -> None:
     with pytest.raises(ValueError) as error:
-        Lesson(CostLimits((5.0,)), noise)
+        CurriculumStep(CostLimits((5.0,)), noise)
     assert str(error.value) == f"policy noise must lie in [0, 1], got {noise}"
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        CurriculumStep(CostLimits((5.0, math.inf)), 0.25),
+        CurriculumStep(CostLimits((5.0,)), 0.0, 1.5, CostLimits((math.inf,))),
+    ],
+)
+def test_a_step_survives_json_and_ends_with_deployment(step: CurriculumStep) -> None:
+    assert CurriculumStep.from_json(json.loads(json.dumps(step.to_json(), allow_nan=False))) == step
+    deployed = step.in_deployment(CostLimits((1.0,)))
+    assert (deployed.limits, deployed.policy_noise) == (CostLimits((1.0,)), 0.0)
+    assert deployed.start_limits == step.start_limits
+    assert (deployed.entropy_coefficient is None) == (step.entropy_coefficient is None)
+    assert not deployed.rewards_entropy

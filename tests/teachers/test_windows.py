@@ -5,21 +5,23 @@ import math
 import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.teachers.windows import Stretch, extend, last_two_windows
+from recrl.teachers.windows import WindowStatistics, extend, last_two_windows
 
 
-def of_costs(*costs: float, env_steps: int = 100) -> Stretch:
+def of_costs(*costs: float, env_steps: int = 100) -> WindowStatistics:
     """An update in which episodes of these costs finished, each with the return 2 x cost."""
     episodes = [
         EpisodeStats(b, Phase.TRAINING, 0, 1, 2 * cost, (cost,), CostLimits((9.0,)), 0.0)
         for b, cost in enumerate(costs)
     ]
-    return Stretch.of_update(episodes, env_steps=env_steps, num_costs=1)
+    return WindowStatistics.of_update(episodes, env_steps=env_steps, num_costs=1)
 
 
 def test_an_update_is_summed_up_by_its_means_and_its_scatter() -> None:
     update = of_costs(1.0, 2.0, 6.0)
-    assert update == Stretch(100, 3, 6.0, mean_costs=(3.0,), cost_scatter=(14.0,), return_scatter=56.0)
+    assert update == WindowStatistics(
+        100, 3, 6.0, mean_costs=(3.0,), cost_scatter=(14.0,), return_scatter=56.0
+    )
     assert update.return_spread == pytest.approx(math.sqrt(56 / 2))
     assert update.standard_errors[0] == pytest.approx(math.sqrt(14 / 2 / 3))
 
@@ -29,12 +31,14 @@ def test_one_episode_has_no_standard_error() -> None:
 
 
 def test_an_update_without_episodes_says_nothing() -> None:
-    assert of_costs() == Stretch(100, 0, 0.0, (0.0,), (0.0,))
+    assert of_costs() == WindowStatistics(100, 0, 0.0, (0.0,), (0.0,))
 
 
 def test_pooled_updates_are_one_update() -> None:
-    pooled = Stretch.pooled([of_costs(1.0, 2.0), of_costs(), of_costs(6.0)])
-    assert pooled == Stretch(300, 3, 6.0, mean_costs=(3.0,), cost_scatter=(14.0,), return_scatter=56.0)
+    pooled = WindowStatistics.pooled([of_costs(1.0, 2.0), of_costs(), of_costs(6.0)])
+    assert pooled == WindowStatistics(
+        300, 3, 6.0, mean_costs=(3.0,), cost_scatter=(14.0,), return_scatter=56.0
+    )
 
 
 def test_windows_of_updates_count_updates() -> None:
@@ -63,13 +67,13 @@ def test_windows_of_episodes_are_rounded_up_to_whole_updates() -> None:
 
 
 def test_an_update_without_episodes_lends_its_steps_to_the_next() -> None:
-    history: tuple[Stretch, ...] = ()
+    history: tuple[WindowStatistics, ...] = ()
     for update in (of_costs(), of_costs(), of_costs(5.0), of_costs()):
         history = extend(history, update, unit="episodes")
-    assert [(stretch.env_steps, stretch.episodes) for stretch in history] == [(300, 1), (100, 0)]
+    assert [(statistics.env_steps, statistics.episodes) for statistics in history] == [(300, 1), (100, 0)]
     assert len(extend(history, of_costs(), unit="updates")) == 3
 
 
 def test_a_stretch_survives_json() -> None:
-    stretch = of_costs(1.0, 2.0)
-    assert Stretch.from_json(stretch.to_json()) == stretch
+    statistics = of_costs(1.0, 2.0)
+    assert WindowStatistics.from_json(statistics.to_json()) == statistics

@@ -1,0 +1,76 @@
+"""Make the networks of a policy or of critics as the agent's options say: the fast perceptron, or modules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from recrl.agents.learning.module_stack import ModuleStack, checked_module, perceptron
+from recrl.agents.learning.networks import FlatParameters, NetworkForm, Scratch, TanhStack
+
+
+class Stack(Protocol):
+    """C networks of one kind whose parameters are views into one block; see ``TanhStack``."""
+
+    def scale(self, factors: Tensor) -> None:
+        """Multiply each network's outputs by a factor, [C] or a scalar."""
+        ...
+
+    def outputs(self, rows: Tensor) -> Tensor:
+        """The outputs of every network, [C, U, out]; rows are [U, n]."""
+        ...
+
+    def activations(self, rows: Tensor, scratch: Scratch | None = None) -> list[Tensor]:
+        """What differentiating needs, for one block of rows; the outputs, [C, U, out], come last."""
+        ...
+
+    def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
+        """The derivative of the outputs along a change of the parameters, [C, U, out]."""
+        ...
+
+    def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
+        """The derivative of a loss by the parameters into the gradient block."""
+        ...
+
+
+def make_stack(
+    form: NetworkForm,
+    num_networks: int,
+    num_inputs: int,
+    num_outputs: int,
+    *,
+    last_scale: float,
+    generator: torch.Generator,
+    others: Sequence[tuple[int, ...]] = (),
+) -> tuple[FlatParameters, Stack]:
+    """Make C networks with their parameters.
+
+    Args:
+        form: which networks.
+        num_networks: C.
+        num_inputs: n.
+        num_outputs: of each.
+        last_scale: factor on the initial outputs.
+        generator: the initialisation's randomness.
+        others: shapes of further parameters at the end of the block.
+
+    Raises:
+        NetworkError: a network of the user's own does not fit.
+    """
+    if form.factory is None and form.activation == "tanh":
+        sizes = (num_inputs, *form.hidden_sizes, num_outputs)
+        parameters = FlatParameters([*TanhStack.shapes(num_networks, sizes), *others])
+        stack = TanhStack(parameters, len(sizes) - 1)
+        stack.initialise(form.initialiser, last_scale, generator)
+        return parameters, stack
+    factory = form.factory or perceptron(form.hidden_sizes, form.activation, form.initialiser)(generator)
+    with torch.random.fork_rng(devices=[]):  # a user's module draws from PyTorch's own generator
+        torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
+        modules = [checked_module(factory, num_inputs, num_outputs) for _ in range(num_networks)]
+    parameters = FlatParameters([*ModuleStack.shapes(modules), *others])
+    of_modules = ModuleStack(modules, parameters)
+    of_modules.initialise(last_scale)
+    return parameters, of_modules

@@ -1,0 +1,31 @@
+"""J*(d_d) of a sweep's trials, where it is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError
+from recrl.environments.registry import optimal_return
+from recrl.orchestrator.errors import USERS_ERRORS, described
+from recrl.orchestrator.spec import TrialSpec
+
+UNKNOWN_OPTIMUM = "the optimum is unknown here, because"
+
+
+def optima_of(specs: Sequence[TrialSpec]) -> tuple[list[float], list[str]]:
+    """J*(d_d) of every trial, NaN where unknown, and a note for each task that is not installed here."""
+    optima: list[float] = []
+    notes: dict[str, str] = {}
+    for spec in specs:
+        task = spec.task
+        try:
+            optimum = optimal_return(task.name, task.options, spec.deploy_limits)
+        except (UnknownNameError, UntrustedNameError) as error:
+            optimum = None
+            notes[task.label] = f"{task.label}: {UNKNOWN_OPTIMUM} {error}"
+        except USERS_ERRORS as error:
+            optimum = None
+            notes[task.label] = f"{task.label}: {UNKNOWN_OPTIMUM} {described(error)}"
+        optima.append(math.nan if optimum is None else optimum)
+    return optima, list(notes.values())

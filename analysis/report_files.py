@@ -1,0 +1,101 @@
+"""The tables of a sweep: written as files, and as text for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from recrl.analysis import report_tables
+from recrl.analysis.data.labels import GROUP
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.statistics import claims, metrics
+from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.metrics import Measure
+from recrl.analysis.statistics.verdicts import verdicts
+
+BOOTSTRAP_SEED = 0
+SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What the report shows beside the figures.
+
+    Attributes:
+        verdicts: of ``verdicts.verdicts``; empty before a trial is complete.
+        shown: the tables for people, as text, with their headings.
+    """
+
+    verdicts: pd.DataFrame = field(default_factory=pd.DataFrame)
+    shown: Sequence[tuple[str, pd.DataFrame]] = ()
+
+
+def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
+    """Write the tables of a sweep, as far as it has come.
+
+    Args:
+        sweep: its frames.
+        folder: where the files go.
+
+    Returns:
+        The files, and what the report shows of them.
+    """
+    rows = metrics.outcomes(sweep)
+    bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
+    written = [
+        report_tables.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
+        report_tables.write_csv(pd.concat(bounds), folder / "bounds.csv"),
+    ]
+    if not len(rows):
+        return written, Tables()
+    generator = np.random.default_rng(BOOTSTRAP_SEED)
+    averaged = metrics.summary(rows)
+    robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
+    compared = metrics.comparisons(rows, generator)
+    weighed = claims.weigh(rows)
+    whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
+    judged = verdicts(rows, compared)
+    outcomes = _outcome_tables(averaged)
+    latex = [f"% {heading}.\n{report_tables.latex(table)}\n" for heading, table in outcomes]
+    shown = [*outcomes, *_comparison_tables(compared)]
+    if len(weighed):
+        written.append(report_tables.write_csv(weighed, folder / "claims.csv"))
+        shown.append(("What the paper says of these maps", claims.claims_table(weighed)))
+    for i, costs in enumerate(bounds):
+        which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
+        if len(costs):
+            shown.append((f"Cumulative cost of training against its bounds{which}", bound_table(costs)))
+    written += [
+        report_tables.write_csv(judged, folder / "verdicts.csv"),
+        report_tables.write_csv(rows, folder / "outcomes.csv"),
+        report_tables.write_parquet(rows, folder / "outcomes.parquet"),
+        report_tables.write_csv(whole, folder / "summary.csv"),
+        report_tables.write_csv(compared, folder / "comparisons.csv"),
+        report_tables.write_text("\n".join(latex), folder / "outcomes.tex"),
+    ]
+    return written, Tables(judged, shown)
+
+
+def _outcome_tables(averaged: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """The outcomes, those of the final policy first."""
+    tables = [(measure, report_tables.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
+    return [(_heading(measure), table) for measure, table in tables if len(table)]
+
+
+def _comparison_tables(compared: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Differences to the agent without a curriculum, those of the final policy first."""
+    if not len(compared):
+        return []
+    return [
+        (f"{_heading(measure)}, minus none", report_tables.comparison_table(compared, measure))
+        for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
+    ]
+
+
+def _heading(measure: Measure) -> str:
+    text = measure.description.removeprefix("the ")
+    return text[0].upper() + text[1:]

@@ -1,0 +1,71 @@
+"""Verdicts on the final policies (solved, feasible, infeasible), for each task, agent and curriculum.
+
+Every verdict is on the stochastic final policy, evaluated without learning. What the words mean is defined in
+``recrl.analysis.statistics.metrics``. The deployment phase stands beside it for comparison only.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pandas as pd
+
+from recrl.analysis.data.labels import GROUP
+from recrl.analysis.statistics.metrics import Measure, is_cost
+
+FINAL = Measure.STOCHASTIC
+
+
+def verdicts(rows: pd.DataFrame, compared: pd.DataFrame) -> pd.DataFrame:
+    """Count the verdicts: a row a GROUP.
+
+    Args:
+        rows: of ``metrics.outcomes``.
+        compared: of ``metrics.comparisons``, with the baseline ``none``.
+
+    Returns:
+        GROUP, seeds, solved, feasible (the solved ones included), infeasible, worst_excess (the largest cost
+        above its limit among the infeasible seeds, or NaN), worst_share (the same divided by that limit),
+        episode_return, episode_return_se and cost_i (means over seeds), deploy_limit_i, optimal_return,
+        exact (whether every seed is), episodes (of a seed), deployment_return, deployment_cost_i,
+        return_difference with _low and _high (NaN without a baseline).
+    """
+    final = rows[rows["measure"] == FINAL.value]
+    deployed = rows[rows["measure"] == Measure.DEPLOYMENT.value]
+    costs = [str(name) for name in rows if is_cost(str(name))]
+    lines = []
+    for group, seeds in final.groupby(list(GROUP), observed=True, sort=False):
+        line = dict(zip(GROUP, group, strict=True)) | _counts(seeds) | _worst(seeds, costs)
+        line |= {name: seeds[name].mean() for name in ("episode_return", *costs)}
+        line["episode_return_se"] = seeds["episode_return"].sem()
+        constant = ["optimal_return", *(f"deploy_{name.replace('cost', 'limit')}" for name in costs)]
+        line |= {name: seeds[name].iloc[0] for name in constant}
+        line |= {"exact": bool(seeds["exact"].all()), "episodes": int(seeds["episodes"].min())}
+        lines.append(line)
+    table = pd.DataFrame(lines, columns=None if lines else [*GROUP])
+    renamed = {"episode_return": "deployment_return"} | {name: f"deployment_{name}" for name in costs}
+    beside = deployed.groupby(list(GROUP), observed=True)[["episode_return", *costs]].mean()
+    table = table.merge(beside.rename(columns=renamed).reset_index(), on=list(GROUP), how="left")
+    return table.merge(_differences(compared), on=list(GROUP), how="left")
+
+
+def _counts(seeds: pd.DataFrame) -> dict[str, int]:
+    counts = {"solved": seeds["optimal"].sum(), "feasible": seeds["feasible"].sum()}
+    infeasible = len(seeds) - counts["feasible"]
+    return {"seeds": len(seeds)} | {k: int(v) for k, v in (counts | {"infeasible": infeasible}).items()}
+
+
+def _worst(seeds: pd.DataFrame, costs: list[str]) -> dict[str, float]:
+    """The largest excess among the infeasible seeds, and its share of the limit."""
+    broken = seeds[~seeds["feasible"]]
+    limits = {name: seeds[f"deploy_{name.replace('cost', 'limit')}"].iloc[0] for name in costs}
+    excess = [(float((broken[name] - limits[name]).max()), float(limits[name])) for name in costs]
+    worst, limit = max((it for it in excess if it[0] > 0.0), default=(math.nan, math.nan))
+    return {"worst_excess": worst, "worst_share": worst / limit if limit > 0.0 else math.nan}
+
+
+def _differences(compared: pd.DataFrame) -> pd.DataFrame:
+    ends = ["return_difference", "return_difference_low", "return_difference_high"]
+    if not len(compared):
+        return pd.DataFrame(columns=[*GROUP, *ends])
+    return compared.loc[compared["measure"] == FINAL.value, [*GROUP, *ends]]

@@ -1,0 +1,299 @@
+"""Pages of the reference that are made from the code itself, whenever the documentation is built.
+
+    reference/generated/command-line.md   every command and option of recrl-sweep, from its parser
+    reference/generated/grid-file.md      every key of a grid file
+    reference/generated/agents.md         every option of every agent
+    reference/generated/curricula.md      every option of every curriculum
+    reference/generated/tasks.md          every option of every task
+    reference/generated/presets.md        the options whose value differs between the presets
+
+Options are pydantic models: name, type, default and description are theirs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from sphinx.application import Sphinx
+
+from recrl.agents import presets
+from recrl.agents.registry import AGENTS
+from recrl.environments.plugins import load_attribute
+from recrl.environments.registry import TASKS
+from recrl.orchestrator.cli.main import parser
+from recrl.orchestrator.grid.file_models import Entry, Exclusion, GridFile, Resources, Run, TaskEntry
+from recrl.teachers.registry import TEACHERS
+
+NOTE = "<!-- made from the code by docs/_ext/generated_reference.py; changes here are lost -->\n\n"
+# Of fields that read themselves, so that no schema knows what may be written.
+WRITTEN = {
+    "train_limits": "`auto`, number, or list of numbers",
+    "deploy_limits": "number, or list of numbers",
+    "seeds": "whole number, or list of whole numbers",
+    "custom_per_trial": "mapping of names to numbers",
+    "tasks": "list of names or mappings",
+    "agents": "list of names or mappings",
+    "methods": "list of names or mappings",
+    "name": "text",
+}
+BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+TYPES = {"integer": "whole number", "number": "number", "boolean": "true or false", "string": "text"}
+SHOWN_NAMES = 12
+
+
+def pages() -> dict[str, str]:
+    """Every page by its file name."""
+    return {
+        "command-line.md": command_line(),
+        "grid-file.md": grid_file(),
+        "agents.md": agents(),
+        "curricula.md": curricula(),
+        "tasks.md": tasks(),
+        "presets.md": presets_page(),
+    }
+
+
+# Command line ---------------------------------------------------------------------------------------------
+
+
+def command_line() -> str:
+    """Every command with its options."""
+    top = parser()
+    (commands,) = (it for it in top._actions if isinstance(it, argparse._SubParsersAction))
+    summaries = {it.dest: it.help or "" for it in commands._choices_actions}
+    lines = [
+        NOTE,
+        "# Command line\n",
+        f"{cell(top.description)}\n",
+        "`recrl-sweep COMMAND --help` prints this.\n",
+    ]
+    lines += ["| command | what it does |", "|---|---|"]
+    lines += [f"| [`{name}`](#recrl-sweep-{name}) | {cell(text)} |" for name, text in summaries.items()]
+    for name, command in commands.choices.items():
+        lines += [f"\n## recrl-sweep {name}\n", f"{cell(command.description)}\n", usage(command)]
+        lines += ["| argument | meaning |", "|---|---|", *map(argument, arguments_of(command))]
+    return "\n".join(lines) + "\n"
+
+
+def usage(command: argparse.ArgumentParser) -> str:
+    """The line that shows how a command is written."""
+    text = " ".join(command.format_usage().removeprefix("usage: ").split())
+    return f"```text\n{text}\n```\n"
+
+
+def arguments_of(command: argparse.ArgumentParser) -> list[argparse.Action]:
+    """What a command takes, but for ``--help``."""
+    return [it for it in command._actions if not isinstance(it, argparse._HelpAction)]
+
+
+def argument(action: argparse.Action) -> str:
+    """One row."""
+    value = action.metavar or ("|".join(map(str, action.choices)) if action.choices else action.dest.upper())
+    shown = value if isinstance(value, str) else " ".join(value)
+    takes_none = action.nargs == 0
+    if not action.option_strings:
+        name = shown
+    else:
+        name = ", ".join(it if takes_none else f"{it} {shown}" for it in action.option_strings)
+    return f"| `{name.replace('|', ' or ')}` | {cell(action.help).replace('%%', '%')} |"
+
+
+# Options --------------------------------------------------------------------------------------------------
+
+
+def grid_file() -> str:
+    """Every key of a grid file."""
+    lines = [
+        NOTE,
+        "# Grid file\n",
+        "A grid is a product: every task x agent x method x seed, less what `exclude` names.",
+        "All mistakes are reported at once, each with its line. Nothing starts before the file is right.\n",
+        "## Top level\n",
+        *option_table(GridFile),
+        "\n## An entry of `tasks`\n",
+        "A name, or a mapping with these keys. Its options are on the page [](tasks.md).\n",
+        *option_table(TaskEntry),
+        "\n## An entry of `agents` or `methods`\n",
+        "A name, or a mapping with these keys. Options: [](agents.md), [](curricula.md).\n",
+        *option_table(Entry),
+        "\n## `run`\n",
+        *option_table(Run),
+        "\n## `resources`\n",
+        "No result depends on these.\n",
+        *option_table(Resources),
+        "\n## An entry of `exclude`\n",
+        "Trials that match everything given here are left out. A key takes one label or a list of labels.\n",
+        *option_table(Exclusion),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def agents() -> str:
+    """Every option of every agent: first those that all share."""
+    models = {name: entry.config for name, entry in AGENTS.items()}
+    shared = common_options(models.values())
+    lines = [
+        NOTE,
+        "# Agents\n",
+        "Options are given in a grid: `agents: [{name: ppo-lag, options: {...}}]`.\n",
+    ]
+    lines += ["| agent | what it is |", "|---|---|"]
+    lines += [f"| [`{name}`](#{anchor(name)}) | {cell(entry.summary)} |" for name, entry in AGENTS.items()]
+    first = next(iter(models.values()))
+    lines += ["\n## Options of every agent\n", *option_table(first, only=shared)]
+    for name, model in models.items():
+        own = [it for it in model.model_fields if it not in shared]
+        lines += [f"\n## {name}\n", f"{cell(AGENTS[name].summary)}\n", *option_table(model, only=own)]
+    return "\n".join(lines) + "\n"
+
+
+def curricula() -> str:
+    """Every option of every curriculum."""
+    lines = [
+        NOTE,
+        "# Curricula\n",
+        "Options are given in a grid: `methods: [{name: dynamic, options: {...}}]`.\n",
+    ]
+    lines += ["| curriculum | what it does |", "|---|---|"]
+    lines += [f"| [`{name}`](#{anchor(name)}) | {cell(kind.summary)} |" for name, kind in TEACHERS.items()]
+    for name, kind in TEACHERS.items():
+        lines += [f"\n## {name}\n", f"{cell(kind.summary)}\n", *option_table(kind.config)]
+    return "\n".join(lines) + "\n"
+
+
+def tasks() -> str:
+    """Every option of every task, tasks with the same options together."""
+    families: dict[type[BaseModel], list[str]] = {}
+    for name, task in TASKS.items():
+        model = load_attribute(task.options) if isinstance(task.options, str) else task.options
+        families.setdefault(model, []).append(name)
+    lines = [
+        NOTE,
+        "# Tasks\n",
+        "Options are given in a grid: `tasks: [{name: rivergrid-1a, options: {...}}]`.\n",
+    ]
+    lines += ["| task | what it is |", "|---|---|"]
+    lines += [f"| `{name}` | {cell(task.summary)} |" for name, task in TASKS.items()]
+    for model, names in families.items():
+        shown = ", ".join(f"`{name}`" for name in names[:SHOWN_NAMES])
+        more = f" and {len(names) - SHOWN_NAMES} more" if len(names) > SHOWN_NAMES else ""
+        title = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+        lines += [f"\n## {title}\n", f"Options of {shown}{more}.\n", *option_table(model)]
+    return "\n".join(lines) + "\n"
+
+
+def presets_page() -> str:
+    """The table of the presets."""
+    return (
+        f"{NOTE}# Presets\n\n"
+        "`recommended` is every option's default. `preset: paper` sets the options below to the values of\n"
+        "safety-starter-agents, which the paper took over unchanged. For `focops` and `ipo` some values are\n"
+        "those of their own papers. An option given beside `preset` overrides it. The table is complete.\n\n"
+        f"{presets.table()}\n"
+    )
+
+
+def common_options(models: Iterable[type[BaseModel]]) -> list[str]:
+    """The options that all models have, with the same default and description."""
+    first, *others = models
+    return [
+        name
+        for name, field in first.model_fields.items()
+        if all(
+            name in other.model_fields
+            and other.model_fields[name].default == field.default
+            and other.model_fields[name].description == field.description
+            for other in others
+        )
+    ]
+
+
+def option_table(model: type[BaseModel], *, only: Iterable[str] | None = None) -> list[str]:
+    """The options of a model as rows of a Markdown table."""
+    schema = model.model_json_schema()
+    wanted = list(model.model_fields) if only is None else list(only)
+    if not wanted:
+        return ["It has no options of its own."]
+    rows = ["| option | type | default | meaning |", "|---|---|---|---|"]
+    for name in wanted:
+        field = schema["properties"][name]
+        required = name in schema.get("required", ())
+        rows.append(
+            f"| `{name}` | {type_text(name, field, schema)} | {default_text(field, required=required)} "
+            f"| {cell(field.get('description', ''))} |"
+        )
+    return rows
+
+
+def type_text(name: str, field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
+    """What may be written for an option, in words."""
+    if name in WRITTEN and "enum" not in field:
+        return WRITTEN[name]
+    return words(field, schema)
+
+
+def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:  # noqa: PLR0911
+    """A JSON schema in words."""
+    if "$ref" in field:
+        return words(schema["$defs"][field["$ref"].rsplit("/", 1)[1]], schema)
+    if "const" in field:
+        return f"`{field['const']}`"
+    if "enum" in field:
+        return ", ".join(f"`{value}`" for value in field["enum"])
+    if "anyOf" in field:
+        return " or ".join(words(each, schema) for each in field["anyOf"])
+    kind = field.get("type")
+    if kind == "null":
+        return "null"
+    if kind == "array":
+        items = field.get("items") or next(iter(field.get("prefixItems", ())), {})
+        return f"list of: {words(items, schema)}" if items else "list"
+    if kind == "object":
+        return "mapping"
+    bounds = " ".join(f"{sign} {field[key]:g}," for key, sign in BOUNDS.items() if key in field)
+    return f"{TYPES.get(str(kind), 'any')} {bounds}".rstrip(" ,")
+
+
+def default_text(field: Mapping[str, Any], *, required: bool) -> str:
+    """An option's default."""
+    if required:
+        return "required"
+    if "default" not in field or isinstance(field["default"], dict):
+        return ""
+    return f"`{json.dumps(field['default'])}`"
+
+
+def cell(text: str | None) -> str:
+    """Text for a table: one line, without what Markdown would take for markup."""
+    line = " ".join((text or "").split())
+    if re.match(r"[a-z]{2,}\b(?!_)", line):  # a symbol such as d_t or W stays as it is
+        line = line[:1].upper() + line[1:]
+    line = re.sub(r"([|<>*_\[\]$])", r"\\\1", line)
+    return line if not line or line.endswith((".", "?", "!")) else f"{line}."
+
+
+def anchor(name: str) -> str:
+    """The anchor of a heading that is a name."""
+    return re.sub(r"[^a-z0-9-]", "", name.lower())
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write those pages that have changed, so that the others need not be built again."""
+    folder = Path(app.srcdir) / "reference" / "generated"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in pages().items():
+        path = folder / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Tell Sphinx."""
+    app.connect("builder-inited", write_pages)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,53 @@
+"""A curriculum that reads episodes: halve the distance to d_d whenever the last episodes kept the limit."""
+
+from statistics import fmean
+
+from pydantic import BaseModel, Field
+
+from recrl.environments.cmdp import CostLimits
+from recrl.teachers.registry import TeacherKind
+from recrl.teachers.teacher import Lesson, already_seen, last_lesson, progress
+
+
+class HalvingConfig(BaseModel, frozen=True, extra="forbid"):
+    """``options: {episodes: 50}`` in a grid."""
+
+    episodes: int = Field(default=20, ge=1, description="Episodes under one limit before it is judged.")
+
+
+def halved(limit, deploy_limit, cost):
+    """The next limit of one cost; a violated limit stays."""
+    return max(deploy_limit, (deploy_limit + cost) / 2) if cost <= limit else limit
+
+
+class Halving:
+    """Everything that must survive a crash is in the state, which holds JSON values only."""
+
+    def __init__(self, spec):
+        self.spec = spec
+        self.config = HalvingConfig.model_validate(dict(spec.options))
+
+    def start(self):
+        return self._state(0, self.spec.train_limits, [])
+
+    def step(self, state, report):
+        if already_seen(state, report):  # asked again after a crash: the same answer
+            return last_lesson(state), state
+        limits = CostLimits.from_json(state["limits"])
+        costs = [*state["costs"], *(list(episode.costs) for episode in report.episodes)]
+        if progress(report.env_steps, self.spec.train_steps) >= 1.0:
+            return self._state(report.update, self.spec.deploy_limits, [])
+        if len(costs) < self.config.episodes:
+            return self._state(report.update, limits, costs)
+        means = map(fmean, zip(*costs, strict=True))
+        lower = map(halved, limits, self.spec.deploy_limits, means)
+        return self._state(report.update, CostLimits(tuple(lower)), [])
+
+    def _state(self, update, limits, costs):
+        state = {"update": update, "limits": limits.to_json(), "policy_noise": 0.0, "costs": costs}
+        return Lesson(limits), state
+
+
+HALVING = TeacherKind(
+    "Halve the distance to d_d when the last episodes kept the limit.", HalvingConfig, Halving
+)

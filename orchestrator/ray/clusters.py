@@ -1,0 +1,204 @@
+"""Start a Ray cluster on this machine, or connect to one that somebody else runs."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import socket
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from recrl.orchestrator.errors import ClusterError
+from recrl.orchestrator.files.own_package import copy_package
+from recrl.orchestrator.files.scratch import scratch_folder
+from recrl.orchestrator.ray.private_api import (
+    at_loopback,
+    fewer_processes,
+    own_sessions,
+    quiet_driver,
+    require_known_ray,
+)
+from recrl.orchestrator.ray.process_state import environment, own_signal_handlers
+from recrl.orchestrator.ray.services import (
+    RAY_FOLDER,
+    TOKEN,
+    TOKEN_VARIABLE,
+    end_processes,
+    end_processes_of_the_dead,
+)
+
+CONNECT_SECONDS = 5.0
+CONNECT_TRIES = 3
+OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
+LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
+
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_AIR_NEW_OUTPUT": "0",  # the new output speaks at verbosity 0, the old one does not
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    "TUNE_DISABLE_SIGINT_HANDLER": "1",  # the stop event is the one way to stop
+    "TUNE_GLOBAL_CHECKPOINT_S": "1e9",  # nobody restores Tune's own state
+    "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
+    "TUNE_WARN_THRESHOLD_S": "60",
+}
+WORKER = {
+    "OMP_NUM_THREADS": "1",
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+}
+
+# Ray's processes look after themselves up to ten times a second. A cluster of our own has one machine, no
+# objects to speak of, and nobody who reads its metrics; none of these settings tells that a process has died.
+# They go into Ray's environment, where a version that does not know one leaves it alone.
+SELDOM: Mapping[str, int] = {
+    "enable_metrics_collection": 0,
+    "gcs_pull_resource_loads_period_milliseconds": 10_000,  # for an autoscaler
+    "kill_idle_workers_interval_ms": 1_000,
+    "local_fs_monitor_interval_ms": 10_000,  # before objects are spilled to disk
+    "memory_monitor_refresh_ms": 2_000,
+    "object_manager_timer_freq_ms": 1_000,
+    "prestart_worker_first_driver": 0,  # a worker without work wakes a hundred times a second
+    "raylet_check_gc_period_milliseconds": 10_000,
+}
+LOOPBACK = "127.0.0.1"
+
+logger = logging.getLogger("recrl.sweep")
+
+
+@contextmanager
+def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
+    """A Ray cluster on this machine, for as long as the context lasts, that strangers cannot use.
+
+    Its services listen at the loopback address and want the token, so that neither another machine nor
+    another user of this one can use them. Ray opens its own folder to everybody on the machine: the one
+    around it, which also holds the token, is only this user's.
+
+    Args:
+        num_cpus: cores it may use, at least 1; all of the machine's if None.
+
+    Raises:
+        ClusterError: Ray does not start.
+    """
+    end_processes_of_the_dead(_short_folder())
+    with scratch_folder(_short_folder()) as folder:
+        token_path = folder / TOKEN
+        with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
+            file.write(_token())
+        seldom = {f"RAY_{name}": str(value) for name, value in SELDOM.items()}
+        with environment(QUIET | WORKER | seldom | {TOKEN_VARIABLE: str(token_path)}):
+            for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
+                os.environ.pop(name, None)  # Ray looks at its mode only where it sets it itself
+            with (
+                _leaving_no_process(folder),
+                at_loopback(),
+                _connection(
+                    "cannot start Ray on this machine",
+                    hint="",
+                    address="local",
+                    num_cpus=num_cpus,
+                    _node_ip_address=LOOPBACK,
+                    include_dashboard=False,
+                    object_store_memory=OBJECT_STORE_BYTES,
+                    _temp_dir=str(folder / RAY_FOLDER),
+                ),
+            ):
+                yield
+
+
+@contextmanager
+def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[None]:
+    """A connection to a Ray cluster that somebody else runs.
+
+    Args:
+        address: ``auto`` for the one this machine belongs to, or ``host:port``.
+        ship_package: whether to send recrl itself, without its dependencies, to the nodes.
+
+    Raises:
+        ClusterError: there is none, this machine is no node of it, or it does not know our token.
+    """
+    failure = f"cannot use the Ray cluster at {address}"
+    if "://" in address:  # Ray itself advises against Tune beyond Ray Client
+        raise ClusterError(
+            f"{failure}: the driver must run on a node of the cluster, not beyond Ray Client; launch there "
+            "with --address auto, or make this machine a node: ray start --address=<host:port> --num-cpus=0"
+        )
+    host, _, port = address.rpartition(":")
+    if host:  # Ray itself would try for two minutes
+        try:
+            socket.create_connection((host, int(port)), timeout=CONNECT_SECONDS).close()
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise ClusterError(f"{failure}: {reason}; is it running, and is this host:port?") from error
+    hint = (
+        "; is this machine a node of it (ray start --address=<host:port> --num-cpus=0), and does it want a "
+        "token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
+    )
+    with scratch_folder(tempfile.gettempdir()) as scratch:
+        environment: dict[str, Any] = {"env_vars": WORKER}
+        if ship_package:
+            environment["py_modules"] = [str(folder) for folder in copy_package(scratch)]
+        with _connection(failure, hint, address=address, runtime_env=environment):
+            yield
+
+
+@contextmanager
+def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
+    require_known_ray()
+    try:
+        quiet_driver()
+        try:
+            _connect(**settings)
+        except SystemExit as error:  # Ray's own answer to a SIGTERM while it starts; nothing runs yet
+            raise KeyboardInterrupt from error
+        except Exception as error:
+            raise ClusterError(f"{failure}: {first_line(error)}{hint}") from error
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _connect(**settings: Any) -> None:
+    """``ray.init``, tried again where a busy machine took longer than the seconds that Ray allows."""
+    for tries_left in range(CONNECT_TRIES - 1, -1, -1):
+        try:
+            with own_signal_handlers(), own_sessions(), fewer_processes():
+                ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
+            return
+        except Exception as error:  # that a node is too slow to start, Ray says by a bare Exception
+            if tries_left == 0 or "timed out" not in str(error):
+                raise
+            logger.warning("Ray did not start in time; it is tried again")
+            ray.shutdown()
+
+
+@contextmanager
+def _leaving_no_process(folder: Path) -> Iterator[None]:
+    """End at last what Ray leaves behind of the cluster in a folder: its agents, if its raylet was killed."""
+    try:
+        yield
+    finally:
+        end_processes(folder)
+
+
+@cache
+def _token() -> str:
+    """This process's token for the clusters it starts: Ray reads a process's token only once."""
+    return secrets.token_hex(32)
+
+
+def _short_folder() -> str:
+    folder = tempfile.gettempdir()
+    return folder if len(folder) <= LONGEST_SOCKET_FOLDER - len("/recrl-12345678/ray") else "/tmp"
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error, or all of them as one where the first only announces the others."""
+    first = next(iter(str(error).splitlines()), "")
+    return " ".join(str(error).split()) if first.endswith(":") else first

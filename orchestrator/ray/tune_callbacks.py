@@ -1,0 +1,172 @@
+"""What the driver does beside Tune's scheduling: passes the stop on, and records trials that are given up."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from ray import cloudpickle, tune
+from ray.exceptions import (
+    ActorDiedError,
+    ActorUnavailableError,
+    NodeDiedError,
+    OutOfMemoryError,
+    RayTaskError,
+    TaskCancelledError,
+    WorkerCrashedError,
+)
+from ray.tune.search import BasicVariantGenerator
+
+from recrl.orchestrator.errors import StorageError, TeacherUnavailableError
+from recrl.orchestrator.places import StopSign, SweepPlace
+from recrl.orchestrator.ray.clusters import first_line
+from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
+from recrl.orchestrator.ray.services import LostServices
+from recrl.orchestrator.ray.worker import spec_of
+from recrl.orchestrator.redaction import shown
+from recrl.orchestrator.spec import TrialSpec, TrialState
+
+LONGEST_PAUSE_SECONDS = 0.5  # in which nobody asks Ray whether a trial has ended
+PAUSE_SHARE = 0.01  # of the time since a trial last began or ended
+
+logger = logging.getLogger("recrl.sweep")
+
+
+class DriverWatch(tune.Callback):
+    """What the driver does beside scheduling: passes the stop event on, and records trials given up."""
+
+    def __init__(
+        self,
+        place: SweepPlace,
+        queue: BasicVariantGenerator,
+        *,
+        stop: threading.Event,
+        stop_sign: StopSign,
+        watchdog: HangWatchdog,
+        lost: LostServices,
+    ) -> None:
+        self._place = place
+        self._queue = queue
+        self._stop = stop
+        self._stop_sign = stop_sign
+        self._watchdog = watchdog
+        self._lost = lost
+        self._last_event = time.monotonic()
+        self.stopped_and_idle = False
+
+    def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        """Look at the stop event and the heartbeats.
+
+        Tune would call this ten times a second, and each turn of its loop costs a millisecond of a core that
+        trials want. So it waits here while trials are long, and never for the stop event.
+        """
+        self._stop.wait(pause_seconds(time.monotonic() - self._last_event))
+        self._lost.check()
+        self._watchdog.end(trials)
+        if self._stop.is_set():
+            if not self._queue.is_finished():
+                self._queue.set_finished()  # type: ignore[no-untyped-call]
+            self._stop_sign.set()
+            self.stopped_and_idle = all(trial.status != "RUNNING" for trial in trials)
+
+    def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Look again soon: where one trial begins, others may."""
+        self._last_event = time.monotonic()
+        self._watchdog.begin(trial)
+
+    def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Look again soon: the next trial is to begin."""
+        self._last_event = time.monotonic()
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Say that Tune starts a trial again."""
+        self._last_event = time.monotonic()
+        logger.warning("%s: its process failed; it goes on from its last checkpoint", spec_of(trial).title)
+
+    def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
+        self._last_event = time.monotonic()
+        cause, spec = _last_error(trial), spec_of(trial)
+        if self._lost.any_is_gone():  # not the trial's fault: it waits
+            return
+        if isinstance(cause, StorageError):
+            logger.warning("%s: %s; it waits", spec.title, cause)
+            return
+        self._refresh(spec)
+        files = self._place.store.trial(spec)
+        if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
+            error = shown(process_error(cause, trial.num_failures))
+            try:
+                files.set_status(TrialState.FAILED, error=error)
+            except StorageError as also:
+                logger.warning("%s; %s", error, also)
+
+    def _refresh(self, spec: TrialSpec) -> None:
+        """Bring the trial's folder up to date."""
+        try:
+            self._place.pull_trial(spec)
+        except StorageError as error:
+            logger.warning("%s", error)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Nothing: Tune pickles its callbacks to restore them, which nobody does, and events cannot be."""
+        return {}
+
+
+class StopWhenIdle(tune.Stopper):
+    """Ends the experiment once the sweep is stopped and the last running trial has come to its end."""
+
+    def __init__(self, watch: DriverWatch) -> None:
+        self._watch = watch
+
+    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
+        """Stop no single trial."""
+        return False
+
+    def stop_all(self) -> bool:
+        """Return whether the sweep is stopped and no trial runs."""
+        return self._watch.stopped_and_idle
+
+
+def pause_seconds(quiet_seconds: float) -> float:
+    """How long to wait before Ray is asked again whether a trial has ended, in seconds.
+
+    Args:
+        quiet_seconds: since a trial last began or ended, at least 0; no trial is kept waiting for more than a
+            hundredth of them.
+    """
+    return min(PAUSE_SHARE * quiet_seconds, LONGEST_PAUSE_SECONDS)
+
+
+def _last_error(trial: Any) -> BaseException | None:
+    """What a Tune trial failed of, last."""
+    path = trial.pickled_error_file
+    if path is None:
+        return None
+    error: BaseException = cloudpickle.loads(Path(path).read_bytes())  # Tune wrote it a moment ago
+    return error.cause if isinstance(error, RayTaskError) else error
+
+
+def process_error(cause: BaseException | None, failures: int) -> str:
+    """What is said of a trial whose processes failed, so often that it is not started again.
+
+    Args:
+        cause: what Ray says of the last time, if it does.
+        failures: how often, at least 1.
+    """
+    times = "once" if failures == 1 else f"{failures} times"
+    if isinstance(cause, OutOfMemoryError):
+        why = "Ray ended it because the machine ran out of memory; let fewer trials run at once"
+    elif isinstance(cause, TaskCancelledError):
+        why = "Ray cancelled it"
+    elif isinstance(cause, ActorDiedError | ActorUnavailableError | WorkerCrashedError | NodeDiedError):
+        why = (
+            "it ended without a word: killed from outside, for want of memory, or by the task's or the "
+            "agent's own code"
+        )
+    else:
+        why = f"{type(cause).__name__}: {first_line(cause)}" if cause else "nobody says why"
+    return f"its process failed {times}; the last time: {why}"

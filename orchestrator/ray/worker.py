@@ -1,0 +1,81 @@
+"""A worker process of Ray Tune: runs one trial after the other.
+
+A trial's result depends on its spec alone, and importing torch anew costs as much as a small trial: so a
+process is used again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray import tune
+
+from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
+from recrl.orchestrator.remote.opening import place_at
+from recrl.orchestrator.spec import TrialSpec
+
+
+class TuneTrial(tune.Trainable):
+    """A worker process, as Tune sees it; each of its trials is one long step.
+
+    Tune hears of a trial only at its end: a report blocks until the driver has taken it, and whoever wants
+    to know more reads the files.
+    """
+
+    def setup(self, config: dict[str, Any]) -> None:
+        """Get ready for the first trial."""
+        self._take(config)
+
+    def reset_config(self, new_config: dict[str, Any]) -> bool:
+        """Get ready for the next trial, in the same process."""
+        self._take(new_config)
+        return True
+
+    def step(self) -> dict[str, Any]:
+        """Run the trial to its end or until the sweep is stopped.
+
+        Raises:
+            TeacherUnavailableError: the teacher is gone; Tune tries the trial again.
+            StorageError: the object store was down for too long; the same.
+        """
+        from recrl.orchestrator.trial.trial import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
+
+        if not self._stop_sign.is_set():
+            with _given_gpu(), self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:
+                run_recorded(
+                    self._spec,
+                    trial,
+                    should_stop=self._stop_sign.is_set,
+                    teacher=self._teacher,
+                    commit_seconds=self._commit_seconds,
+                )
+        return {"done": True}
+
+    def _take(self, config: Mapping[str, Any]) -> None:
+        self._spec = TrialSpec.from_json(json.loads(config["spec"]))
+        sweep = Path(config["sweep"])
+        self._place = place_at(SweepStore(sweep.parent, sweep.name), config["storage"])
+        self._stop_sign = self._place.stop_sign_at(config["stop_sign"])
+        self._commit_seconds: float = config["commit_seconds"]
+        name = config["teacher_service"]
+        self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
+
+
+def _given_gpu() -> AbstractContextManager[Any]:
+    """Students made meanwhile live on the GPU that Ray gave this worker, if it gave one that can be used."""
+    if not ray.get_gpu_ids():
+        return nullcontext()
+    import torch  # noqa: PLC0415  (the driver does without)
+
+    return torch.device("cuda") if torch.cuda.is_available() else nullcontext()
+
+
+def spec_of(trial: Any) -> TrialSpec:
+    """The recrl trial that a Tune trial is."""
+    return TrialSpec.from_json(json.loads(trial.config["spec"]))

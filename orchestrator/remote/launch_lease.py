@@ -1,0 +1,182 @@
+"""The lease of a launch: one object that says who runs a sweep, and when that one last said so.
+
+Two launches at once: the first creates ``launch.json``, the second is refused, where the store creates an
+object only once (S3, Google, Azure). That file of a launch that died is free after ``SILENT_SECONDS``, by
+the machines' clocks. Should two launches run all the same, one sees the other's name there within
+``BEAT_SECONDS`` and stops; until then they may do the same work twice, but never damage it: each attempt
+writes below its own name.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from recrl.orchestrator.background import beside
+from recrl.orchestrator.errors import StorageError, SweepBusyError
+from recrl.orchestrator.remote.object_store import ObjectStore
+
+LOOK_SECONDS = 5.0  # between two looks whether somebody asks to stop
+BEAT_SECONDS = 15.0  # between two signs of life of a launch
+EMPTY_SECONDS = 1.0  # after which what is being written is there
+SILENT_SECONDS = 90.0  # without a sign of life, after which its sweep is free
+
+LAUNCH = "launch.json"
+STOP_REQUEST = "stop.request"
+
+logger = logging.getLogger("recrl.sweep")
+
+
+class LaunchLease:
+    """Who runs a sweep in an object store."""
+
+    def __init__(self, objects: ObjectStore) -> None:
+        """Hold nothing yet.
+
+        Args:
+            objects: what lies below the sweep's folder.
+        """
+        self._objects = objects
+        self._token = ""  # of the launch that this is, if it is one
+
+    @contextmanager
+    def held(self, stop: threading.Event) -> Iterator[None]:
+        """Be the one launch that runs the sweep; set ``stop`` when somebody asks for it, or has taken over.
+
+        Raises:
+            SweepBusyError: another one is.
+            StorageError: the store cannot be read or written.
+        """
+        own = {
+            "token": secrets.token_hex(8),
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "boot": _boot(),
+        }
+        self._take(own)
+        self._token = str(own["token"])
+        try:
+            self._objects.delete([STOP_REQUEST])
+            with beside(partial(self._hold, own, stop), name="launch"):
+                yield
+        finally:
+            try:
+                if self._holder().get("token") == own["token"]:
+                    self._objects.delete([STOP_REQUEST, LAUNCH])
+            except StorageError as error:
+                logger.warning("%s; the sweep is free again in %.0f seconds", error, SILENT_SECONDS)
+
+    def belongs_to_another(self) -> bool:
+        """Return whether another launch runs the sweep now.
+
+        Raises:
+            StorageError: the store cannot be read.
+        """
+        holder = self._holder()
+        return _is_alive(holder) and holder.get("token") != self._token
+
+    def request_stop(self) -> None:
+        """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
+
+        Raises:
+            StorageError: the store cannot be written.
+        """
+        self._objects.write(STOP_REQUEST, b"stop\n")
+
+    def is_held(self) -> bool:
+        """Whether a launch runs the sweep, on whatever machine.
+
+        Raises:
+            StorageError: the store cannot be read.
+        """
+        return _is_alive(self._holder())
+
+    def _take(self, own: dict[str, Any]) -> None:
+        """Create ``launch.json``, in place of that of a dead launch if need be."""
+        if self._is_created(own):
+            return
+        holder = self._holder()
+        if not holder:  # somebody is just about to write what it holds, or nobody ever will
+            time.sleep(EMPTY_SECONDS)
+            holder = self._holder()
+        if holder.get("token") == own["token"]:
+            return  # it was written, though the answer was lost
+        if _is_alive(holder):
+            silent = max(0.0, time.time() - holder["at"])
+            raise SweepBusyError(
+                f"{self._objects.uri}: this sweep is already being run by process {holder['pid']} on "
+                f"{holder['host']}, which said so {silent:.0f} seconds ago; wait for it or stop it (if it "
+                f"was killed, the sweep is free after {SILENT_SECONDS:.0f} seconds of silence)"
+            )
+        self._objects.delete([LAUNCH])
+        if not self._is_created(own):
+            raise SweepBusyError(f"{self._objects.uri}: another process has begun to run this sweep just now")
+
+    def _is_created(self, own: dict[str, Any]) -> bool:
+        """Create ``launch.json`` and look whether it is ours: not every store can create exclusively."""
+        created = self._objects.create(LAUNCH, _beat(own))
+        return created and self._holder().get("token") == own["token"]
+
+    def _hold(self, own: dict[str, Any], stop: threading.Event, over: threading.Event) -> None:
+        """Go on saying that this launch lives, and listen."""
+        spoke_at = time.monotonic()
+        while not over.wait(LOOK_SECONDS):
+            try:
+                if self._objects.read(STOP_REQUEST) is not None:
+                    stop.set()
+                if time.monotonic() >= spoke_at + BEAT_SECONDS:
+                    holder = self._holder()
+                    if holder and holder.get("token") != own["token"]:
+                        logger.warning("%s: another launch has taken the sweep over", self._objects.uri)
+                        stop.set()
+                        return
+                    self._objects.write(LAUNCH, _beat(own))
+                    spoke_at = time.monotonic()
+            except StorageError as error:  # whoever pulls says it
+                logger.debug("%s", error)
+
+    def _holder(self) -> dict[str, Any]:
+        """Who runs the sweep, as last said; empty if nobody does."""
+        try:
+            value = json.loads(self._objects.read(LAUNCH) or b"{}")
+        except ValueError:
+            return {}
+        return value if isinstance(value, dict) else {}
+
+
+def _beat(own: dict[str, Any]) -> bytes:
+    return json.dumps({**own, "at": time.time()}).encode()
+
+
+def _is_alive(holder: dict[str, Any]) -> bool:
+    """Whether a launch that says so runs: it spoke lately, and its process is not known to be dead."""
+    try:
+        if time.time() - float(holder["at"]) > SILENT_SECONDS:
+            return False
+        if not _boot() or holder["boot"] != _boot():
+            return True
+        os.kill(int(holder["pid"]), 0)  # signal 0 only asks
+    except (KeyError, TypeError, ValueError, ProcessLookupError):
+        return False
+    except PermissionError:
+        pass  # somebody else's process, so it is there
+    return True
+
+
+def _boot() -> str:
+    """Where and since when process numbers mean what they mean here; empty where nobody can say."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return ""

@@ -1,0 +1,172 @@
+"""The MLflow runs of one sweep: a parent run for the sweep and a child run for each trial."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.tracking.address import is_server
+from recrl.orchestrator.tracking.client import EXPERIMENTS, connect
+from recrl.orchestrator.tracking.points import VIEW, VIEW_STATE
+from recrl.orchestrator.tracking.positions import Position, file_mark
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+EXPERIMENT_TAGS = {
+    "mlflow.experimentKind": "custom_model_development",
+    f"mlflow.sharedViewState.{VIEW}": json.dumps(VIEW_STATE),
+}
+
+
+class SweepRuns:
+    """The experiment of a sweep and its runs.
+
+    Attributes:
+        client: MLflow's.
+        experiment_id: the experiment of all sweeps of this name.
+        parent_id: the sweep's own run.
+        parent_is_new: whether that was just made.
+        without_params: runs that were just made, or whose maker died before it sent their params.
+    """
+
+    def __init__(self, store: SweepStore, uri: str, *, rebuild: bool = False) -> None:
+        """Find the runs, and make the experiment and the parent run if they are missing.
+
+        Args:
+            store: the sweep.
+            uri: of ``address.tracking_uri``.
+            rebuild: delete the runs that are there first.
+        """
+        self.client = connect(uri)
+        self.without_params: set[str] = set()
+        self._store = store
+        self._uri = uri
+        self._tags = {"recrl.sweep": store.name, "recrl.sweep_id": _sweep_id(store)}
+        self.experiment_id = self._find_experiment()
+        self._artifacts: dict[str, str] = {}  # place of each run's files
+        self._of_trials = self._find_runs()
+        if rebuild:
+            for run_id in self._of_trials.values():
+                self.delete(run_id)
+            self._of_trials = {}
+        found = self._of_trials.pop("", None)
+        self.parent_is_new = found is None
+        self.parent_id = found or self._create_parent()
+        if found is None:  # somebody may have deleted the parent alone
+            for run_id in self._of_trials.values():
+                self.client.set_tag(run_id, "mlflow.parentRunId", self.parent_id)
+
+    def of_trial(self, trial_id: str) -> str | None:
+        """Return the run of a trial, None if there is none."""
+        return self._of_trials.get(trial_id)
+
+    def create(self, trial: TrialStore, record: TrialRecord) -> str:
+        """Make the run of a trial, and return its id."""
+        spec = trial.spec
+        tags = {
+            **self._tags,
+            "recrl.kind": "trial",
+            "recrl.trial_id": spec.trial_id,
+            "recrl.group": f"{spec.method.label}, {spec.agent.label}, {spec.task.label}",
+            "mlflow.parentRunId": self.parent_id,
+        }
+        run_id = self._create(spec.title, record.started_at, tags)
+        self._of_trials[spec.trial_id] = run_id
+        self.without_params.add(run_id)
+        return run_id
+
+    def delete(self, run_id: str) -> None:
+        """Delete a run; ``mlflow gc`` removes it for good."""
+        self.client.delete_run(run_id)
+
+    def set_status(self, run_id: str, status: str, end: float) -> None:
+        """Set a run's status.
+
+        A run that goes on after an end keeps its old end time until the next end: MLflow's client cannot
+        clear it.
+        """
+        if status in ("RUNNING", "SCHEDULED"):
+            self.client.update_run(run_id, status=status)
+        else:
+            self.client.set_terminated(run_id, status, end_time=_milliseconds(end))
+
+    def send_files(self, position: Position, paths: Sequence[Path], folder: str | None = None) -> Position:
+        """Upload those files that exist, are not empty and were not sent as they are now."""
+        from mlflow.store.artifact.artifact_repository_registry import (  # noqa: PLC0415
+            get_artifact_repository,
+        )
+
+        # client.log_artifact would ask for the whole run first, to know this place
+        repository: Any = get_artifact_repository(self._artifacts[position.run_id], self._uri)
+        sent = list(position.artifacts)
+        for path in paths:
+            with suppress(FileNotFoundError):
+                mark = file_mark(path)
+                if mark not in sent and path.stat().st_size and path.is_file():
+                    repository.log_artifact(str(path), folder)
+                    sent.append(mark)
+        return replace(position, artifacts=sent)
+
+    def _find_experiment(self) -> str:
+        name = f"{EXPERIMENTS}{self._store.name}"
+        experiment = self.client.get_experiment_by_name(name)
+        if experiment is None:
+            # A server knows where it keeps artifacts; a bare database would take the current folder.
+            place = None if is_server(self._uri) else self._store.mlflow_artifacts.as_uri()
+            return str(self.client.create_experiment(name, artifact_location=place, tags=EXPERIMENT_TAGS))
+        if experiment.lifecycle_stage != "active":
+            self.client.restore_experiment(experiment.experiment_id)
+        for key, value in EXPERIMENT_TAGS.items():
+            if experiment.tags.get(key) != value:
+                self.client.set_experiment_tag(experiment.experiment_id, key, value)
+        return str(experiment.experiment_id)
+
+    def _find_runs(self) -> dict[str, str]:
+        """Return run by trial id, the parent by the empty id; the oldest where there are several."""
+        found: dict[str, str] = {}
+        for run in sorted(self._own_runs(), key=lambda run: run.info.start_time or 0):
+            run_id = str(run.info.run_id)
+            found.setdefault(run.data.tags.get("recrl.trial_id", ""), run_id)
+            self._artifacts[run_id] = str(run.info.artifact_uri)
+        return found
+
+    def _own_runs(self) -> list[Run]:
+        """Return the runs of this sweep, page by page."""
+        query = f"tags.`recrl.sweep_id` = '{self._tags['recrl.sweep_id']}'"
+        runs: list[Run] = []
+        token: str | None = None
+        while token is None or token:
+            page = self.client.search_runs([self.experiment_id], query, page_token=token)
+            runs += page
+            token = page.token or ""
+        return runs
+
+    def _create_parent(self) -> str:
+        records = (trial.record() for trial in self._store.trials())
+        begun = min((record.started_at for record in records if record.attempt), default=time.time())
+        return self._create(self._store.name, begun, {**self._tags, "recrl.kind": "sweep"})
+
+    def _create(self, name: str, start: float, tags: dict[str, str]) -> str:
+        run = self.client.create_run(
+            self.experiment_id, start_time=_milliseconds(start), run_name=name, tags=tags
+        )
+        self._artifacts[run.info.run_id] = str(run.info.artifact_uri)
+        return str(run.info.run_id)
+
+
+def _sweep_id(store: SweepStore) -> str:
+    """Return ten hex digits: sweeps of one name, made at different times, are different sweeps."""
+    created = str(store.info().get("created", ""))
+    return hashlib.sha256(f"{store.name}\n{created}".encode()).hexdigest()[:10]
+
+
+def _milliseconds(seconds: float) -> int:
+    return round(seconds * 1000)

@@ -1,0 +1,94 @@
+"""Bring the sweep's parent run up to date: its note, its status, the grid, the figures, the export file."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from recrl.orchestrator.files.store import SweepStore, TrialRecord
+from recrl.orchestrator.status import Standing, standing_of
+from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
+from recrl.orchestrator.tracking.points import Summary, charts_page, note
+from recrl.orchestrator.tracking.positions import Position, mirror_folder, read_position
+from recrl.orchestrator.tracking.run_states import sweep_status
+from recrl.orchestrator.tracking.runs import SweepRuns
+
+
+class SweepSync:
+    """Sends what is known of the whole sweep to its parent run."""
+
+    def __init__(
+        self,
+        store: SweepStore,
+        uri: str,
+        runs: SweepRuns,
+        *,
+        summaries: Callable[[], Sequence[Summary]],
+        write_export: ExportWriter | None,
+    ) -> None:
+        """Go on from the position of an earlier process.
+
+        Args:
+            store: the sweep.
+            uri: of ``address.tracking_uri``.
+            runs: its runs.
+            summaries: returns the means of all complete trials.
+            write_export: writes the export file; None to upload none.
+        """
+        self._store = store
+        self._runs = runs
+        self._summaries = summaries
+        folder = mirror_folder(store, uri)
+        self._path = folder / "sweep.json"
+        known = read_position(self._path)
+        self._position = known if known and known.run_id == runs.parent_id else Position(runs.parent_id)
+        self._export = ExportUpload(store, runs, write_export, folder) if write_export else None
+
+    def show(self, *, live: bool) -> str:
+        """Bring the parent run up to date.
+
+        Returns:
+            Why the export file could not be uploaded, or nothing.
+        """
+        records = self._records()
+        position = self._show_state(self._position, records, live=live)
+        position = self._runs.send_files(position, [self._store.grid_path, self._store.info_path])
+        figures = sorted(self._store.figures_folder.glob("*"))
+        position = self._runs.send_files(position, figures, "figures")
+        self._save(position)
+        if self._export is None:
+            return ""
+        position, remark = self._export.bring_up_to_date(position, records, live=live)
+        self._save(position)
+        return remark
+
+    def _show_state(self, position: Position, records: dict[str, TrialRecord], *, live: bool) -> Position:
+        from mlflow.entities import RunTag  # noqa: PLC0415
+
+        counts = Counter(standing_of(record, now=time.time()) for record in records.values())
+        status = sweep_status(counts, live=live)
+        text = note(
+            self._store.name,
+            {standing: counts[standing] for standing in Standing},
+            self._summaries(),
+            charts=f"#{charts_page(self._runs.experiment_id)}",
+        )
+        if position.shown.get("note") != text:
+            self._runs.client.log_batch(position.run_id, tags=[RunTag("mlflow.note.content", text)])
+        if position.shown.get("status") != status:
+            last = max((record.heartbeat for record in records.values()), default=0.0)
+            self._runs.set_status(position.run_id, status, last or time.time())
+        return replace(position, shown={**position.shown, "note": text, "status": status})
+
+    def _records(self) -> dict[str, TrialRecord]:
+        """Return the records of all trials by folder name, also of those that were never started."""
+        records = {trial.folder.name: trial.record() for trial in self._store.trials()}
+        waiting = {spec.folder_name: TrialRecord() for spec in self._store.specs()}
+        return {**waiting, **records}
+
+    def _save(self, position: Position) -> None:
+        if position != self._position:
+            position.write(self._path)
+            self._position = position

@@ -1,0 +1,197 @@
+"""Bring the MLflow runs of trials up to date with the trials' files.
+
+Only committed rows are sent. Should a trial's file have been cut back behind its position (its newest
+checkpoint was damaged), MLflow holds points that no longer exist: the run is deleted and made anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from recrl.orchestrator.errors import DamagedError
+from recrl.orchestrator.files.row_files import Extent
+from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.tracking.points import (
+    Point,
+    Row,
+    Summary,
+    final_points,
+    params,
+    points,
+    rows_after,
+    thinned,
+)
+from recrl.orchestrator.tracking.positions import Position, file_mark, mirror_folder, read_position
+from recrl.orchestrator.tracking.run_states import run_status, state_tags
+from recrl.orchestrator.tracking.runs import SweepRuns
+
+if TYPE_CHECKING:
+    from mlflow.entities import Metric
+
+
+class TrialSync:
+    """Sends trials to their runs; remembers between passes what was sent."""
+
+    def __init__(self, store: SweepStore, uri: str, runs: SweepRuns) -> None:
+        self._runs = runs
+        self._folder = mirror_folder(store, uri)
+        self._positions: dict[str, Position] = {}
+
+    def show(self, trial: TrialStore, *, live: bool) -> int:
+        """Bring the trial's run up to date; return the number of points sent.
+
+        Raises:
+            DamagedError: a file of the trial is not what was committed.
+        """
+        record = trial.record()
+        if record.status is TrialState.DAMAGED:
+            raise DamagedError(record.error)
+        shown = _shown(trial, record, live=live)
+        position = self._position(trial, record)
+        if position.shown == shown:
+            return 0
+        data = _committed_rows(trial, record)
+        if data is None:
+            return 0  # the file is being cut back at this moment; the next pass sees the result
+        if not position.fits(data):
+            self._runs.delete(position.run_id)
+            position = Position(self._runs.create(trial, record))
+        new_points, position = _points_to_send(
+            trial, data, position, is_finished=shown["status"] == "FINISHED"
+        )
+        position = self._send(trial, record, position, new_points)
+        if position.shown.get("status") != shown["status"]:
+            self._runs.set_status(position.run_id, shown["status"], record.heartbeat)
+        self._save(trial, replace(position, shown=shown))
+        return len(new_points)
+
+    def summary(self, trial: TrialStore) -> Summary | None:
+        """Return the means that a complete trial ended with, None before its end."""
+        position = self._positions.get(trial.folder.name)
+        if position is None or not position.summary:
+            return None
+        spec = trial.spec
+        return Summary((spec.task.label, spec.agent.label, spec.method.label), position.summary)
+
+    def _send(
+        self, trial: TrialStore, record: TrialRecord, position: Position, new_points: Sequence[Point]
+    ) -> Position:
+        """Send points, params, tags and files.
+
+        In as few requests as MLflow allows: each costs the server, or this process, about 10 ms.
+        """
+        from mlflow.entities import Metric, Param, RunTag  # noqa: PLC0415
+
+        client, run_id = self._runs.client, position.run_id
+        metrics: list[Metric] = [Metric(it.key, it.value, it.milliseconds, it.step) for it in new_points]
+        is_new = run_id in self._runs.without_params
+        told = [Param(key, value) for key, value in params(trial.spec).items()] if is_new else []
+        try:
+            position = self._runs.send_files(position, _result_files(trial, record))
+            for path in _added_afterwards(trial):
+                position = self._runs.send_files(position, [path], path.parent.name)
+        except OSError:  # where there is no room for files there may be some for the curves
+            client.log_batch(run_id, metrics=metrics, params=told)
+            raise
+        tags = [RunTag(key, value) for key, value in state_tags(record).items()]
+        client.log_batch(run_id, metrics=metrics, params=told, tags=tags)
+        self._runs.without_params.discard(run_id)
+        if position.shown.get("error") and not record.error:
+            client.delete_tag(run_id, "recrl.error")
+        return position
+
+    def _position(self, trial: TrialStore, record: TrialRecord) -> Position:
+        """Return how far the trial has been sent, as far as MLflow still has the run."""
+        name = trial.folder.name
+        if name not in self._positions:
+            position = read_position(self._path(trial))
+            found = self._runs.of_trial(trial.spec.trial_id)
+            if position is None or position.run_id != found:
+                position = Position(found or self._runs.create(trial, record))
+                if found and not self._runs.client.get_run(found).data.params:
+                    self._runs.without_params.add(found)
+            self._positions[name] = position
+        return self._positions[name]
+
+    def _path(self, trial: TrialStore) -> Path:
+        return self._folder / f"trial-{trial.folder.name}.json"
+
+    def _save(self, trial: TrialStore, position: Position) -> None:
+        position.write(self._path(trial))
+        self._positions[trial.folder.name] = position
+
+
+def _shown(trial: TrialStore, record: TrialRecord, *, live: bool) -> dict[str, Any]:
+    """Return what the run is to show; as long as it does not change, nothing is sent."""
+    return {
+        "status": run_status(record, live=live),
+        "attempt": record.attempt,
+        "committed": record.committed.get(trial.updates_path.name, 0),
+        "error": record.error,
+        "added": [file_mark(path) for path in _added_afterwards(trial)],
+    }
+
+
+def _committed_rows(trial: TrialStore, record: TrialRecord) -> bytes | None:
+    """Return the committed bytes of ``updates.csv``, None while it is shorter.
+
+    Raises:
+        DamagedError: they are not what was committed.
+    """
+    extent = record.extents.get(trial.updates_path.name, Extent())
+    data = b""
+    if extent.length:
+        with trial.updates_path.open("rb") as file:
+            data = file.read(extent.length)
+    if len(data) < extent.length:
+        return None
+    if Extent.of(data) != extent:
+        raise DamagedError(f"{trial.updates_path.name} is not what was committed: its checksum differs")
+    return data
+
+
+def _points_to_send(
+    trial: TrialStore, data: bytes, position: Position, *, is_finished: bool
+) -> tuple[list[Point], Position]:
+    """Return the points behind a position, those of a finished trial's end, and the position behind them."""
+    if is_finished:
+        trial.require_whole()
+    found, position = _new_points(trial, data, position)
+    if is_finished and position.last_row:
+        last = final_points(trial.updates(), trial.evaluation(), _last_row(data, position))
+        summary = {point.key: point.value for point in last if point.key.startswith("summary/")}
+        found, position = [*found, *last], replace(position, summary=summary)
+    return found, position
+
+
+def _new_points(trial: TrialStore, data: bytes, position: Position) -> tuple[list[Point], Position]:
+    found: list[Point] = []
+    end = position.offset
+    for end, row in thinned(rows_after(data, position.offset), trial.spec.num_updates):  # noqa: B007
+        found += points(row, trial.spec)
+    start = data.rfind(b"\n", 0, max(0, end - 1)) + 1
+    return found, replace(position, offset=end, last_row=data[start:end].decode())
+
+
+def _last_row(data: bytes, position: Position) -> Row:
+    return next(row for _, row in rows_after(data, position.offset - len(position.last_row.encode())))
+
+
+def _result_files(trial: TrialStore, record: TrialRecord) -> list[Path]:
+    """Return the trial's small files, and at its end what it learnt."""
+    paths = [trial.spec_path, trial.provenance_path]
+    if record.status is TrialState.COMPLETE:
+        paths += [trial.evaluation_path, trial.events_path, trial.policy_path, *trial.checkpoints()[:1]]
+    if record.status is TrialState.FAILED:
+        paths += [trial.error_path]
+    return paths
+
+
+def _added_afterwards(trial: TrialStore) -> list[Path]:
+    """Return what was measured and filmed of the final policy, for artifacts in folders of these names."""
+    folders = (trial.evaluations_folder, trial.videos_folder)
+    return [path for folder in folders for path in sorted(folder.glob("update-*"))]

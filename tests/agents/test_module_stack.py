@@ -1,0 +1,154 @@
+"""Networks of the user's own do what the standard perceptron does, and say what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from recrl.agents.collection import Collector, episode_costs
+from recrl.agents.errors import NetworkError
+from recrl.agents.learning.module_stack import ModuleStack, checked_module
+from recrl.agents.learning.networks import FlatParameters, TanhStack, orthogonal
+from recrl.agents.registry import make_agent
+from recrl.agents.spaces import observation_size
+from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.plugins import UntrustedNameError, refuse_import_paths
+from recrl.environments.registry import make_vector
+
+SIZES, NETWORKS, ROWS = (3, 5, 4, 2), 2, 7
+AGENTS = ["ppo-lag", "cpo", "focops", "trpo-lag", "pcpo"]
+OWN = {"network": f"{__name__}:with_layer_norm"}
+
+
+def with_layer_norm(num_inputs: int, num_outputs: int) -> nn.Module:
+    """A user's network."""
+    return nn.Sequential(nn.Linear(num_inputs, 8), nn.LayerNorm(8), nn.SiLU(), nn.Linear(8, num_outputs))
+
+
+class Both:
+    """The same networks as a ``TanhStack`` and as modules."""
+
+    def __init__(self) -> None:
+        self.fast_block = FlatParameters(TanhStack.shapes(NETWORKS, SIZES))
+        self.fast = TanhStack(self.fast_block, len(SIZES) - 1)
+        self.fast.initialise(orthogonal, 1.0, torch.Generator().manual_seed(0))
+        self.fast_block.values.add_(0.1 * torch.randn(len(self.fast_block.values)))
+        modules = [self.module(number) for number in range(NETWORKS)]
+        self.block = FlatParameters(ModuleStack.shapes(modules))
+        self.stack = ModuleStack(modules, self.block)
+        self.stack.initialise(1.0)
+
+    def module(self, number: int) -> nn.Module:
+        layers: list[nn.Module] = []
+        for weight, bias in zip(self.fast.weights, self.fast.biases, strict=True):
+            layer = nn.Linear(*weight.shape[1:])
+            layer.weight.data, layer.bias.data = weight[number].T.clone(), bias[number, 0].clone()
+            layers += [layer, nn.Tanh()]
+        return nn.Sequential(*layers[:-1])
+
+    def as_modules(self, pieces: list[Tensor]) -> list[Tensor]:
+        """Pieces of the perceptrons' block in the order of the modules' parameters."""
+        ordered = [
+            part
+            for number in range(NETWORKS)
+            for piece in pieces
+            for part in (piece[number, :-1].T, piece[number, -1])
+        ]
+        return [*ordered, torch.zeros(NETWORKS)]
+
+
+@pytest.fixture
+def both() -> Both:
+    torch.manual_seed(1)
+    return Both()
+
+
+def test_outputs_and_derivatives_are_those_of_the_standard_perceptron(both: Both) -> None:
+    rows, slope = torch.randn(ROWS, SIZES[0]), torch.randn(NETWORKS, ROWS, SIZES[-1])
+    ours, theirs = both.fast.activations(rows), both.stack.activations(rows)
+    torch.testing.assert_close(theirs[-1], ours[-1])
+    torch.testing.assert_close(both.stack.outputs(rows), both.fast.outputs(rows))
+    for add in (False, True):
+        both.fast.pull_back(ours, slope, add=add)
+        both.stack.pull_back(theirs, slope, add=add)
+        torch.testing.assert_close(both.block.gradients, both.as_modules(both.fast_block.gradients))
+    change = [torch.randn(tensor.shape) for tensor in both.fast_block.tensors]
+    torch.testing.assert_close(
+        both.stack.output_change(theirs, both.as_modules(change)), both.fast.output_change(ours, change)
+    )
+
+
+def test_a_factor_scales_the_outputs_and_is_not_learnt(both: Both) -> None:
+    rows = torch.randn(ROWS, SIZES[0])
+    before = both.stack.outputs(rows)
+    both.stack.scale(torch.tensor([2.0, 0.5]))
+    torch.testing.assert_close(both.stack.outputs(rows), before * torch.tensor([2.0, 0.5])[:, None, None])
+    kept = both.stack.activations(rows)
+    both.stack.pull_back(kept, torch.ones_like(kept[-1]))
+    assert both.block.gradients[-1].tolist() == [0.0, 0.0]
+
+
+def trained(agent: str, task: str, options: dict[str, Any], *, updates: int = 3) -> Any:
+    environments = make_vector(task, 4)
+    student = make_agent(agent, environments.cmdp, {"critic_steps": 5, **options}, np.random.SeedSequence(7))
+    collector, generator = Collector(environments, num_steps=20), np.random.default_rng(2)
+    collector.reset(seed=1)
+    for _ in range(updates):
+        rollout, episodes = collector.collect(student, generator)
+        student.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits((1.0,))))
+    return student
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("task", ["two-state", "continuous-bandit"])
+@pytest.mark.parametrize("options", [{"activation": "relu", "hidden_sizes": [8]}, OWN], ids=["relu", "own"])
+def test_agents_learn_with_other_networks_and_resume_exactly(
+    agent: str, task: str, options: dict[str, Any]
+) -> None:
+    once, again = (trained(agent, task, options) for _ in range(2))
+    state = once.state_dict()
+    np.testing.assert_array_equal(state["policy"], again.state_dict()["policy"])
+    fresh = trained(agent, task, options, updates=0)
+    assert not np.array_equal(fresh.state_dict()["policy"], state["policy"])
+    fresh.load_state_dict(state)
+    size = observation_size(make_vector(task, 1).cmdp.observation_space)
+    observations = np.zeros((2, size), np.float32)
+    np.testing.assert_array_equal(fresh.act_greedily(observations), once.act_greedily(observations))
+    noisy = once.add_noise(0.5, observations)
+    assert noisy["randomness_after"] >= noisy["randomness_before"]
+
+
+def no_module(num_inputs: int, num_outputs: int) -> Any:
+    return num_inputs + num_outputs
+
+
+def of_another_shape(num_inputs: int, num_outputs: int) -> nn.Module:
+    return nn.Linear(num_inputs, num_outputs + 1)
+
+
+def with_statistics(num_inputs: int, num_outputs: int) -> nn.Module:
+    return nn.Sequential(nn.BatchNorm1d(num_inputs), nn.Linear(num_inputs, num_outputs))
+
+
+@pytest.mark.parametrize(
+    ("factory", "sentence"),
+    [
+        (no_module, "the network's factory returned a int, not a torch.nn.Module"),
+        (of_another_shape, r"to torch.float32 \[2, 3\]: it must return float32 \[2, 2\]"),
+        (with_statistics, "the network has buffers .*use layers without running statistics"),
+        (lambda _, __: nn.Identity(), "the network has no parameters"),
+    ],
+)
+def test_what_is_wrong_with_a_network_is_said(factory: Callable[[int, int], Any], sentence: str) -> None:
+    with pytest.raises(NetworkError, match=sentence):
+        checked_module(factory, 4, 2)
+
+
+def test_a_file_of_somebody_else_runs_no_network() -> None:
+    with refuse_import_paths(), pytest.raises(UntrustedNameError):
+        trained("ppo-lag", "two-state", {"network": "os:system"}, updates=0)

@@ -1,0 +1,124 @@
+"""A report's first lines: verdicts, counted and in words."""
+
+import math
+from html import unescape
+
+import pandas as pd
+import pytest
+
+from recrl.analysis import report_page, report_verdicts
+from recrl.analysis.statistics.verdicts import verdicts
+
+NONE_COMPARED = pd.DataFrame()
+
+
+def outcome(method: str, seed: int, value: float, cost: float, **others: object) -> dict[str, object]:
+    """A final policy on a task with limit 5 and optimum 9.5."""
+    feasible = cost <= 5.05
+    return {
+        "task": "river",
+        "agent": "cpo",
+        "method": method,
+        "seed": seed,
+        "measure": "stochastic",
+        "episodes": 100,
+        "exact": True,
+        "episode_return": value,
+        "cost_0": cost,
+        "deploy_limit_0": 5.0,
+        "optimal_return": 9.5,
+        "feasible": feasible,
+        "optimal": feasible and value >= 9.3,
+        **others,
+    }
+
+
+ROWS = [
+    outcome("none", 0, -20.0, 0.0),
+    outcome("none", 1, 9.5, 5.0),
+    outcome("linear", 0, 9.6, 6.0),
+    outcome("linear", 1, 9.6, 7.0),
+    outcome("dynamic", 0, 9.5, 5.0),
+    outcome("dynamic", 1, 9.4, 5.0),
+    outcome("none", 0, 1.0, 50.0, measure="deployment"),
+    outcome("none", 1, 3.0, 50.0, measure="deployment"),
+]
+
+
+def judged(rows: list[dict[str, object]]) -> pd.DataFrame:
+    return verdicts(pd.DataFrame(rows), NONE_COMPARED)
+
+
+def test_seeds_are_counted_by_the_final_policy_only() -> None:
+    table = judged(ROWS).set_index("method")
+    counts = table[["seeds", "solved", "feasible", "infeasible"]]
+    assert list(counts.loc["none"]) == [2, 1, 2, 0]
+    assert list(counts.loc["linear"]) == [2, 0, 0, 2]
+    assert list(counts.loc["dynamic"]) == [2, 2, 2, 0]
+    assert list(table.loc["linear", ["worst_excess", "worst_share"]]) == [2.0, 0.4]
+    assert list(table.loc["none", ["deployment_return", "deployment_cost_0"]]) == [2.0, 50.0]
+
+
+def test_the_worst_cost_is_the_one_that_is_furthest_over_its_limit() -> None:
+    others = {"cost_1": 3.0, "deploy_limit_1": 1.0, "feasible": False}
+    row = judged([outcome("none", 0, 9.5, 5.5, **others)]).iloc[0]
+    assert (row["worst_excess"], row["worst_share"]) == (2.0, 2.0)
+
+
+def test_the_table_says_the_verdict_in_words() -> None:
+    table = report_verdicts.verdict_table(judged(ROWS))
+    assert table["verdict"].tolist() == [
+        "solved 1 of 2; feasible, not solved 1 of 2",
+        "infeasible by up to 2.00 (40%)",
+        "solved",
+    ]
+    assert report_verdicts.verdict_kinds(judged(ROWS)) == ["feasible", "infeasible", "solved"]
+    assert table["n"].tolist() == ["2", "2", "2"]
+    assert table[report_verdicts.DEPLOYMENT].iloc[0] == "return 2.00, cost 50.000"
+
+
+def test_one_seed_has_no_interval() -> None:
+    table = report_verdicts.verdict_table(judged(ROWS[:1]))
+    assert table["return"].tolist() == ["-20.00"]
+    assert table["verdict"].tolist() == ["feasible"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        (
+            ROWS,
+            "river: 3 of 6 final policies solve it, most often with dynamic (2 of 2), against 1 of 2 with "
+            "none; 2 violate a limit, by up to 2.00 (with linear).",
+        ),
+        (ROWS[4:6], "river: all 2 final policies solve it."),
+        (
+            ROWS[2:4],
+            "river: none of 2 final policies solves it; 2 violate a limit, by up to 2.00 (with linear).",
+        ),
+        (
+            [row | {"optimal_return": math.nan, "optimal": False} for row in ROWS[:4]],
+            "river: 2 of 4 final policies are feasible, most often with none (2 of 2); 2 violate a limit, by "
+            "up to 2.00 (with linear).",
+        ),
+        ([row | {"optimal_return": -math.inf} for row in ROWS], "river: no policy keeps the limits."),
+    ],
+)
+def test_a_sentence_a_task(rows: list[dict[str, object]], sentence: str) -> None:
+    assert report_verdicts.answers(judged(rows)) == [sentence]
+
+
+def test_violators_are_marked_by_text_and_colour() -> None:
+    table = judged(ROWS)
+    html = report_page.verdict_table(
+        report_verdicts.verdict_table(table), report_verdicts.verdict_kinds(table)
+    )
+    assert '<tr class="infeasible"><td>river</td>' in html
+    assert '<td class="verdict">infeasible by up to 2.00 (40%)</td>' in unescape(html)
+    assert "tr.infeasible" in report_page.STYLE
+
+
+def test_sampled_policies_are_said_to_be_sampled() -> None:
+    sampled = judged([outcome("none", 0, 9.5, 5.0, exact=False, episodes=30)])
+    assert "means over 30 episodes" in report_verdicts.explanation(sampled)[0]
+    assert "computed exactly" in report_verdicts.explanation(judged(ROWS))[0]

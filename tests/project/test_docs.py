@@ -1,0 +1,113 @@
+"""What the documentation says is so: its grids are valid, its code runs, its lists are complete."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from recrl.agents.collection import Collector, episode_costs
+from recrl.agents.registry import AGENTS, make_agent
+from recrl.analysis.data import sweep_data
+from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.registry import make_vector
+from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files import store
+from recrl.orchestrator.grid.file_models import GridFile
+from recrl.orchestrator.grid.grid import parse_grid
+from tests.project.documentation import DOCS, PAGES, ROOT, Fence, fences, label
+
+BASE: dict[str, Any] = {
+    "name": "page",
+    "tasks": ["rivergrid-1a"],
+    "agents": ["ppo-lag"],
+    "methods": ["none"],
+    "seeds": 1,
+    "deploy_limits": 5,
+    "run": {"total_steps": 10_000},
+}
+REFERENCE = DOCS / "reference"
+
+
+def grids() -> Iterator[Any]:
+    """Every fence that is a grid, or a part of one."""
+    for page in PAGES:
+        for number, fence in enumerate(fences(page)):
+            if fence.language == "yaml":
+                yield pytest.param(fence, id=f"{label(page)}-{number}")
+
+
+@pytest.mark.parametrize("fence", list(grids()))
+def test_every_grid_and_part_of_a_grid_is_valid(fence: Fence, monkeypatch: pytest.MonkeyPatch) -> None:
+    for example in (ROOT / "examples").iterdir():
+        monkeypatch.syspath_prepend(str(example))
+    given = yaml.safe_load(fence.text)
+    assert set(given) <= set(GridFile.model_fields), "a yaml fence must hold keys of a grid"
+    complete = yaml.safe_dump(given if fence.caption else BASE | given)
+    assert parse_grid(complete.encode(), source="page.yaml").trials()
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if any(it.language == "python" for it in fences(page))], ids=label
+)
+def test_python_in_fences_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for fence in fences(page):
+        if fence.language == "python" and not fence.caption:
+            exec(compile(fence.text, label(page), "exec"), names)
+
+
+def test_every_metric_of_every_agent_is_explained() -> None:
+    explained = (REFERENCE / "metrics.md").read_text()
+    for name in AGENTS:
+        environments = make_vector("two-state", 4, options={"horizon": 10})
+        agent = make_agent(name, environments.cmdp, {}, np.random.SeedSequence(0))
+        collector = Collector(environments, num_steps=20)
+        collector.reset(seed=0)
+        rollout, finished = collector.collect(agent, np.random.default_rng(0))
+        metrics = agent.update(rollout, episode_costs(finished, 1), CurriculumStep(CostLimits((5.0,))))
+        for metric in metrics:
+            assert f"`{re.sub(r'_0$', '_i', metric)}`" in explained, f"{name}: {metric}"
+
+
+def test_every_column_is_explained() -> None:
+    explained = (REFERENCE / "files.md").read_text()
+    columns = {
+        *store.EPISODE_COLUMNS,
+        *store.UPDATE_COLUMNS,
+        *store.EVALUATION_COLUMNS,
+        *sweep_data.TRIAL_COLUMNS,
+        *sweep_data.PHASE_COLUMNS,
+        *sweep_data.EVENT_COLUMNS,
+    }
+    assert not [name for name in columns if f"`{name}`" not in explained]
+
+
+def test_every_event_is_explained() -> None:
+    explained = (REFERENCE / "events.md").read_text()
+    events = re.findall(r"_event\(\s*\"([^\"]+)\"", (ROOT / "orchestrator/trial/trial.py").read_text())
+    assert len(events) >= 3
+    assert not [event for event in events if f"`{event}`" not in explained]
+
+
+def test_every_exit_code_is_explained() -> None:
+    explained = (REFERENCE / "exit-codes.md").read_text()
+    assert not [code for code in ExitCode if f"\n| {code.value} |" not in explained]
+
+
+def test_every_agent_has_a_page_and_every_page_is_listed() -> None:
+    folder = DOCS / "explanation/algorithms"
+    assert {page.stem for page in folder.glob("*.md")} == {*AGENTS, "index"}
+
+
+def test_no_page_quotes_a_test_that_is_not_there() -> None:
+    tests = "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+    quoted = re.findall(r"`(?:test_\w+\.py::)?(test_\w+)`", (DOCS / "faults.md").read_text())
+    assert quoted
+    assert not [name for name in quoted if f"def {name}(" not in tests]
