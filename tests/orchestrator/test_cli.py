@@ -11,7 +11,7 @@ import pytest
 from recrl.analysis.figures import learning_curves
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.spec import TrialState
 
