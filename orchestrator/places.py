@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Protocol
 
 from recrl.orchestrator.files.stop_file import StopFile
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 
 

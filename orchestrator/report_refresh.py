@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 FIRST_SECONDS = 120.0
 INTERVAL_SECONDS = 300.0

@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from recrl.orchestrator.files.store import SweepStore, TrialRecord
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 # A trial says after its updates that it lives, and an update of big networks takes a minute or two; one that

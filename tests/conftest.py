@@ -15,7 +15,8 @@ import pytest
 
 from recrl.analysis.data.sweep_data import Sweep, load
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.orchestrator.files.store import SweepStore, TrialWriter
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync

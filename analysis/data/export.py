@@ -43,7 +43,7 @@ from recrl.orchestrator.errors import DamagedError, RecrlError, missing
 from recrl.orchestrator.files.archives import UNREADABLE, unpacked
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.small_files import write_atomically
-from recrl.orchestrator.files.store import EVALUATION_COLUMNS, UPDATE_COLUMNS
+from recrl.orchestrator.files.trial_tables import EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.untrusted import LimitValues, checked_name
 from recrl.orchestrator.validation import sentences

@@ -47,13 +47,9 @@ from recrl.analysis.data.labels import DOUBLES, KEY, TRIAL, keys_of
 from recrl.analysis.data.optima import UNKNOWN_OPTIMUM, optima_of
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.errors import DamagedError, RecrlError
-from recrl.orchestrator.files.store import (
-    EPISODE_COLUMNS,
-    EVALUATION_COLUMNS,
-    UPDATE_COLUMNS,
-    SweepStore,
-    TrialStore,
-)
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_tables import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.phase_totals import phase_totals
 from recrl.orchestrator.untrusted import checked_name

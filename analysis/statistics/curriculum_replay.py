@@ -19,7 +19,7 @@ import pandas as pd
 from recrl.analysis.report_tables import number
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec

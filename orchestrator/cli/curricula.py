@@ -16,7 +16,7 @@ from recrl.orchestrator.cli.results import say_warnings, source
 from recrl.orchestrator.cli.sweeps import open_store, wanted
 from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.plan import select
 from recrl.orchestrator.spec import Choice, TrialState
 from recrl.teachers.registry import teacher_config

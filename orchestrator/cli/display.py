@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from recrl.orchestrator.background import beside
-from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import Estimate, Plan, Work
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, standing_of

@@ -10,7 +10,8 @@ from recrl.orchestrator.cli.sweeps import open_store, wanted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import has_other_code, other_code_sentence
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import select
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.address import tracking_uri

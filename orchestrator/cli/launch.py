@@ -22,7 +22,7 @@ from recrl.orchestrator.cli.sweeps import DEFAULT_ROOT, wanted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import GridSpec, read_grid
 from recrl.orchestrator.grid.plan import Plan
 from recrl.orchestrator.places import SweepPlace

@@ -16,7 +16,8 @@ from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import no_curriculum_sentence
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import make_plan
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialSpec

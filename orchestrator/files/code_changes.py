@@ -20,7 +20,7 @@ from recrl.agents.registry import AGENTS
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.own_package import folder_of
-from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
 

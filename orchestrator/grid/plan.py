@@ -13,7 +13,9 @@ from enum import StrEnum
 
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.code_changes import has_other_code
-from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.validation import nearest
 

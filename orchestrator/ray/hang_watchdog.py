@@ -13,7 +13,7 @@ from typing import Any
 
 import ray
 
-from recrl.orchestrator.files.store import TrialRecord
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.worker import spec_of
 from recrl.orchestrator.spec import TrialState

@@ -15,7 +15,7 @@ from typing import Any
 import ray
 from ray import tune
 
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
 from recrl.orchestrator.remote.opening import place_at
 from recrl.orchestrator.spec import TrialSpec

@@ -1,6 +1,6 @@
-r"""A trial's commit as one object: its record, the rows that are new, and its checkpoint.
+"""A trial's commit as one object: its record, the rows that are new, and its checkpoint.
 
-    <64 hex digits> <10 digits>\n      SHA-256 and length of the header
+    <64 hex digits> <10 digits>        SHA-256 and length of the header
     header                            JSON: the TrialRecord, and the pieces that each file is made of
     spaces, then bytes                the pieces of this commit
 
@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
-from recrl.orchestrator.files.store import TrialRecord
+from recrl.orchestrator.files.trial_record import TrialRecord
 
 FORMAT = 2
 PREFIX_BYTES = 76
@@ -85,9 +85,8 @@ class Commit:
         """
         try:
             if value["format"] != FORMAT:
-                raise ValueError(
-                    f"a commit of format {FORMAT} is expected, got {value['format']!r}, another version's"
-                )
+                found = f"got {value['format']!r}, of another version of recrl"
+                raise ValueError(f"a commit of format {FORMAT} is expected, {found}")
             files = {name: tuple(Piece(**it) for it in pieces) for name, pieces in value["files"].items()}
             commit = cls(TrialRecord.from_json(value["record"]), files)
         except (KeyError, TypeError, AttributeError) as error:

@@ -60,8 +60,16 @@ class ObjectStore:
         Raises:
             StorageError: the store does not answer, or refuses.
         """
+        return self.read_range(key, None, None)
+
+    def read_range(self, key: str, start: int | None, end: int | None) -> bytes | None:
+        """An object's bytes from one position to another, fewer if it is shorter; None if there is none.
+
+        Raises:
+            StorageError: the store does not answer, or refuses.
+        """
         with self._speaking("cannot be read", unless=FileNotFoundError):
-            return bytes(self._system.cat_file(self._path(key)))
+            return bytes(self._system.cat_file(self._path(key), start=start, end=end))
         return None
 
     def write(self, key: str, data: bytes) -> None:

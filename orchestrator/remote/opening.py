@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 
 

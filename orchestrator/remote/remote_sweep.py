@@ -27,12 +27,15 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
 from recrl.orchestrator.files.locks import open_lock
 from recrl.orchestrator.files.small_files import read_sealed, write_atomically, write_sealed
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.places import LocalSweep, StopSign
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial, Upload, patiently, working_copy
+from recrl.orchestrator.remote.patience import patiently
+from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
 from recrl.orchestrator.remote.stop_object import StopObject
+from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 PULL_SECONDS = 10.0  # between two looks at the trials that run
@@ -136,7 +139,7 @@ class RemoteSweep:
     def working_copy(
         self, spec: TrialSpec, should_stop: Callable[[], bool]
     ) -> AbstractContextManager[TrialStore]:
-        """Return a folder on this machine for one attempt at a trial; see ``remote_trial.working_copy``."""
+        """Return a folder on this machine for one attempt at a trial; see ``upload.working_copy``."""
         return working_copy(self.trial(spec.folder_name), spec, should_stop)
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:

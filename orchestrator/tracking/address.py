@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from recrl.orchestrator.errors import TrackingError
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import redacted
 
 SQLITE = "sqlite:///"

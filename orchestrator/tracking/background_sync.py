@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import RedactedStream
 from recrl.orchestrator.status import Standing, standing_of
 from recrl.orchestrator.tracking.client import ENVIRONMENT

@@ -16,7 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from recrl.orchestrator.errors import TrackingError
-from recrl.orchestrator.files.store import SweepStore, TrialRecord
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.tracking.positions import Position
 from recrl.orchestrator.tracking.runs import SweepRuns
 
@@ -90,7 +91,7 @@ def write_in_own_process(store: SweepStore, path: Path) -> None:
     Raises:
         TrackingError: the file could not be written.
     """
-    command = [sys.executable, "-m", "recrl.orchestrator.cli", "export", store.name]
+    command = [sys.executable, "-m", "recrl", "export", store.name]
     done = subprocess.run(
         [*command, "--root", str(store.folder.parent), "--to", str(path)],
         env={**os.environ, "OMP_NUM_THREADS": "1"},

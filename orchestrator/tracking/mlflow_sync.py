@@ -25,7 +25,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from recrl.orchestrator.files.small_files import write_json
-from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter

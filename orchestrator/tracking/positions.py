@@ -18,7 +18,7 @@ from typing import Any
 
 from recrl.orchestrator.files.locks import open_lock
 from recrl.orchestrator.files.small_files import write_json
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 
 @dataclass(frozen=True)

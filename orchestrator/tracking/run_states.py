@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 
-from recrl.orchestrator.files.store import TrialRecord
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.status import Standing, standing_of
 
 MAX_ERROR = 5_000  # characters of a failed trial's error

@@ -11,7 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.tracking.address import is_server
 from recrl.orchestrator.tracking.client import EXPERIMENTS, connect
 from recrl.orchestrator.tracking.points import VIEW, VIEW_STATE

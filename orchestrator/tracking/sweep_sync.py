@@ -7,7 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from recrl.orchestrator.files.store import SweepStore, TrialRecord
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.status import Standing, standing_of
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.points import Summary, charts_page, note

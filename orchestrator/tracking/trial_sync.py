@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.files.row_files import Extent
-from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.points import (
     Point,

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 
 from recrl.orchestrator.errors import TrackingError
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking.address import is_server
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 from recrl.orchestrator.tracking.points import charts_page

@@ -28,7 +28,7 @@ from recrl.environments.plugins import UntrustedNameError
 from recrl.environments.registry import NotDrawnError, make_drawn, make_vector
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.files.row_files import write_rows
-from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows
 from recrl.orchestrator.trial.videos import VideoFormat, captioned, stride, write_video

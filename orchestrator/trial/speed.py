@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
-from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import make_teacher

@@ -44,7 +44,8 @@ from recrl.orchestrator.errors import (
 )
 from recrl.orchestrator.files.code_changes import code_of
 from recrl.orchestrator.files.provenance import collect as collect_provenance
-from recrl.orchestrator.files.store import TrialStore, TrialWriter
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.heartbeat import Heartbeat

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_in
 from recrl.orchestrator.errors import GridError, RecrlError
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import GridSpec, parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
 

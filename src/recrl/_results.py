@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from recrl.agents.agent import Agent
     from recrl.analysis.data.sweep_data import Sweep
     from recrl.environments.cmdp import CMDPSpec
-    from recrl.orchestrator.files.store import TrialStore
+    from recrl.orchestrator.files.trial_store import TrialStore
     from recrl.orchestrator.spec import TrialSpec
 
 
@@ -81,7 +81,7 @@ def load_policy(trial: str | Path, *, seed: int | None = 0, trust: bool = False)
         >>> policy = recrl.load_policy("runs/demo/trials/...")          # doctest: +SKIP
         >>> policy.act(observation, deterministic=True)                 # doctest: +SKIP
     """
-    from recrl.orchestrator.files.store import TrialStore  # noqa: PLC0415
+    from recrl.orchestrator.files.trial_store import TrialStore  # noqa: PLC0415
 
     folder = Path(trial)
     if not (folder / "spec.json").exists():

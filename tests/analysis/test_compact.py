@@ -14,7 +14,7 @@ from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.sweep_data import Sweep, drawn_columns
 from recrl.analysis.figures import styles
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 
 @pytest.fixture(scope="module")

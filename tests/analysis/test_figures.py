@@ -19,7 +19,7 @@ from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
 from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 
 def lines_of(axes: Axes, colour: str) -> list[Line2D]:

@@ -12,7 +12,7 @@ from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.environments.cmdp import Phase
 from recrl.environments.registry import optimal_return
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 
 def test_every_frame_begins_with_the_key(finished: Sweep) -> None:

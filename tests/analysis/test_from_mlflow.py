@@ -17,7 +17,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking import export_file
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.client import connect

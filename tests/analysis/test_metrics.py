@@ -12,7 +12,7 @@ from recrl.analysis import report_tables
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics import metrics
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 
 def only(frame: pd.DataFrame, **values: object) -> pd.Series:

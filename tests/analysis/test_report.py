@@ -9,7 +9,7 @@ import pytest
 from recrl.analysis import report, report_files
 from recrl.analysis.data import sweep_data
 from recrl.analysis.report import NothingToDrawError
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.faults.committing import commit_file
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.executor import RayExecutor

@@ -22,7 +22,7 @@ import numpy as np
 import ray
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.executor import RayExecutor

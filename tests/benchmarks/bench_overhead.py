@@ -31,7 +31,7 @@ import torch
 
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.launch import MIRROR_INTERVAL_SECONDS
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.background import beside
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.ray import executor
 from recrl.orchestrator.ray.clusters import local_cluster

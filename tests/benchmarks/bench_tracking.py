@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from recrl.environments.cmdp import CostLimits, Phase
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror

@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from recrl.analysis.data.sweep_data import load
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 KEYS = ["task", "agent", "method", "seed", "policy"]
 

@@ -39,7 +39,8 @@ from typing import TextIO
 
 import numpy as np
 
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.points import final_points, points, rows_after, thinned
 

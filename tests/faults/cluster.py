@@ -40,7 +40,8 @@ from typing import Any, TextIO
 import yaml
 
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore, TrialRecord
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialState
 from tests.faults.chaos import differences, mirrored
 

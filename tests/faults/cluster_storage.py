@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from tests.faults.chaos import differences
 from tests.faults.cluster import (

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from recrl.orchestrator.files.row_files import Extent
-from recrl.orchestrator.files.store import TrialStore
+from recrl.orchestrator.files.trial_store import TrialStore
 
 
 def commit_file(trial: TrialStore, name: str, text: str) -> None:

@@ -29,7 +29,8 @@ import numpy as np
 
 from recrl.orchestrator.cli.main import main as recrl_sweep
 from recrl.orchestrator.executors import InlineExecutor
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec

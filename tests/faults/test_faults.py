@@ -20,7 +20,8 @@ from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.errors import LostLeaseError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.scratch import EMPTY_SECONDS, LOCK, scratch_folder
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, launch

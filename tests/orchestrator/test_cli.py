@@ -14,7 +14,7 @@ import pytest
 from recrl.analysis.figures import learning_curves
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.trial.speed import measured_speed
@@ -496,7 +496,8 @@ def test_a_module_that_is_nowhere_is_a_sentence(folder: Path, capsys: pytest.Cap
     assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.startswith(
         "grid.yaml:2: tasks.0.name: cannot import 'my_nav:make': there is no module my_nav; "
-        "start the command in the folder that holds it, name that folder in PYTHONPATH, or install the module's package\n"
+        "start the command in the folder that holds it, name that folder in PYTHONPATH, or install "
+        "the module's package\n"
     )
 
 

@@ -16,7 +16,8 @@ from recrl.environments.registry import TASKS, make_drawn, make_vector
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.trial.saved_policy import FrozenTrial, NoCheckpointError, summary
 from recrl.orchestrator.trial.trial import run_recorded

@@ -20,7 +20,8 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.row_files import Extent, RowFile
 from recrl.orchestrator.files.small_files import read_sealed, write_sealed
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.plan import Work, make_plan
 from recrl.orchestrator.places import LocalSweep, SweepPlace

@@ -20,7 +20,7 @@ from recrl.orchestrator.files.code_changes import (
     no_curriculum_sentence,
     other_code_sentence,
 )
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.sweep import LaunchSettings, launch

@@ -25,7 +25,7 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.stop_file import StopFile
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.ray import hang_watchdog
 from recrl.orchestrator.ray.clusters import existing_cluster, local_cluster

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import TrialState
 from tests.faults.chaos import comm, descendants
 

@@ -102,7 +102,7 @@ def test_no_secret_is_in_a_sweeps_folder_or_in_any_output(
 
 
 def test_an_address_reaches_a_child_in_its_environment_and_not_on_its_command_line(tmp_path: Path) -> None:
-    from recrl.orchestrator.files.store import SweepStore  # noqa: PLC0415
+    from recrl.orchestrator.files.sweep_store import SweepStore  # noqa: PLC0415
     from recrl.orchestrator.tracking.ui import ui_command  # noqa: PLC0415
 
     command = ui_command(SweepStore(tmp_path, "small"), f"postgresql://me:{CANARY}@host/mlflow")

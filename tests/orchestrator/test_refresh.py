@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.report_refresh import refreshing
 
 

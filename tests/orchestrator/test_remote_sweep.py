@@ -22,14 +22,15 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import GridSpec, parse_grid
 from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
-from recrl.orchestrator.remote.remote_trial import Upload
 from recrl.orchestrator.remote.stop_object import StopObject
+from recrl.orchestrator.remote.upload import Upload
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
 from recrl.orchestrator.trial.trial import run_recorded
@@ -173,7 +174,7 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
     program = (
         "import json, sys, threading\n"
         "from pathlib import Path\n"
-        "from recrl.orchestrator.files.store import SweepStore\n"
+        "from recrl.orchestrator.files.sweep_store import SweepStore\n"
         "from recrl.orchestrator.remote.opening import place_at\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
         "from recrl.orchestrator.trial.trial import run_recorded\n"
@@ -205,7 +206,7 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
 def test_a_storage_that_is_down_for_a_while_loses_nothing(
     tmp_path: Path, local: SweepStore, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.remote_trial.FIRST_PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.patience.FIRST_PAUSE_SECONDS", 0.01)
     here = machine(tmp_path, "here", "unreliable")
     spec = grid().trials()[1]
     with here.storage.working_copy(spec, never) as trial:
@@ -219,7 +220,7 @@ def test_a_storage_that_is_down_for_a_while_loses_nothing(
 def test_a_storage_that_stays_down_is_given_up_and_the_trial_goes_on_later(
     tmp_path: Path, local: SweepStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.remote_trial.PATIENCE_SECONDS", 0.0)
+    monkeypatch.setattr("recrl.orchestrator.remote.patience.PATIENCE_SECONDS", 0.0)
     here = machine(tmp_path, "here", "unreliable")
     spec = grid().trials()[1]
     with (

@@ -1,7 +1,6 @@
 """A trial in an object store is there whole or as it was before, whoever writes, fails or comes back."""
 
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,13 @@ from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError
-from recrl.orchestrator.files.store import TrialStore, TrialWriter
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_writer import TrialWriter
+from recrl.orchestrator.remote.commit import Commit, pack, unpack
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.remote.remote_trial import Manifest, RemoteTrial, Upload
+from recrl.orchestrator.remote.remote_trial import RemoteTrial
+from recrl.orchestrator.remote.upload import Upload
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from tests.faults.unreliable import Unreliable
 
@@ -85,6 +88,11 @@ def mirror(remote: RemoteTrial, folder: Path, *, checkpoints: bool = True) -> Tr
     return trial
 
 
+def commit_at(remote: RemoteTrial, key: str) -> Commit:
+    data = remote.objects.read(key) or b""
+    return unpack(lambda start, end: data[start:end])
+
+
 def updates(trial: TrialStore) -> list[int]:
     """The committed updates of a trial whose files belong together."""
     frame = trial.updates()
@@ -147,9 +155,7 @@ def test_many_commits_leave_few_objects(bucket: RemoteTrial, tmp_path: Path) -> 
     for update in range(1, 33):
         machine.work(update)
         machine.upload.push()
-    assert len(bucket.objects.keys_in()) < 2 * (
-        2 * 7 + 3
-    )  # two manifests; two row files of log2(64) + 1 parts
+    assert len(bucket.objects.keys_in()) < 2 * 7  # two commits, and those that hold log2(64) + 1 pieces
     assert updates(mirror(bucket, tmp_path / "mirror")) == list(range(1, 33))
 
 
@@ -205,7 +211,7 @@ def test_not_even_what_was_under_way_when_it_was_declared_dead(bucket: RemoteTri
     successor.upload.push()
     for key, data in late.items():
         assert data is not None
-        bucket.objects.write(key.replace("manifest-0000000", "manifest-0000009"), data)
+        bucket.objects.write(key.replace("commit-0000000", "commit-0000009"), data)
     assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2, 3]
     third = Machine(bucket, tmp_path / "third")
     np.testing.assert_equal(third.restored, tree(3))
@@ -214,7 +220,7 @@ def test_not_even_what_was_under_way_when_it_was_declared_dead(bucket: RemoteTri
     assert not [key for key in bucket.objects.keys_in() if key.startswith(("000001-", "000002-"))]
 
 
-def test_a_sign_of_life_of_an_attempt_before_the_manifests_is_passed_over(
+def test_a_sign_of_life_of_an_attempt_before_the_commits_is_passed_over(
     bucket: RemoteTrial, tmp_path: Path
 ) -> None:
     first = Machine(bucket, tmp_path / "first")
@@ -247,11 +253,8 @@ def test_of_two_attempts_at_once_all_agree_on_one(bucket: RemoteTrial, tmp_path:
     assert mirror(bucket, tmp_path / "mirror").record().token == winner.trial.record().token
 
 
-@pytest.mark.parametrize("victim", ["parts/updates.csv.*", "parts/checkpoint*", "manifest-00000002.json"])
-@pytest.mark.parametrize("harm", ["cut", "gone"])
-def test_a_set_that_is_not_whole_is_not_there(
-    bucket: RemoteTrial, tmp_path: Path, victim: str, harm: str
-) -> None:
+@pytest.mark.parametrize("harm", ["header", "rows", "checkpoint", "cut", "cut to nothing", "gone"])
+def test_a_commit_that_is_not_whole_is_not_there(bucket: RemoteTrial, tmp_path: Path, harm: str) -> None:
     machine = Machine(bucket, tmp_path / "machine")
     machine.work(1)
     machine.upload.push()
@@ -259,34 +262,84 @@ def test_a_set_that_is_not_whole_is_not_there(
     machine.work(2)
     machine.upload.push()
     new = set(bucket.objects.keys_in()) - before
-    [key] = [key for key in new if re.search(victim, key)]
+    [key] = new
     path = tmp_path / "bucket" / key
-    if harm == "cut":
-        path.write_bytes(path.read_bytes()[:-3])
-    else:
+    whole = path.read_bytes()
+    files = commit_at(bucket, key).files
+    [checkpoint] = [name for name in files if "checkpoint" in name]
+    places = {
+        "header": 100,
+        "rows": files["updates.csv"][-1].offset,
+        "checkpoint": files[checkpoint][0].offset,
+    }
+    if harm in places:
+        at = places[harm]
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    elif harm == "gone":
         path.unlink()
+    else:
+        path.write_bytes(whole[:-3] if harm == "cut" else b"")
     assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
     np.testing.assert_equal(Machine(bucket, tmp_path / "next").restored, tree(1))
 
 
-def test_a_manifest_cannot_name_files_that_no_trial_has(bucket: RemoteTrial, tmp_path: Path) -> None:
+def test_a_commit_cannot_name_files_that_no_trial_has(bucket: RemoteTrial, tmp_path: Path) -> None:
     machine = Machine(bucket, tmp_path / "machine")
     machine.upload.push()
-    [key] = [key for key in bucket.objects.keys_in() if "manifest" in key]
-    text = (bucket.objects.read(key) or b"").decode()
-    assert Manifest.from_bytes(text.encode()).record == machine.trial.record()
+    [key] = [key for key in bucket.objects.keys_in() if "commit" in key]
+    commit = commit_at(bucket, key)
+    assert commit.record == machine.trial.record()
+    text = json.dumps(commit.to_json())
+    assert Commit.from_json(json.loads(text)) == commit
     for wrong in (
         text.replace("spec.json", "../../evil"),
-        text.replace('"format": 1', '"format": 2'),
+        text.replace('"format": 2', '"format": 1'),
+        text.replace("commit-00000001", "../commit-00000001"),
         "[]",
-        "",
+        "{}",
     ):
-        with pytest.raises(ValueError, match=r"manifest|Expecting"):
-            Manifest.from_bytes(wrong.encode())
+        with pytest.raises(ValueError, match="commit"):
+            Commit.from_json(json.loads(wrong))
     value = json.loads(text)
     value["files"]["spec.json"][0]["start"] = 1
     with pytest.raises(ValueError, match="leave a gap"):
-        Manifest.from_bytes(json.dumps(value).encode())
+        Commit.from_json(value)
+
+
+@pytest.mark.parametrize("data", [b"", b"no commit", b"\xff" * 100, b"0" * 64 + b" 0000000002\n{}"])
+def test_what_is_no_commit_is_a_value_error(data: bytes) -> None:
+    with pytest.raises(ValueError, match=r"that of a commit|not intact"):
+        unpack(lambda start, end: data[start:end])
+
+
+def test_a_long_header_is_read_whole() -> None:
+    record = TrialRecord(error="x" * 20_000)
+    commit, data = pack("commit-00000001", record, {"log.txt": ()}, {"log.txt": (0, b"a line")})
+    assert unpack(lambda start, end: data[start:end]) == commit
+    [piece] = commit.files["log.txt"]
+    assert data[piece.offset : piece.offset + piece.length] == b"a line"
+
+
+def test_each_byte_is_sent_about_log2_of_n_times_and_a_commit_is_one_write(
+    bucket: RemoteTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    written: list[str] = []
+    write = bucket.objects.write
+
+    def note(key: str, data: bytes) -> None:
+        written.append(key)
+        write(key, data)
+
+    monkeypatch.setattr(bucket.objects, "write", note)
+    sent = 0
+    for update in range(1, 65):
+        machine.work(update)
+        machine.upload.push()
+        pieces = commit_at(bucket, written[-1]).files["episodes.csv"]
+        sent += sum(piece.length for piece in pieces if written[-1].endswith(piece.commit))
+    assert len(written) == 64
+    assert sent < 7 * machine.trial.episodes_path.stat().st_size
 
 
 def test_a_verdict_from_outside_stands_until_the_trial_speaks(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -306,7 +359,7 @@ def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp
     machine.work(1)
     machine.upload.push()
     machine.work(2)
-    Unreliable.plan += ["ok", "cut"]
+    Unreliable.plan += ["cut"]
     with pytest.raises(
         StorageError, match=r"^unreliable://.*/bucket: cannot be written \(OSError: the network is down\)$"
     ):
@@ -317,20 +370,20 @@ def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp
     assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2, 3]
 
 
-def test_a_manifest_whose_answer_was_lost_is_not_taken_for_the_next(
+def test_a_commit_whose_answer_was_lost_is_not_taken_for_the_next(
     bucket: RemoteTrial, tmp_path: Path
 ) -> None:
     machine = Machine(bucket, tmp_path / "machine")
     machine.work(1)
-    Unreliable.plan += ["ok"] * 4 + ["lost"]  # two row files, the spec and a checkpoint; the manifest
+    Unreliable.plan += ["lost"]
     with pytest.raises(StorageError):
         machine.upload.push()
     assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
     machine.writer.close(TrialState.COMPLETE)
     machine.upload.finish()
     assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.COMPLETE
-    manifests = [key for key in bucket.objects.keys_in() if "/manifest-" in key]
-    assert [key.rpartition("/")[2] for key in manifests] == ["manifest-00000002.json"]
+    commits = [key for key in bucket.objects.keys_in() if "/commit-" in key]
+    assert [key.rpartition("/")[2] for key in commits] == ["commit-00000002"]
 
 
 STEPS = st.lists(

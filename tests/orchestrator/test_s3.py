@@ -10,7 +10,7 @@ import pytest
 
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import InlineExecutor
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.places import LocalSweep
 from recrl.orchestrator.remote.object_store import ObjectStore

@@ -13,7 +13,9 @@ import pytest
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import LostLeaseError, SweepBusyError
 from recrl.orchestrator.files.small_files import write_atomically
-from recrl.orchestrator.files.store import SweepStore, TrialStore, TrialWriter
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 
 SPEC = TrialSpec(

@@ -18,7 +18,9 @@ import pandas as pd
 import pytest
 
 from recrl.orchestrator.errors import TrackingError
-from recrl.orchestrator.files.store import SweepStore, TrialRecord, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.address import tracking_uri
@@ -603,7 +605,7 @@ def test_a_mirror_ends_with_its_parent_and_leaves_the_truth(write: Callable[...,
     uri = tracking_uri(store, None)
     program = (
         "import os, sys; from pathlib import Path; "
-        "from recrl.orchestrator.files.store import SweepStore; "
+        "from recrl.orchestrator.files.sweep_store import SweepStore; "
         "from recrl.orchestrator.tracking.background_sync import start_mirror; "
         "store = SweepStore(Path(sys.argv[1]), sys.argv[2]); "
         "print(start_mirror(store, sys.argv[3], interval_seconds=3600.0).process.pid, flush=True); "

@@ -18,7 +18,8 @@ import pytest
 
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
-from recrl.orchestrator.files.store import SweepStore, TrialStore
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.trial.trial import run_recorded
 from recrl.teachers.registry import TEACHERS, make_teacher
@@ -125,7 +126,7 @@ def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path
     program = (
         "import json, sys; from pathlib import Path\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
-        "from recrl.orchestrator.files.store import SweepStore\n"
+        "from recrl.orchestrator.files.sweep_store import SweepStore\n"
         "from recrl.orchestrator.trial.trial import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
         "store = SweepStore(Path(sys.argv[1]), 'sweep').trial(spec)\n"

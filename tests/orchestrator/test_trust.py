@@ -18,7 +18,7 @@ from recrl.environments.registry import find_task, task_options
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec
 from tests.faults.bad_inputs import changed
 

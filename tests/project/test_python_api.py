@@ -14,7 +14,7 @@ import recrl
 from recrl.analysis.data import export
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.store import SweepStore
+from recrl.orchestrator.files.sweep_store import SweepStore
 
 RUN = {"total_steps": 160, "deploy_fraction": 0.5, "num_envs": 4, "rollout_steps": 10}
 GRID = {

@@ -1,0 +1,353 @@
+"""The files of a sweep: the truth that everything else (status, MLflow, figures) is a view of.
+
+    <root>/<sweep>/
+        sweep.json              name, creation time, recrl's version
+        grid.yaml               the grid file as given to the last launch
+        trials.jsonl            how many trials that grid has, then a TrialSpec a line, in their order
+        lock                    held by the one process that runs the sweep
+        stop.request            there while somebody asks that process to stop
+        storage.json            of a mirror: the address of the object store that the sweep is kept in
+        figures/                what ``recrl-sweep figures`` drew
+        mlflow.db, mlartifacts/ the default MLflow store
+        mirror/                 how far MLflow has been told, for each store it was told to
+        trials/<task>__<agent>__<method>__s<seed>__<id>/
+            spec.json           the TrialSpec
+            state.json          the TrialRecord: status, progress, lease, committed lengths and digests
+            episodes.csv        a row an episode: EPISODE_COLUMNS and one cost_i, limit_i per cost
+            updates.csv         a row a policy update: UPDATE_COLUMNS and the student's own metrics
+            events.jsonl        a line an event: noise added, limits measured, phase changed
+            evaluation.csv      a row an episode of the frozen-policy evaluations: EVALUATION_COLUMNS
+            policy.csv          of finite tasks: the final policy, a row a state, action_j for each action
+            evaluations/        what ``recrl-sweep evaluate`` measured afterwards; no part of the trial
+            videos/             episodes filmed by ``recrl-sweep evaluate --video``; no part of the trial
+            checkpoints/        the newest two checkpoints
+            provenance.json     of each attempt: versions, commit, machine, digests of the code
+            log.txt, error.txt  the trial's log; the traceback of a failed trial
+            aside/              what was damaged or replaced, as it was when an attempt began
+            .reserve            room for a running trial's last words, should the disk be full
+
+Rules. Small files are written beside and renamed. Rows are appended only by ``TrialWriter.commit``, then
+synced, then a checkpoint that holds the files' lengths and digests is written, then ``state.json``: whatever
+dies between, a restart cuts the files back to the newest intact checkpoint and nothing is there twice.
+Readers look only at committed bytes, and hold them against the record's digests. A file that is shorter than
+its committed length, or whose committed bytes have changed, is damage: the trial's status is then DAMAGED,
+and nothing is made of it. What an attempt cannot use, or replaces, it moves to ``aside/``. A writer holds a
+lease (a token in ``state.json``): once another attempt has taken the trial over, its every write is refused.
+Where the disk is full or gone, a writer's methods raise StorageError, and the last commit stands.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import secrets
+import socket
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from recrl.orchestrator.errors import DamagedError, OtherFormatError, StorageError, SweepBusyError
+from recrl.orchestrator.files.aside import move_aside
+from recrl.orchestrator.files.locks import look_at_lock, open_lock
+from recrl.orchestrator.files.row_files import Extent
+from recrl.orchestrator.files.small_files import (
+    parsed_object,
+    read_sealed,
+    read_whole,
+    sealed,
+    write_atomically,
+    write_sealed,
+)
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.spec import TrialSpec
+
+SPECS_FORMAT = 2
+INFO_FORMAT = 2
+LOOK_SECONDS = 10.0  # that others may take, all together, to look whether a sweep is locked
+
+_TRIAL = re.compile(r"__[0-9a-f]{10}$")
+
+
+class SweepStore:
+    """The folder of one sweep; every path in it is a property here.
+
+    Attributes:
+        folder: ``<root>/<sweep>``.
+    """
+
+    def __init__(self, root: Path, name: str) -> None:
+        self.folder = root.absolute() / name
+        self.name = name
+
+    @property
+    def grid_path(self) -> Path:
+        """The grid file as given to the last launch."""
+        return self.folder / "grid.yaml"
+
+    @property
+    def specs_path(self) -> Path:
+        """The trials of the last launch's grid, a TrialSpec a line."""
+        return self.folder / "trials.jsonl"
+
+    @property
+    def info_path(self) -> Path:
+        """Name, creation time and version."""
+        return self.folder / "sweep.json"
+
+    @property
+    def trials_folder(self) -> Path:
+        """One folder a trial."""
+        return self.folder / "trials"
+
+    @property
+    def figures_folder(self) -> Path:
+        """What ``recrl-sweep figures`` draws."""
+        return self.folder / "figures"
+
+    @property
+    def mlflow_database(self) -> Path:
+        """The default MLflow store (sqlite)."""
+        return self.folder / "mlflow.db"
+
+    @property
+    def mlflow_artifacts(self) -> Path:
+        """The default place of MLflow's artifacts."""
+        return self.folder / "mlartifacts"
+
+    @property
+    def mirror_folder(self) -> Path:
+        """How far MLflow has been told; may be deleted at any time."""
+        return self.folder / "mirror"
+
+    @property
+    def stop_request_path(self) -> Path:
+        """Whether the process that runs the sweep is asked to stop."""
+        return self.folder / "stop.request"
+
+    @property
+    def storage_path(self) -> Path:
+        """Where the sweep is kept, if this folder only mirrors it."""
+        return self.folder / "storage.json"
+
+    def trial(self, spec: TrialSpec) -> TrialStore:
+        """The trial's folder; it need not exist yet."""
+        return self.trial_named(spec.folder_name)
+
+    def trial_named(self, folder_name: str) -> TrialStore:
+        """The trial in a folder of this name; it need not exist yet."""
+        return TrialStore(self.trials_folder / folder_name)
+
+    def info(self) -> dict[str, Any]:
+        """What ``sweep.json`` says; nothing if there was no launch.
+
+        Raises:
+            DamagedError: it is not what was written.
+        """
+        try:
+            info = read_sealed(self.info_path, version=INFO_FORMAT)
+            if info.get("name") != self.name:
+                raise DamagedError(f"{self.info_path.name} is that of another sweep, {info.get('name')}")
+            return info
+        except FileNotFoundError:
+            return {}
+        except DamagedError as error:
+            raise type(error)(f"{self.name}: {error}; launching its grid again writes it anew") from error
+
+    def write_info(self, info: Mapping[str, Any]) -> None:
+        """Say in ``sweep.json`` what the sweep is."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_sealed(self.info_path, info, version=INFO_FORMAT)
+
+    def specs(self) -> list[TrialSpec]:
+        """The trials of the last launch's grid, in their order; none if there was no launch.
+
+        Raises:
+            DamagedError: the file that lists them is not what was written.
+        """
+        try:
+            return self._listed()[1]
+        except FileNotFoundError:
+            if not self._was_launched():
+                return []
+            problem = DamagedError(f"{self.specs_path.name} is missing")
+        except DamagedError as error:
+            problem = error
+        raise type(problem)(f"{self.name}: {problem}; launching its grid again writes it anew") from problem
+
+    def write_specs(self, specs: Sequence[TrialSpec], grid_text: bytes = b"") -> None:
+        """Write the trials of a grid, and that grid's text.
+
+        Args:
+            specs: the trials, in their order.
+            grid_text: the grid file; empty if there is none.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs).encode()
+        of_lines, of_grid = Extent.of(lines).sha256, Extent.of(grid_text).sha256
+        told = {
+            "name": self.name,
+            "created": self._created(),
+            "trials": len(specs),
+            "lines": of_lines,
+            "grid": of_grid,
+        }
+        header = sealed(told, version=SPECS_FORMAT)
+        if grid_text:
+            write_atomically(self.grid_path, grid_text)
+        write_atomically(self.specs_path, (json.dumps(header) + "\n").encode() + lines)
+
+    def grid_text(self) -> tuple[str, str]:
+        """The grid file of the last launch, and a sentence on what is wrong with it; either may be empty."""
+        try:
+            data = read_whole(self.grid_path)
+        except FileNotFoundError:
+            data = b""
+        except StorageError as error:
+            return "", f"{error}; launching the grid again writes it anew"
+        try:
+            expected = self._listed()[0]
+        except (FileNotFoundError, StorageError):
+            expected = Extent.of(data).sha256  # nobody knows better
+        if Extent.of(data).sha256 != expected:
+            what = "is not what was written" if data else "is missing"
+            return "", f"{self.grid_path.name} {what}; launching the grid again writes it anew"
+        return data.decode(errors="replace"), ""
+
+    def _listed(self) -> tuple[str, list[TrialSpec]]:
+        """The digest of the grid file, and the trials, that ``trials.jsonl`` holds.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            DamagedError: it is not what was written.
+        """
+        name = self.specs_path.name
+        first, _, lines = read_whole(self.specs_path).partition(b"\n")
+        header = parsed_object(first, name)
+        found = header.get("format")
+        if found != SPECS_FORMAT:
+            raise OtherFormatError(
+                f"{name} has format {found!r}, of another version of recrl, and this one reads format "
+                f"{SPECS_FORMAT}"
+            )
+        told = {key: value for key, value in header.items() if key not in ("format", "sha256")}
+        if header != sealed(told, version=SPECS_FORMAT) or Extent.of(lines).sha256 != told["lines"]:
+            raise DamagedError(f"{name} is not what was written: its checksum differs")
+        created = self._created()
+        if told["name"] != self.name or (created and told["created"] not in (None, created)):
+            raise DamagedError(f"{name} is not of this sweep, or {self.info_path.name} is not")
+        return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
+
+    def _created(self) -> float | None:
+        """When the sweep was first launched, seconds since 1970; None if nobody knows."""
+        try:
+            return self.info().get("created")
+        except StorageError:
+            return None
+
+    def _was_launched(self) -> bool:
+        try:
+            return "launched" in self.info()
+        except StorageError:
+            return True
+
+    def damages(self) -> list[str]:
+        """A sentence for each file of the sweep itself, not of its trials, that is not what was written."""
+        found = []
+        for look in (self.info, self.specs):
+            try:
+                look()
+            except StorageError as error:
+                found.append(str(error).removeprefix(f"{self.name}: "))
+        if not self.info_path.exists() and self.specs_path.exists():
+            found.append(f"{self.info_path.name} is missing; launching the grid again writes it anew")
+        if wrong_grid := self.grid_text()[1]:
+            found.append(wrong_grid)
+        if self.trials_folder.exists() and not self.trials_folder.is_dir():
+            found.append(f"{self.trials_folder.name} is a file, it must be a folder; move it away")
+        return found
+
+    def trials(self) -> list[TrialStore]:
+        """Every trial on disk, in the order of the folders' names."""
+        if not self.trials_folder.is_dir():
+            return []
+        trials = [TrialStore(path) for path in sorted(self.trials_folder.iterdir())]
+        return [
+            trial
+            for trial in trials
+            if trial.spec_path.exists()
+            or trial.state_path.exists()
+            or (_TRIAL.search(trial.folder.name) and not trial.folder.is_dir())  # a file in its place
+        ]
+
+    def find(self, text: str) -> list[TrialStore]:
+        """The trials on disk that are called so, or else all whose name begins so.
+
+        Args:
+            text: a trial's id, title or folder, or its beginning.
+        """
+        trials = self.trials()
+        names = [(trial.trial_id, trial.title, trial.folder.name) for trial in trials]
+        called = [trial for trial, known in zip(trials, names, strict=True) if text in known]
+        begins = (any(name.startswith(text) for name in known) for known in names)
+        return called or [trial for trial, fits in zip(trials, begins, strict=True) if fits]
+
+    def is_locked(self) -> bool:
+        """Whether some process runs the sweep."""
+        try:
+            with look_at_lock(self.folder / "lock") as file:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            return False
+        return False
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the sweep, so that no second process runs it.
+
+        Raises:
+            SweepBusyError: another process holds it.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for path in (self.folder / "lock", self.info_path, self.specs_path, self.grid_path):
+            if path.is_dir():
+                move_aside(path, self.folder / "aside")
+        if self.trials_folder.exists() and not self.trials_folder.is_dir():
+            move_aside(self.trials_folder, self.folder / "aside")
+        with open_lock(self.folder / "lock") as file:
+            if not _is_taken(file):
+                file.seek(0)
+                holder = file.read().strip() or "another process"
+                raise SweepBusyError(
+                    f"{self.folder}: this sweep is already being run by {holder}; wait for it or stop it"
+                )
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            file.flush()
+            yield
+
+
+def _is_taken(file: IO[str]) -> bool:
+    """Take the exclusive lock of a file, unless somebody else holds it.
+
+    ``SweepStore.is_locked`` holds a shared one for a moment: who only looks must not keep anybody from it.
+    """
+    end = time.monotonic() + LOOK_SECONDS
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return False
+            fcntl.flock(file, fcntl.LOCK_UN)
+            if time.monotonic() > end:
+                return False
+            time.sleep((1 + secrets.randbelow(10)) / 1000.0)  # two who wait must not keep step

@@ -1,0 +1,244 @@
+"""Read a trial's spec, record and committed bytes, and find damage.
+
+A file that is shorter than its committed length, or whose committed bytes have changed, is damage: the
+trial's status is then DAMAGED, and nothing is made of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from recrl.orchestrator.errors import CheckpointError, DamagedError, OtherFormatError, StorageError
+from recrl.orchestrator.files import checkpoint
+from recrl.orchestrator.files.row_files import Extent, digest_of, shortage
+from recrl.orchestrator.files.small_files import read_sealed
+from recrl.orchestrator.files.trial_paths import TrialPaths
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.spec import TrialSpec, TrialState
+
+RECORD_FORMAT = 2
+SPEC_FORMAT = 2
+LOOKS = 3  # at files that an attempt may be changing, before they are called damaged
+
+
+class TrialReader(TrialPaths):
+    """What a trial's files say, as far as they are what was committed."""
+
+    @property
+    def title(self) -> str:
+        """What people call the trial: the spec's title, or the folder's name where that is damaged."""
+        try:
+            return self.spec.title
+        except StorageError:
+            return self.folder.name
+
+    @cached_property
+    def spec(self) -> TrialSpec:
+        """What the trial is; it must be on disk.
+
+        Raises:
+            DamagedError: the file that says it is missing, damaged or another trial's.
+        """
+        try:
+            return self._read_spec()
+        except DamagedError as error:
+            raise type(error)(f"{self.folder.name}: {error}") from error
+
+    def _read_spec(self) -> TrialSpec:
+        name = self.spec_path.name
+        try:
+            value = read_sealed(self.spec_path, version=SPEC_FORMAT)
+            spec = TrialSpec.from_json(value)
+        except FileNotFoundError as error:
+            raise DamagedError(f"{name} is missing") from error
+        except (KeyError, TypeError, ValueError) as error:
+            raise DamagedError(f"{name} describes no trial ({error})") from error
+        if spec.trial_id != self.trial_id:
+            raise DamagedError(f"{name} is that of another trial, {spec.trial_id}")
+        return spec
+
+    def record(self) -> TrialRecord:
+        """Where the trial stands now; a blank record if it was never started.
+
+        The status is DAMAGED, and ``error`` says what is wrong and what to do, where the file that says it is
+        damaged, or a committed file is shorter than it was. Digests are compared where rows are read, and by
+        ``damages``.
+        """
+        stated = TrialRecord()
+        for _ in range(LOOKS):
+            try:
+                stated, before = self._stated(), stated
+            except StorageError as error:
+                return self._damaged(TrialRecord(), error)
+            wrong = self._short(stated)
+            if wrong is None or stated == before:
+                break
+        return self._damaged(stated, wrong) if wrong else stated
+
+    def stated(self) -> TrialRecord:
+        """What ``state.json`` says, whatever the other files are; a blank record if there is none.
+
+        Raises:
+            DamagedError: it is not what was written.
+        """
+        try:
+            return self._stated()
+        except StorageError as error:
+            raise type(error)(f"{self.folder.name}: {error}") from error
+
+    def _stated(self) -> TrialRecord:
+        try:
+            value = read_sealed(self.state_path, version=RECORD_FORMAT)
+            owner = value.pop("trial_id")
+            if owner != self.trial_id:
+                raise DamagedError(f"{self.state_path.name} is that of another trial, {owner}")
+            return TrialRecord.from_json(value)
+        except FileNotFoundError as error:
+            if self.updates_path.exists() or self.episodes_path.exists() or self.checkpoints():
+                raise DamagedError(f"{self.state_path.name} is missing") from error
+            return TrialRecord()
+        except (TypeError, ValueError, KeyError) as error:
+            raise DamagedError(f"{self.state_path.name} is no record of a trial ({error})") from error
+
+    def _short(self, record: TrialRecord) -> StorageError | None:
+        """What is wrong with the lengths of the committed files, if anything is."""
+        for name, length in record.committed.items():
+            path = self.folder / name
+            if length == 0 and not path.is_dir():
+                continue
+            try:
+                found = path.stat().st_size
+            except FileNotFoundError:
+                return DamagedError(f"{name} is missing, {length:,} bytes of it are committed")
+            except OSError as error:
+                return StorageError(f"{name} cannot be read ({error.strerror})")
+            if path.is_dir():
+                return DamagedError(f"{name} is a folder, it must be a file")
+            if found < length:
+                return DamagedError(f"{name} {shortage(found, length)}")
+        return None
+
+    def _damaged(self, stated: TrialRecord, error: StorageError) -> TrialRecord:
+        """The record of a damaged trial, with a sentence that says what is wrong and what to do."""
+        claims = stated.status if stated.attempt else None
+        if isinstance(error, OtherFormatError):
+            claims = TrialState.COMPLETE  # perhaps: nobody is to run it again unasked
+        if self.is_mirror:
+            remedy = "the sweep's folder is a mirror here: delete it, and it is fetched again"
+        elif claims in (TrialState.COMPLETE, TrialState.FAILED):
+            remedy = "launch --rerun-damaged runs the trial again and moves what is damaged aside"
+        else:
+            remedy = "the next launch goes on from what is whole and moves what is damaged aside"
+        return replace(stated, status=TrialState.DAMAGED, claims=claims, error=f"{error}; {remedy}")
+
+    def damages(self) -> list[str]:
+        """A sentence for each file that is not what was committed, by lengths and digests.
+
+        Empty for a whole trial, and for one that was never started.
+        """
+        found: list[str] = []
+        stated = TrialRecord()
+        for _ in range(LOOKS):
+            try:
+                stated, before = self._stated(), stated
+            except StorageError as error:
+                return [str(error)]
+            found = list(self._wrong_files(stated))
+            if not found or stated == before:
+                break
+        return found
+
+    def _wrong_files(self, record: TrialRecord) -> Iterator[str]:
+        for name, extent in record.extents.items():
+            short = self._short(replace(record, committed={name: extent.length}))
+            digest = None if short else digest_of(self.folder / name, extent.length)
+            if short:
+                yield str(short)
+            elif digest is None or digest.hexdigest() != extent.sha256:
+                yield f"{name} is not what was committed: its checksum differs"
+        if self.spec_path.name in record.committed:
+            try:
+                self._read_spec()
+            except StorageError as error:
+                yield str(error)
+        paths = {path.name: path for path in self.checkpoints()}
+        if record.checkpoint and (record.status.is_finished or not self.is_mirror):
+            paths[record.checkpoint] = self.checkpoints_folder / record.checkpoint
+        for path in paths.values():
+            try:
+                self.load_checkpoint(path)
+            except CheckpointError as error:
+                yield str(error).removeprefix(f"{self.folder}/")
+
+    def verified_record(self) -> TrialRecord:
+        """``record``, with every file held against its digest as well."""
+        record = self.record()
+        found = self.damages() if record.status is not TrialState.DAMAGED else []
+        return self._damaged(record, DamagedError(found[0])) if found else record
+
+    def require_whole(self) -> None:
+        """Hold every file against what was committed.
+
+        Raises:
+            DamagedError: one is damaged; the sentence says which and what to do.
+        """
+        record = self.verified_record()
+        if record.status is TrialState.DAMAGED:
+            raise DamagedError(f"{self.title}: {record.error}")
+
+    def committed_bytes(self, path: Path) -> bytes:
+        """The committed bytes of one of the trial's files; none if nothing of it is committed.
+
+        Raises:
+            DamagedError: they are not what was committed.
+        """
+        stated: TrialRecord | None = None
+        for _ in range(LOOKS):
+            stated, before = self.stated(), stated
+            extent = stated.extents.get(path.name, Extent())
+            data = _head(path, extent.length)
+            if Extent.of(data) == extent:
+                return data
+            if stated == before:
+                break
+        assert stated is not None
+        wrong = self._short(stated) or DamagedError(
+            f"{path.name} is not what was committed: its checksum differs"
+        )
+        raise DamagedError(f"{self.folder.name}: {self._damaged(stated, wrong).error}")
+
+    def load_checkpoint(self, path: Path) -> dict[str, Any]:
+        """A checkpoint of this trial: ``trial``, the trial's state, and what its writer has to know.
+
+        Raises:
+            CheckpointError: it is missing, damaged, of another version, or of another trial.
+        """
+        tree = checkpoint.load(path)
+        owner = tree.get("trial_id")
+        if owner != self.trial_id:
+            raise CheckpointError(f"{path}: the checkpoint is that of another trial, {owner}")
+        return tree
+
+    def latest_checkpoint(self) -> dict[str, Any] | None:
+        """The newest intact checkpoint, or None; damaged ones are passed over."""
+        for path in self.checkpoints():
+            try:
+                return self.load_checkpoint(path)
+            except CheckpointError:
+                continue
+        return None
+
+
+def _head(path: Path, length: int) -> bytes:
+    """A file's first bytes, fewer where it has fewer."""
+    if length == 0:
+        return b""
+    try:
+        with path.open("rb") as file:
+            return file.read(length)
+    except OSError:
+        return b""

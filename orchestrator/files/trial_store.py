@@ -1,0 +1,196 @@
+"""The folder of one trial: what readers may know of it, and how an attempt takes it over.
+
+What an attempt cannot use, or replaces, it moves to ``aside/``. Where the disk is full or gone, the methods
+raise StorageError, and the last commit stands.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import secrets
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from recrl.orchestrator.errors import DamagedError, StorageError
+from recrl.orchestrator.files.aside import move_aside
+from recrl.orchestrator.files.locks import open_lock
+from recrl.orchestrator.files.row_files import Extent, digest_of
+from recrl.orchestrator.files.small_files import parsed_object, read_whole, write_sealed
+from recrl.orchestrator.files.trial_reader import RECORD_FORMAT, SPEC_FORMAT
+from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
+from recrl.orchestrator.files.trial_tables import TrialTables
+from recrl.orchestrator.files.trial_writer import TrialWriter
+from recrl.orchestrator.spec import TrialSpec, TrialState
+
+RESERVE_BYTES = 16 * 1024  # a record and a traceback
+
+logger = logging.getLogger("recrl.trial")
+
+
+class TrialStore(TrialTables):
+    """The folder of one trial: readers' methods, and those of whoever takes the trial over."""
+
+    def write_record(self, record: TrialRecord) -> None:
+        """Write ``state.json``; whoever does it holds ``locked``."""
+        value = {"trial_id": self.trial_id, **record.to_json()}
+        write_sealed(self.state_path, value, version=RECORD_FORMAT)
+
+    def begin(self, spec: TrialSpec) -> TrialWriter:
+        """Take the trial over: from now on only the returned writer may write.
+
+        What is damaged is moved to ``aside/`` first.
+
+        Args:
+            spec: the trial; must be what the folder already holds, if anything.
+
+        Raises:
+            StorageError: the disk is full or gone.
+        """
+        with self.writing():
+            self._clear_the_way()
+            self.checkpoints_folder.mkdir(parents=True, exist_ok=True)
+            return self._begin(spec)
+
+    def _begin(self, spec: TrialSpec) -> TrialWriter:
+        with self.locked():
+            self.reserve_path.unlink(missing_ok=True)  # it might be a link
+            self.reserve_path.write_bytes(secrets.token_bytes(RESERVE_BYTES))
+            old = self._salvaged()
+            if self.spec_path.name not in old.committed:
+                if self.spec_path.exists():
+                    self.move_aside(self.spec_path)
+                write_sealed(self.spec_path, spec.to_json(), version=SPEC_FORMAT)
+            extents = {**old.extents, self.spec_path.name: Extent.of(self.spec_path.read_bytes())}
+            record = replace(
+                old,
+                **as_fields(extents),
+                status=TrialState.RUNNING,
+                attempt=old.attempt + 1,
+                token=secrets.token_hex(8),
+                total_steps=spec.total_steps,
+                started_at=old.started_at or time.time(),
+                heartbeat=time.time(),
+                host=socket.gethostname(),
+                pid=os.getpid(),
+                error="",
+            )
+            self.write_record(record)
+        return TrialWriter(self, record, spec)
+
+    def _salvaged(self) -> TrialRecord:
+        """What the next attempt goes on from: the record without the files that are not what it says.
+
+        Those are moved aside, but for row files, of which a copy is: an older checkpoint may still do with
+        their beginning.
+        """
+        rows = (self.episodes_path, self.updates_path, self.events_path)
+        try:
+            old = self._stated()
+        except DamagedError as error:
+            logger.warning("%s: %s; it is moved aside", self.folder.name, error)
+            for path in (self.state_path, self.spec_path, self.evaluation_path, self.policy_path):
+                self.move_aside(path)
+            return TrialRecord(attempt=self._attempts_made())
+        whole = {}
+        for name, extent in old.extents.items():
+            digest = digest_of(self.folder / name, extent.length)
+            if digest is not None and digest.hexdigest() == extent.sha256:
+                whole[name] = extent
+                continue
+            logger.warning("%s: %s is not what was committed; it is moved aside", self.folder.name, name)
+            self.move_aside(self.folder / name, copy=self.folder / name in rows)
+        return replace(old, **as_fields(whole))
+
+    def _attempts_made(self) -> int:
+        """How many attempts there were, where the record that counted them is lost."""
+        try:
+            return len(parsed_object(read_whole(self.provenance_path), "")["attempts"])
+        except (OSError, StorageError, KeyError, TypeError):
+            return 0
+
+    def _clear_the_way(self) -> None:
+        """Move aside what is a file where a folder must be, or the other way round."""
+        if self.folder.exists() and not self.folder.is_dir():
+            move_aside(self.folder, self.folder.parent.parent / "aside")
+        if self.aside_folder.exists() and not self.aside_folder.is_dir():
+            self.aside_folder.rename(self.folder / f"aside-{secrets.token_hex(4)}")
+        for path in (self.checkpoints_folder, self.evaluations_folder, self.videos_folder):
+            if path.exists() and not path.is_dir():
+                self.move_aside(path)
+        for path in self.folder.glob("*"):
+            if path.is_dir() and path.suffix:  # the trial's own folders have none
+                self.move_aside(path)
+        for path in (self.folder / ".lock", self.reserve_path):
+            if path.is_dir():
+                self.move_aside(path)
+
+    def move_aside(self, path: Path, *, copy: bool = False) -> None:
+        """Keep a file of the trial, or what is in its place, in ``aside/``; nothing if it is not there."""
+        move_aside(path, self.aside_folder, copy=copy)
+
+    def set_all_aside(self) -> None:
+        """Move everything that attempts have left aside: the next one begins at the beginning.
+
+        Raises:
+            StorageError: the disk is full or gone.
+        """
+        with self.writing():
+            self._clear_the_way()
+            if not self.folder.is_dir():
+                return
+            with self.locked():
+                kept = {self.aside_folder, self.evaluations_folder, self.videos_folder, self.folder / ".lock"}
+                number = 1 + len(list(self.aside_folder.glob("run-*")))
+                place = self.aside_folder / f"run-{number:03d}"
+                place.mkdir(parents=True)
+                for path in sorted(set(self.folder.iterdir()) - kept):
+                    path.rename(place / path.name)
+
+    def set_status(self, status: TrialState, *, error: str = "") -> None:
+        """Say from outside where the trial stands, for a trial that can no longer say it itself.
+
+        Revokes the lease of whoever still writes.
+
+        Raises:
+            StorageError: the disk is full or gone.
+        """
+        with self.writing():
+            self._clear_the_way()
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.reserve_path.unlink(missing_ok=True)
+            self._set_status(status, error)
+
+    def _set_status(self, status: TrialState, error: str) -> None:
+        with self.locked():
+            try:
+                stated = self._stated()
+            except DamagedError:
+                self.move_aside(self.state_path)
+                stated = TrialRecord(attempt=self._attempts_made())
+            self.write_record(replace(stated, status=status, error=error, token=""))
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Turn what a full or lost disk raises into a StorageError that says how to go on."""
+        try:
+            yield
+        except OSError as error:
+            update = self.saved_update
+            saved = f"it goes on from update {update}" if update else "it starts anew"
+            raise StorageError(
+                f"{self.folder.name}: its files cannot be written ({error.strerror or error}); "
+                f"{saved} when there is room and the sweep is launched again"
+            ) from error
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Exclude other writers of this trial on the same file system, for a moment."""
+        with open_lock(self.folder / ".lock") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield

@@ -1,0 +1,253 @@
+"""The one writer of a trial: it holds the lease, and commits rows together with a checkpoint.
+
+Rows are appended only by ``TrialWriter.commit``, then synced, then a checkpoint that holds the files' lengths
+and digests is written, then ``state.json``: whatever dies between, a restart cuts the files back to the
+newest intact checkpoint and nothing is there twice. A lease is a token in ``state.json``: once another
+attempt has taken the trial over, this one's every write is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import operator
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from recrl.environments.cmdp import EpisodeStats
+from recrl.orchestrator.errors import CheckpointError, LostLeaseError, RowError
+from recrl.orchestrator.files import checkpoint
+from recrl.orchestrator.files.row_files import Extent, RowFile, rows_text
+from recrl.orchestrator.files.small_files import write_atomically, write_sealed
+from recrl.orchestrator.files.trial_paths import PROVENANCE
+from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
+from recrl.orchestrator.files.trial_tables import EPISODE_COLUMNS
+from recrl.orchestrator.spec import TrialSpec, TrialState
+
+if TYPE_CHECKING:
+    from recrl.orchestrator.files.trial_store import TrialStore
+
+KEPT_CHECKPOINTS = 2
+PROVENANCE_FORMAT = 2
+
+_episode_values = operator.attrgetter(*EPISODE_COLUMNS)
+
+logger = logging.getLogger("recrl.trial")
+
+
+class TrialWriter:
+    """The lease on a trial: buffers its rows and commits them together with a checkpoint.
+
+    Attributes:
+        store: the trial's folder.
+        record: the last record this writer wrote.
+    """
+
+    def __init__(self, store: TrialStore, record: TrialRecord, spec: TrialSpec) -> None:
+        self.store = store
+        self.record = record
+        self._agent = f"agent {spec.agent.label}"
+        self._task = f"task {spec.task.label}"
+        self._episodes = RowFile(store.episodes_path)
+        self._updates = RowFile(store.updates_path)
+        self._events = RowFile(store.events_path)
+        self._rows = (self._episodes, self._updates, self._events)
+        names = (store.spec_path.name, PROVENANCE)  # the rest is written anew, or taken up by ``restore``
+        self._whole = {name: extent for name, extent in record.extents.items() if name in names}
+        self._cpu_origin = time.process_time()
+        self._cpu_before = record.cpu_seconds
+
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU time of all attempts of this trial so far."""
+        return self._cpu_before + time.process_time() - self._cpu_origin
+
+    def restore(self) -> dict[str, Any] | None:
+        """The newest usable checkpoint, with the row files cut back to it; None to start afresh.
+
+        A checkpoint is usable if it is intact, of this trial, and the rows that it says are there are. One
+        that is not is renamed ``*.damaged`` and the one before it is used.
+        """
+        with self._lease():
+            tree = self._newest_usable()
+            if tree is None:
+                for file in self._rows:
+                    file.take_up(Extent())
+            for file in self._rows:
+                if self.record.committed.get(file.path.name, 0) > file.length:
+                    self.store.move_aside(file.path, copy=True)
+            self._cpu_before = float(tree["cpu_seconds"]) if tree else 0.0
+            self._cpu_origin = time.process_time()
+            self._write_record(
+                **as_fields(self._extents())
+            )  # before the cut: nobody is to see files too short
+            for file in self._rows:
+                if file.path.exists():
+                    os.truncate(file.path, file.length)
+        return tree["trial"] if tree else None
+
+    def _newest_usable(self) -> dict[str, Any] | None:
+        """The newest usable checkpoint; all that are not are renamed."""
+        found: dict[str, Any] | None = None
+        for path in self.store.checkpoints():
+            try:
+                tree = self.store.load_checkpoint(path)
+            except CheckpointError as error:
+                logger.warning("%s; it is renamed", error)
+            else:
+                if found is not None:
+                    continue
+                if all(file.take_up(_extent_in(tree, file.path.name)) for file in self._rows):
+                    found = tree
+                    continue
+                logger.warning("%s: its rows are not there any more; it is renamed", path)
+            damaged = path.with_suffix(".damaged")
+            if os.path.lexists(damaged):
+                self.store.move_aside(damaged)
+            path.rename(damaged)
+        return found
+
+    def append_episode(self, episode: EpisodeStats) -> None:
+        """Add an episode's row to the next commit.
+
+        Raises:
+            RowError: it has another number of costs than those before.
+        """
+        costs, limits = len(episode.costs), len(episode.limits)
+        if not self._episodes.has_header:
+            names = (f"cost_{i}" for i in range(costs)), (f"limit_{i}" for i in range(limits))
+            self._episodes.columns = (*EPISODE_COLUMNS, *names[0], *names[1])
+            self._episodes.add_text(",".join(self._episodes.columns) + "\n")
+        if len(EPISODE_COLUMNS) + costs + limits != len(self._episodes.columns) or costs != limits:
+            raise RowError(
+                f"{self._task}: an episode has {costs} costs and {limits} limits, those before it had "
+                f"{len(self._episodes.columns) - len(EPISODE_COLUMNS)} together"
+            )
+        cells = (*_episode_values(episode), *episode.costs, *episode.limits.values)
+        self._episodes.add_text(",".join(map(str, cells)) + "\n")
+
+    def append_update(self, row: Mapping[str, Any]) -> None:
+        """Add an update's row to the next commit; every row of a trial has the same keys, in any order.
+
+        Raises:
+            RowError: it has not; the sentence names the agent.
+        """
+        self._updates.add_row(row, of=self._agent)
+
+    def append_event(self, event: Mapping[str, Any]) -> None:
+        """Add an event's line to the next commit."""
+        self._events.add_text(json.dumps(event) + "\n")
+
+    def write_evaluation(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write the frozen-policy evaluations, whole; at least one row, all with the same keys."""
+        self._write_csv(self.store.evaluation_path, rows)
+
+    def write_policy(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write the final policy's table, whole: a row a state, at least one, all with the same keys."""
+        self._write_csv(self.store.policy_path, rows)
+
+    def add_provenance(self, provenance: Mapping[str, Any]) -> None:
+        """Say where this attempt comes from, behind what the attempts before it said."""
+        with self._lease():
+            before = self.store.provenance() if PROVENANCE in self._whole else []
+            if PROVENANCE not in self._whole:
+                self.store.move_aside(self.store.provenance_path)
+            attempts = [*before, {"attempt": self.record.attempt, **provenance}]
+            write_sealed(self.store.provenance_path, {"attempts": attempts}, version=PROVENANCE_FORMAT)
+            self._whole[PROVENANCE] = Extent.of(self.store.provenance_path.read_bytes())
+            committed = {**self.record.extents, PROVENANCE: self._whole[PROVENANCE]}
+            self._write_record(**as_fields(committed))
+
+    def commit(self, tree: dict[str, Any], *, update: int, env_steps: int, **changes: Any) -> None:
+        """Make everything appended so far, and the trial's state, safe.
+
+        Args:
+            tree: the trial's whole state after ``update``.
+            update: policy updates done.
+            env_steps: environment steps taken.
+            changes: further fields of the TrialRecord to set.
+
+        Raises:
+            LostLeaseError: another attempt runs the trial now; nothing was written.
+            StorageError: the disk is full or gone, or a file was cut meanwhile; the previous commit stands.
+        """
+        with self._lease():
+            written = [file.write() for file in self._rows]
+            extents = {
+                file.path.name: Extent(length, digest.hexdigest())
+                for file, (length, digest) in zip(self._rows, written, strict=True)
+            }
+            cpu_seconds = self.cpu_seconds
+            data = checkpoint.encode(
+                {
+                    "trial_id": self.store.trial_id,
+                    "trial": tree,
+                    "files": {name: extent.length for name, extent in extents.items()},
+                    "digests": {name: extent.sha256 for name, extent in extents.items()},
+                    "cpu_seconds": cpu_seconds,
+                }
+            )
+            name = f"checkpoint-{update:08d}.recrl"
+            write_atomically(self.store.checkpoints_folder / name, data)
+            self._write_record(
+                **as_fields({**self._whole, **extents}),
+                checkpoint=name,
+                update=update,
+                env_steps=env_steps,
+                cpu_seconds=cpu_seconds,
+                **changes,
+            )
+            for file, done in zip(self._rows, written, strict=True):
+                file.settle(done)
+            for old in self.store.checkpoints()[KEPT_CHECKPOINTS:]:
+                old.unlink()
+
+    def heartbeat(self, *, update: int, env_steps: int, steps_per_second: float) -> None:
+        """Say that the trial lives and how far it is; commits nothing.
+
+        Raises:
+            LostLeaseError: another attempt runs the trial now.
+        """
+        with self._lease():
+            self._write_record(update=update, env_steps=env_steps, steps_per_second=steps_per_second)
+
+    def close(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
+        """End this attempt: complete, failed with an error, or waiting to be resumed."""
+        with self._lease():
+            self.store.reserve_path.unlink(missing_ok=True)
+            if traceback:
+                write_atomically(self.store.error_path, traceback.encode())
+            self._write_record(status=status, error=error, steps_per_second=0.0)
+
+    @contextmanager
+    def _lease(self) -> Iterator[None]:
+        with self.store.writing(), self.store.locked():
+            if self.store.stated().token != self.record.token:
+                raise LostLeaseError(f"{self.store.folder.name}: another attempt runs this trial now")
+            yield
+
+    def _extents(self) -> dict[str, Extent]:
+        """What is committed of every file."""
+        return {**self._whole, **{file.path.name: file.extent for file in self._rows}}
+
+    def _write_record(self, **changes: Any) -> None:
+        self.record = replace(self.record, heartbeat=time.time(), **changes)
+        self.store.write_record(self.record)
+
+    def _write_csv(self, path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+        with self._lease():
+            text = rows_text(rows)
+            if path.exists() and path.read_bytes() != text:
+                self.store.move_aside(path)
+            write_atomically(path, text)
+            self._whole[path.name] = Extent.of(text)
+
+
+def _extent_in(tree: Mapping[str, Any], name: str) -> Extent:
+    """What a checkpoint says is committed of a row file."""
+    return Extent(int(tree["files"].get(name, 0)), tree["digests"].get(name, Extent().sha256))

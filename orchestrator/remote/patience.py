@@ -1,0 +1,44 @@
+"""Wait for an object store that is down."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from recrl.orchestrator.errors import StorageError
+
+FIRST_PAUSE_SECONDS = 1.0  # before what failed is tried again; doubled each time
+LONGEST_PAUSE_SECONDS = 60.0
+PATIENCE_SECONDS = 900.0  # for a store that is down when a trial begins or has ended
+STOPPING_SECONDS = 60.0  # the same, once the sweep is to stop
+
+logger = logging.getLogger("recrl.trial")
+
+
+def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
+    """Do what needs the store, again and again while that is down, with growing pauses.
+
+    Args:
+        act: what to do; may be done more than once.
+        should_stop: once true, for ``STOPPING_SECONDS`` more.
+
+    Raises:
+        StorageError: it was down for ``PATIENCE_SECONDS``.
+    """
+    began = time.monotonic()
+    pause, stopping_since = FIRST_PAUSE_SECONDS, float("inf")
+    while True:
+        try:
+            return act()
+        except StorageError as error:
+            now = time.monotonic()
+            if should_stop():
+                stopping_since = min(stopping_since, now)
+            left = min(began + PATIENCE_SECONDS, stopping_since + STOPPING_SECONDS) - now
+            if left <= 0.0:
+                raise
+            if pause == FIRST_PAUSE_SECONDS:
+                logger.warning("%s; it is tried again for %.0f minutes", error, left / 60.0)
+            time.sleep(min(pause, left))
+            pause = min(2.0 * pause, LONGEST_PAUSE_SECONDS)

@@ -1,0 +1,250 @@
+"""Send the commits of an attempt at a trial to the object store in which the trial is kept."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from recrl.orchestrator.background import beside
+from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError
+from recrl.orchestrator.files.row_files import Extent
+from recrl.orchestrator.files.scratch import scratch_folder
+from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.remote import patience
+from recrl.orchestrator.remote.commit import APPENDED, WHOLE, Commit, Piece, pack
+from recrl.orchestrator.remote.patience import patiently
+from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial, attempt_of, attempts_in, size_of
+from recrl.orchestrator.spec import TrialSpec, TrialState
+
+LOOK_SECONDS = 0.5  # between two looks at the trial's folder
+ALIVE_SECONDS = 15.0  # between two signs of life
+KEPT_COMMITS = 2  # a reader may still be at the one before the last
+
+ROWS = ("episodes.csv", "updates.csv", "events.jsonl")
+
+logger = logging.getLogger("recrl.trial")
+
+
+class Upload:
+    """An attempt's way from the folder in which it works to the store."""
+
+    def __init__(self, remote: RemoteTrial, trial: TrialStore) -> None:
+        """Begin with whatever attempt takes the trial next (``TrialStore.begin``).
+
+        Args:
+            remote: where to.
+            trial: where from; as ``RemoteTrial.take_up`` left it.
+        """
+        self._remote = remote
+        self._trial = trial
+        self._before = trial.stated().token
+        self._commits: list[tuple[str, Commit]] = []
+        self._written: set[str] = set()
+        self._number = 0
+        self._shown: tuple[Any, ...] | None = None
+        self._spoke_at = float("-inf")
+
+    def follow(self) -> None:
+        """Send what is new, if anything is, and now and then a sign of life.
+
+        Raises:
+            StorageError: the store cannot be written; nothing is lost, the next call tries again.
+            LostLeaseError: a newer attempt runs the trial.
+        """
+        record = self._trial.stated()
+        if not record.token or record.token == self._before:
+            return
+        if self._shown is None or time.monotonic() >= self._spoke_at + ALIVE_SECONDS:
+            self._speak(record)
+        if self._shown != _commit_of(record):
+            self.push()
+
+    def finish(self) -> None:
+        """Send the rest, after the attempt's end.
+
+        Raises:
+            StorageError: the store cannot be written; nothing is lost, the next call tries again.
+            LostLeaseError: a newer attempt runs the trial.
+        """
+        record = self._trial.stated()
+        if not record.token or record.token == self._before:
+            return
+        self._speak(replace(record, heartbeat=time.time()))  # to send much takes long
+        self.push()
+        self._remote.objects.delete([f"{attempt_of(record)}/{ALIVE}"])
+
+    def push(self) -> None:
+        """Send a commit: a set of files as of this moment.
+
+        Raises:
+            StorageError: the store cannot be written; the commit before stands.
+            LostLeaseError: a newer attempt runs the trial.
+        """
+        record, kept, new = self._capture()
+        attempt = attempt_of(record)
+        others = self._other_attempts(attempt)
+        self._number += 1  # also if this fails: a reader may have it, and looks at no name a second time
+        name = f"commit-{self._number:08d}"
+        commit, data = pack(name, record, kept, new)
+        self._written.add(name)
+        self._remote.objects.write(f"{attempt}/{name}", data)
+        self._shown = _commit_of(record)
+        self._commits = [*self._commits, (name, commit)][-KEPT_COMMITS:]
+        self._clear(attempt, others)
+
+    def revoke(self) -> None:
+        """Take the trial's lease back, so that its attempt ends."""
+        self._trial.set_status(TrialState.WAITING)
+
+    def _speak(self, record: TrialRecord) -> None:
+        """Claim the trial, and say that it lives. That it is over only a commit may say."""
+        said = replace(record, status=TrialState.RUNNING)
+        self._remote.objects.write(f"{attempt_of(record)}/{ALIVE}", _json(said.to_json()))
+        self._spoke_at = time.monotonic()
+
+    def _capture(self) -> tuple[TrialRecord, dict[str, tuple[Piece, ...]], dict[str, tuple[int, bytes]]]:
+        """Return the record, the pieces that were sent before, and what is new, while nobody commits.
+
+        The rows are those of the newest checkpoint: of a commit that a full disk broke off, the record may
+        not know yet.
+        """
+        with self._trial.locked():
+            record = self._trial.stated()
+            saved, rows = _newest_checkpoint(self._trial)
+            extents = {**record.extents, **dict.fromkeys(ROWS, Extent()), **rows}
+            committed = {name: extent.length for name, extent in extents.items()}
+            lengths = {**committed, "log.txt": size_of(self._trial, "log.txt")}
+            kept: dict[str, tuple[Piece, ...]] = {}
+            new: dict[str, tuple[int, bytes]] = {}
+            for name in APPENDED:
+                if (self._trial.folder / name).exists():
+                    kept[name], start = self._kept(name, lengths.get(name, 0))
+                    self._take(name, start, lengths.get(name, 0), new)
+            for name in (*WHOLE, *saved):
+                if (self._trial.folder / name).exists():
+                    kept[name] = ()
+                    self._take(name, 0, size_of(self._trial, name), new)
+        digests = {name: extent.sha256 for name, extent in extents.items()}
+        return replace(record, committed=committed, digests=digests), kept, new
+
+    def _take(self, name: str, start: int, end: int, new: dict[str, tuple[int, bytes]]) -> None:
+        if end > start:
+            with (self._trial.folder / name).open("rb") as file:
+                file.seek(start)
+                new[name] = (start, file.read(end - start))
+
+    def _kept(self, name: str, length: int) -> tuple[tuple[Piece, ...], int]:
+        """Return the pieces of a row file that are not sent again, and where what is sent begins.
+
+        A new piece takes in those before it that are no longer than it: n commits leave about log2(n)
+        pieces, and each byte is sent about log2(n) times at most.
+        """
+        pieces = list(self._commits[-1][1].files.get(name, ())) if self._commits else []
+        if pieces and pieces[-1].end > length:  # cut back: not what was sent
+            pieces.clear()
+        start = pieces[-1].end if pieces else 0
+        if start < length:
+            while pieces and pieces[-1].length <= length - start:
+                start = pieces.pop().start
+        return tuple(pieces), start
+
+    def _other_attempts(self, attempt: str) -> list[str]:
+        """Return the keys of the attempts before this one."""
+        others = attempts_in(self._remote.objects.keys_in())
+        if max(others, default="") > attempt:
+            raise LostLeaseError(f"{self._remote.name}: another attempt runs this trial now")
+        return [f"{other}/{name}" for other, names in others.items() if other != attempt for name in names]
+
+    def _clear(self, attempt: str, others: Sequence[str]) -> None:
+        """Delete what none of the last commits needs, and the attempts before this one."""
+        spare = self._written.difference(*({name, *commit.objects} for name, commit in self._commits))
+        self._remote.objects.delete([*(f"{attempt}/{name}" for name in sorted(spare, reverse=True)), *others])
+        self._written -= spare
+
+
+@contextmanager
+def working_copy(
+    remote: RemoteTrial, spec: TrialSpec, should_stop: Callable[[], bool]
+) -> Iterator[TrialStore]:
+    """A folder on this machine for one attempt at a trial that is kept in an object store.
+
+    It holds what the attempts before left. What the body commits there is sent meanwhile, what is left at the
+    end: this returns when all of it is there.
+
+    Args:
+        remote: where the trial is kept.
+        spec: the trial.
+        should_stop: once true, a store that is down is waited for no longer than ``STOPPING_SECONDS``.
+
+    Raises:
+        StorageError: the store is down, and was for ``PATIENCE_SECONDS``; its last commit stands.
+    """
+    with scratch_folder(tempfile.gettempdir()) as folder:
+        trial = TrialStore(folder / spec.folder_name)
+        patiently(lambda: remote.take_up(trial), should_stop)
+        upload = Upload(remote, trial)
+        try:
+            with beside(partial(_follow, upload), name="upload"):
+                yield trial
+        except Exception:  # but not a KeyboardInterrupt: that means at once
+            _finish(upload, should_stop)
+            raise
+        _finish(upload, should_stop)
+
+
+def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:
+    """Send what is left, unless a newer attempt has made it worthless."""
+    try:
+        patiently(upload.finish, should_stop)
+    except LostLeaseError as error:
+        logger.warning("%s", error)
+
+
+def _follow(upload: Upload, over: threading.Event) -> None:
+    """Send what is committed, until it is over."""
+    pause = LOOK_SECONDS
+    while not over.wait(pause):
+        try:
+            upload.follow()
+        except LostLeaseError as error:
+            logger.warning("%s", error)
+            upload.revoke()
+            return
+        except (StorageError, OSError) as error:
+            if pause == LOOK_SECONDS:
+                logger.warning("%s; the trial goes on, this is tried again", error)
+            pause = min(2.0 * max(pause, patience.FIRST_PAUSE_SECONDS / 2.0), patience.LONGEST_PAUSE_SECONDS)
+        else:
+            if pause > LOOK_SECONDS:
+                logger.info("the storage takes everything again")
+            pause = LOOK_SECONDS
+
+
+def _commit_of(record: TrialRecord) -> tuple[Any, ...]:
+    """What differs between two records only if there was a commit, a beginning or an end between them."""
+    return (record.token, record.status, record.error, record.cpu_seconds, *sorted(record.committed.items()))
+
+
+def _newest_checkpoint(trial: TrialStore) -> tuple[list[str], dict[str, Extent]]:
+    """The newest intact checkpoint, as a path in the trial's folder, if there is one; what rows it has."""
+    for path in trial.checkpoints():
+        try:
+            tree = trial.load_checkpoint(path)
+            rows = {name: Extent(length, tree["digests"][name]) for name, length in tree["files"].items()}
+            return [f"checkpoints/{path.name}"], rows
+        except CheckpointError:
+            continue
+    return [], {}
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, allow_nan=False).encode()
