@@ -26,7 +26,7 @@ from recrl.agents import presets
 from recrl.agents.registry import AGENTS
 from recrl.environments.plugins import load_attribute
 from recrl.environments.registry import TASKS
-from recrl.orchestrator.cli.main import parser
+from recrl.orchestrator.cli.arguments import parser
 from recrl.orchestrator.grid.file_models import Entry, Exclusion, GridFile, Resources, Run, TaskEntry
 from recrl.teachers.registry import TEACHERS
 
