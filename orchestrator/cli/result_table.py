@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
 
-import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report_tables import number, with_error
-from recrl.analysis.statistics.metrics import Measure, outcomes
+from recrl.analysis.report_verdicts import verdict_text
+from recrl.analysis.statistics.metrics import outcomes
+from recrl.analysis.statistics.verdicts import verdicts
 
 CAPTION = (
-    "Final policies (stochastic), evaluated without learning: means over n seeds, with standard errors.\n"
-    "Feasible: seeds whose mean cost keeps the deployment limit."
+    "Final policies (stochastic), evaluated without learning: means over n seeds, returns ± standard error.\n"
+    "Verdicts as in the report: solved, feasible, or infeasible by how much."
 )
 
 
@@ -27,24 +27,15 @@ def result_table(sweep: Sweep) -> pd.DataFrame:
     """
     if sweep.evaluations.empty:
         return pd.DataFrame()
-    rows = outcomes(sweep)
-    rows = rows[rows["measure"] == Measure.STOCHASTIC.value]
-    groups = rows.groupby(list(GROUP), observed=True, sort=False)
-    return pd.DataFrame([_line(group, seeds, sweep.num_costs) for group, seeds in groups])
+    rows = verdicts(outcomes(sweep), pd.DataFrame())
+    return pd.DataFrame([_line(row, sweep.num_costs) for _, row in rows.iterrows()])
 
 
-def _line(group: tuple[Hashable, ...], seeds: pd.DataFrame, num_costs: int) -> dict[str, str]:
-    line = dict(zip(GROUP, map(str, group), strict=True)) | {"n": str(len(seeds))}
-    line["return"] = _mean_text(seeds["episode_return"])
+def _line(row: pd.Series, num_costs: int) -> dict[str, str]:
+    line = {name: str(row[name]) for name in GROUP} | {"n": str(row["seeds"])}
+    line["return"] = with_error(row["episode_return"], row["episode_return_se"])
     for i in range(num_costs):
         which = "" if num_costs == 1 else f" {i + 1}"
-        line[f"cost{which}"] = _mean_text(seeds[f"cost_{i}"])
-        line[f"limit{which}"] = number(float(seeds[f"deploy_limit_{i}"].iloc[0]))
-    line["feasible"] = f"{int(seeds['feasible'].sum())} of {len(seeds)}"
-    return line
-
-
-def _mean_text(values: pd.Series[float]) -> str:
-    numbers = values.to_numpy(np.float64)
-    error = numbers.std(ddof=1) / math.sqrt(len(numbers)) if len(numbers) > 1 else math.nan
-    return with_error(float(numbers.mean()), float(error))
+        line[f"cost{which}"] = with_error(row[f"cost_{i}"], math.nan, digits=3)
+        line[f"limit{which}"] = number(row[f"deploy_limit_{i}"])
+    return line | {"verdict": verdict_text(row)}
