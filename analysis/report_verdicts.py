@@ -78,6 +78,7 @@ def verdict_text(row: pd.Series) -> str:
     >>> verdict_text(pd.Series(counts | {"solved": 0, "feasible": 0, "infeasible": 1, "seeds": 1}))
     'infeasible by 0.40 (8%)'
     """
+    seeds = int(row["seeds"])
     share = "" if math.isnan(row["worst_share"]) else f" ({row['worst_share']:.0%})"
     excess = f"{number(row['worst_excess'])}{share}"
     counts = {
@@ -85,12 +86,12 @@ def verdict_text(row: pd.Series) -> str:
         FEASIBLE: int(row["feasible"] - row["solved"]),
         INFEASIBLE: int(row["infeasible"]),
     }
-    if counts[INFEASIBLE] == row["seeds"]:
+    if counts[INFEASIBLE] == seeds:
         return f"infeasible by {'' if row['seeds'] == 1 else 'up to '}{excess}"
-    if row["seeds"] in (counts[SOLVED], counts[FEASIBLE]):
+    if seeds in (counts[SOLVED], counts[FEASIBLE]):
         return SOLVED if counts[SOLVED] else FEASIBLE
     names = {FEASIBLE: "feasible, not solved" if counts[SOLVED] else FEASIBLE}
-    texts = [f"{names.get(kind, kind)} {count} of {row['seeds']}" for kind, count in counts.items() if count]
+    texts = [f"{names.get(kind, kind)} {count} of {seeds}" for kind, count in counts.items() if count]
     return "; ".join(texts) + (f", by up to {excess}" if counts[INFEASIBLE] else "")
 
 

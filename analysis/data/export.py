@@ -7,7 +7,7 @@ A zip archive of plain text, so that any tool can open it:
     position of the
                        trial in sweep.json
 
-Left out are single episodes (``phases`` has their sums), timing, and the students' metrics that no figure
+Left out are single episodes (``phases`` has their sums), timing, and the agents' metrics that no figure
 reads. What was measured at single updates, and the policies' tables, are rounded to DIGITS significant
 digits; outcomes (phases, evaluations) are exact. Equal sweeps give equal bytes.
 """

@@ -16,7 +16,7 @@ task lacks are NaN. All returns and costs are undiscounted sums over an episode.
                  cost_i_std (over episodes, NaN for one), cost_i_total, excess_i_total: the sum of
                  max(0, C_i - d_d,i), what went over the deployment limit
     updates      a row a policy update: KEY, store.UPDATE_COLUMNS, cost_i, limit_i (in force when the
-                 batch was collected), then the students' own metrics
+                 batch was collected), then the agents' own metrics
     evaluations  a row an episode of the frozen policy: KEY, store.EVALUATION_COLUMNS, cost_i
     events       a row an event: KEY, update, end_step, event
     policies     a row a state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
@@ -78,7 +78,7 @@ ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the frames 
 
 # Notes of ``assemble`` say one of these.
 
-# The students' metrics that figures and tables read; MLflow and the compact file give no others.
+# The agents' metrics that figures and tables read; MLflow and the compact file give no others.
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
 
 
@@ -176,7 +176,7 @@ class Sweep:
 
     @cached_property
     def agent_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """The options of every student, by its label."""
+        """The options of every agent, by its label."""
         return {it.spec.agent.label: it.spec.agent.options for it in self.facts}
 
     def rows(self, name: str) -> pd.DataFrame:

@@ -37,11 +37,11 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
 
     Args:
         sweep: the frames.
-        agent: the student's label.
+        agent: the agent's label.
         cost: i, which cost.
 
     Returns:
-        Every run thin, the mean over runs thick; or None if no trial of the student has finished its
+        Every run thin, the mean over runs thick; or None if no trial of the agent has finished its
         training phase.
     """
     trials = sweep.trials[
@@ -107,7 +107,7 @@ def _sums(series: list[pd.DataFrame], name: str) -> Floats:
 
 
 def _legend(figure: Figure, agent: str, drawn: set[str]) -> None:
-    """What is drawn: students but CPO have no bounds, unknown tasks no ceiling."""
+    """What is drawn: agents but CPO have no bounds, unknown tasks no ceiling."""
     handles = [Line2D([], [], color="0.2", linewidth=1.5, label="measured cost, undiscounted")]
     handles += [
         Line2D([], [], color=colour, linestyle=dashes, linewidth=0.9, label=name)

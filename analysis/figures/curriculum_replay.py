@@ -1,6 +1,6 @@
 """What limits a teacher would have set on recorded runs, beside those that were in force.
 
-A row a task and student, a column a method of the sweep; a line a run. Limits that are infinite are left out.
+A row a task and agent, a column a method of the sweep; a line a run. Limits that are infinite are left out.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def replayed_limits(runs: Sequence[Replayed], teacher: str, *, cost: int = 0) ->
             Line2D(
                 [], [], color=REPLAYED_COLOUR, linewidth=1.1, linestyle=DASHED, label=f"{teacher}'s limit"
             ),
-            Line2D([], [], color=COST_COLOUR, linewidth=1.1, label="the student's own cost"),
+            Line2D([], [], color=COST_COLOUR, linewidth=1.1, label="the agent's own cost"),
         ]
         title = f"limits that {teacher} would have set on the recorded episodes, a line a run"
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), title=title)

@@ -1,7 +1,7 @@
-"""What a curriculum did to its student: limit, cost, multiplier and step size on one axis, for each method.
+"""What a curriculum did to its agent: limit, cost, multiplier and step size on one axis, for each method.
 
-A figure a task and student; a column a method. From above: the student's own cost under the limit in force;
-the mean multipliers (where the student has them); what the critics of the reward and of the cost explain of
+A figure a task and agent; a column a method. From above: the agent's own cost under the limit in force;
+the mean multipliers (where the agent has them); what the critics of the reward and of the cost explain of
 the variance of fresh returns; the mean KL divergence of its updates. Ticks below the costs mark where noise
 was added to some run's policy; ticks below the KL divergence mark CPO's recovery steps, in which it only
 lowers the cost.
@@ -36,9 +36,9 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     """Limit, cost, multiplier, KL divergence and events of every method.
 
     Args:
-        sweep: with at least one update of this task and student.
+        sweep: with at least one update of this task and agent.
         task: its label.
-        agent: the student's label.
+        agent: the agent's label.
         cost: i, which cost and limit to show.
 
     Returns:

@@ -1,6 +1,6 @@
 """The paper's figures, from a sweep's frames: functions that return a matplotlib Figure.
 
-``learning_curves`` is Figures 3 and 4 (one a student): return and cost over training, and magnified over
+``learning_curves`` is Figures 3 and 4 (one an agent): return and cost over training, and magnified over
 deployment. ``curricula`` is Figure 5: the limits in force. Trials are averaged on a common grid of
 environment steps (``curves.step_grid``), about 100 bins over a whole trial and 25 over its deployment.
 
@@ -37,7 +37,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) ->
     """The paper's Figures 3 and 4: a row a task, return and cost over training and over deployment.
 
     Args:
-        sweep: with at least one update of this student.
+        sweep: with at least one update of this agent.
         agent: its label.
         averaging: what lines and bands are; means and standard errors as in the paper by default.
     """
@@ -75,9 +75,9 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) ->
 
 
 def curricula(sweep: Sweep) -> Figure:
-    """The paper's Figure 5: the cost limits in force; a row a task and cost, a column a student.
+    """The paper's Figure 5: the cost limits in force; a row a task and cost, a column an agent.
 
-    Every run is a thin line, the mean over seeds a thick one; the student's own cost, a mean over seeds too,
+    Every run is a thin line, the mean over seeds a thick one; the agent's own cost, a mean over seeds too,
     is a faint line. Infinite limits, which no axis reaches, are drawn along the upper edge and marked with
     the sign of infinity, unless they only last as long as the measuring of d_t.
 

@@ -2,7 +2,7 @@
 
 A row a task, a column a method. Each map is the mean over the method's runs: a square's shade is the
 expected number of steps that an episode spends on it; an arrow leaves a square in the direction of the
-student's heading, as long as the policy is likely to go forward from there, and as dark as it is likely to be
+agent's heading, as long as the policy is likely to go forward from there, and as dark as it is likely to be
 seen there at all. Where a policy would rather turn, there is a dot. Nothing is sampled: visits, returns and
 costs are computed from the tables of the policy and the task (``exact.evaluate_policy``).
 """
@@ -64,11 +64,11 @@ class MeanBehaviour:
 
 
 def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
-    """The final policies of a student on the maps of its RiverGrid tasks.
+    """The final policies of an agent on the maps of its RiverGrid tasks.
 
     Args:
         sweep: its trials with a policy table are drawn.
-        agent: the student's label.
+        agent: the agent's label.
 
     Returns:
         The figure, or None if there is no such trial.
@@ -134,7 +134,7 @@ def mean_behaviour(policies: pd.DataFrame, river_map: RiverMap, options: RiverGr
     """Evaluate the policies of several runs exactly and average.
 
     Args:
-        policies: rows of ``Sweep.policies``, of one task, student and method.
+        policies: rows of ``Sweep.policies``, of one task, agent and method.
         river_map: the task's.
         options: the task's.
     """

@@ -2,7 +2,7 @@
 
 An infeasible run counts as worse than any return. Its line starts below 1 and never rises.
 The profile shows the whole distribution over runs where a mean shows one number: with five seeds, one that
-failed is a step of a fifth. Agarwal et al. 2021, figure 4; here a panel a task and student, so that returns
+failed is a step of a fifth. Agarwal et al. 2021, figure 4; here a panel a task and agent, so that returns
 of different tasks need not be normalised.
 """
 

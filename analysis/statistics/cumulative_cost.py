@@ -7,7 +7,7 @@ Undiscounted (the unit of all limits here), a row a trial:
 
     cost_sum         sum_b C_b, the measured mean episode cost of each policy
     limit_sum        sum_b D_b, the limits that were in force (the cost itself where they were infinite)
-    overshoot_sum    sum_b max(0, C_b - D_b), what the student really went over them
+    overshoot_sum    sum_b max(0, C_b - D_b), what the agent really went over them
     violation_sum    sum_b max(0, C_b - d_d), what relaxing really cost
     bound            H c_max + sum_{b<n} min(D_b + excess_b, H c_max), what the n policies are expected to
                      cost at most if every update solves CPO's problem: policy b + 1 is the answer to the
@@ -20,8 +20,8 @@ Discounted, as the paper has it, never to be added to the above:
     discounted_bound        H c_max + sum_{b<n} min(D_b + discounted excess_b, H c_max): Proposition 1 on the
                             limits that were in force
 
-delta_b is the mean KL divergence that the trial measured of the update from policy b, gamma the student's
-own. eps_b is at most c_max / (1 - gamma). Where the student reports its largest cost advantage in the batch
+delta_b is the mean KL divergence that the trial measured of the update from policy b, gamma the agent's
+own. eps_b is at most c_max / (1 - gamma). Where the agent reports its largest cost advantage in the batch
 (``cost_advantage_max_i``), that is taken if it is less: an estimate, which no proof covers. The undiscounted
 advantages are not measured: H c_max bounds them, crudely, and so the undiscounted bound is near the ceiling.
 A policy's discounted cost, which is not recorded, is at most its undiscounted one: a run whose cost_sum is
@@ -90,7 +90,7 @@ def policy_costs(
         updates: of the trial's training phase.
         cost: i, which cost.
         sizes: of the task, None if unknown.
-        discount: gamma of a CPO student; None for others, of which nothing is proven.
+        discount: gamma of a CPO agent; None for others, of which nothing is proven.
 
     Returns:
         end_step, cost, limit, ceiling, bound, discounted_excess (of the update that made the policy, 0 for
@@ -123,7 +123,7 @@ def policy_costs(
 
 
 def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, discount: float) -> Floats:
-    """The eps of each update: the largest that can be, or that the student saw, if that is less."""
+    """The eps of each update: the largest that can be, or that the agent saw, if that is less."""
     largest = math.inf if sizes is None else sizes.largest_cost / (1.0 - discount)
     name = f"cost_advantage_max_{cost}"
     seen = updates[name].to_numpy(np.float64) if name in updates else np.full(len(updates), math.inf)
@@ -140,7 +140,7 @@ def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
     Returns:
         KEY, policies (n), episodes_per_policy, train_limit (the d_t in force at the start of the
         curriculum), deploy_limit, and the quantities that the module's docstring lists; NaN where they are
-        unknown, the bounds also for students but CPO, of which nothing is proven.
+        unknown, the bounds also for agents but CPO, of which nothing is proven.
     """
     trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
     runs = training_runs(sweep)
@@ -280,7 +280,7 @@ def _sizes_of(name: str, canonical: str, cost: int) -> TaskSizes | None:
 
 
 def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
-    """The discount gamma of a CPO student, None for others: Lemma 1 is not about them."""
+    """The discount gamma of a CPO agent, None for others: Lemma 1 is not about them."""
     options = sweep.agent_options[str(trial["agent"])]
     discount = options.get("discount", math.nan)
     if trial["agent_name"] != "cpo":

@@ -3,7 +3,7 @@
 A teacher is a pure function of what it is told, so a run's files are enough to ask it again: every policy
 update becomes the ``ProgressReport`` that the trial sent. A run's own teacher gives the run's own limits.
 
-What it cannot say is how the student would have done under the other limits: the episodes stay those that
+What it cannot say is how the agent would have done under the other limits: the episodes stay those that
 were played under the recorded ones. It shows what a teacher makes of a given course of training, for example
 whether a dynamic curriculum's window or tolerance would have let it move.
 """

@@ -82,10 +82,10 @@ def binned_runs(updates: pd.DataFrame, column: str, edges: Floats) -> Floats:
     """Every run's curve on a common grid.
 
     A bin (e_j, e_j+1] holds the mean of the run's updates that end in it, each weighted with its number of
-    episodes (limits and the student's own metrics: each update once), NaN if there is none.
+    episodes (limits and the agent's own metrics: each update once), NaN if there is none.
 
     Args:
-        updates: of one task, student and method; of a ``Sweep``.
+        updates: of one task, agent and method; of a ``Sweep``.
         column: what to average.
         edges: ascending, [g + 1].
 
@@ -110,7 +110,7 @@ def mean_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
     """Mean and standard error over seeds of ``binned_runs``.
 
     Args:
-        updates: of one task, student and method.
+        updates: of one task, agent and method.
         column: what to average.
         edges: ascending, [g + 1].
     """
@@ -131,7 +131,7 @@ def interquartile_curve(
     Whole runs are resampled, so that a band's neighbouring bins rest on the same resamples.
 
     Args:
-        updates: of one task, student and method.
+        updates: of one task, agent and method.
         column: what to average.
         edges: ascending, [g + 1].
         generator: draws the resamples.

@@ -141,7 +141,7 @@ def training_totals(sweep: Sweep) -> pd.DataFrame:
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Outcomes averaged over seeds: a row a task, student, method and measure.
+    """Outcomes averaged over seeds: a row a task, agent, method and measure.
 
     Args:
         rows: of ``outcomes``.
@@ -204,7 +204,7 @@ def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.Dat
 def comparisons(
     rows: pd.DataFrame, generator: np.random.Generator, *, baseline: str = "none"
 ) -> pd.DataFrame:
-    """Every method against the student without a curriculum: a row a GROUP (but the baseline) and measure.
+    """Every method against the agent without a curriculum: a row a GROUP (but the baseline) and measure.
 
     Args:
         rows: of ``outcomes``.

@@ -26,7 +26,7 @@ from recrl.agents import presets
 from recrl.agents.registry import AGENTS
 from recrl.environments.plugins import load_attribute
 from recrl.environments.registry import TASKS
-from recrl.orchestrator.cli.main import parser
+from recrl.orchestrator.cli.arguments import parser
 from recrl.orchestrator.grid.file_models import Entry, Exclusion, GridFile, Resources, Run, TaskEntry
 from recrl.teachers.registry import TEACHERS
 
@@ -43,7 +43,14 @@ WRITTEN = {
     "name": "text",
 }
 BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
-TYPES = {"integer": "whole number", "number": "number", "boolean": "true or false", "string": "text"}
+TYPES = {
+    "integer": "whole number",
+    "number": "number",
+    "boolean": "true or false",
+    "string": "text",
+    "object": "mapping",
+    "null": "null",
+}
 SHOWN_NAMES = 12
 
 
@@ -238,26 +245,19 @@ def type_text(name: str, field: Mapping[str, Any], schema: Mapping[str, Any]) ->
     return words(field, schema)
 
 
-def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:  # noqa: PLR0911
+def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
     """A JSON schema in words."""
     if "$ref" in field:
         return words(schema["$defs"][field["$ref"].rsplit("/", 1)[1]], schema)
-    if "const" in field:
-        return f"`{field['const']}`"
-    if "enum" in field:
-        return ", ".join(f"`{value}`" for value in field["enum"])
     if "anyOf" in field:
         return " or ".join(words(each, schema) for each in field["anyOf"])
-    kind = field.get("type")
-    if kind == "null":
-        return "null"
-    if kind == "array":
+    if "const" in field or "enum" in field:
+        return ", ".join(f"`{value}`" for value in field.get("enum", [field.get("const")]))
+    if field.get("type") == "array":
         items = field.get("items") or next(iter(field.get("prefixItems", ())), {})
         return f"list of: {words(items, schema)}" if items else "list"
-    if kind == "object":
-        return "mapping"
     bounds = " ".join(f"{sign} {field[key]:g}," for key, sign in BOUNDS.items() if key in field)
-    return f"{TYPES.get(str(kind), 'any')} {bounds}".rstrip(" ,")
+    return f"{TYPES.get(str(field.get('type')), 'any')} {bounds}".rstrip(" ,")
 
 
 def default_text(field: Mapping[str, Any], *, required: bool) -> str:

@@ -4,7 +4,7 @@
     :methods: none, linear, dynamic
     ```
 
-A trial is solved if its regret is at most 0.2 and every mean cost is at most the limit + 0.05.
+What solved means, and its one tolerance, is defined in recrl.analysis.statistics.metrics.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from recrl.analysis.statistics.metrics import optimal
+
 ROOT = Path(__file__).resolve().parents[2]
-REGRET, EXCESS, ROUNDING = 0.2, 0.05, 1e-9
 MEASURES = {
     "stochastic": "final policy, stochastic",
     "deterministic": "final policy, deterministic",
@@ -36,11 +37,7 @@ def solved_table(path: Path, methods: list[str]) -> str:
         methods: the curricula to show, in this order; all if empty.
     """
     rows = pd.read_csv(path)
-    costs = [name for name in rows if name.startswith("cost_") and not name.endswith("_se")]
-    within = pd.Series(True, index=rows.index)
-    for cost in costs:
-        within &= rows[cost] <= rows[f"deploy_limit_{cost.removeprefix('cost_')}"] + EXCESS
-    rows["solved"] = within & (rows["gap"] <= REGRET + ROUNDING)
+    rows["solved"] = optimal(rows)
     shown = methods or list(dict.fromkeys(rows["method"]))
     lines = [f"| task | agent | curriculum | {' | '.join(MEASURES.values())} |", "|---|---|---|---|---|---|"]
     for (task, agent), cell in rows.groupby(["task", "agent"], sort=False):

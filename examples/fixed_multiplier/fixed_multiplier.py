@@ -4,7 +4,7 @@ from pydantic import Field
 
 from recrl.agents.algorithms.trpo import step_up
 from recrl.agents.config import TrustRegionConfig
-from recrl.agents.learning.actor_critic import fresh_student, indexed
+from recrl.agents.learning.actor_critic import fresh_agent, indexed
 from recrl.agents.learning.advantages import SMALLEST_STD
 from recrl.agents.registry import AgentEntry
 
@@ -32,7 +32,7 @@ class FixedMultiplier:
 
 
 def make_fixed_multiplier(cmdp, config, seed):
-    return fresh_student(cmdp, config, seed, lambda policy: FixedMultiplier(config))
+    return fresh_agent(cmdp, config, seed, lambda policy: FixedMultiplier(config))
 
 
 FIXED_MULTIPLIER = AgentEntry(

@@ -4,9 +4,9 @@ from statistics import fmean
 
 from pydantic import BaseModel, Field
 
-from recrl.environments.cmdp import CostLimits
+from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.registry import TeacherKind
-from recrl.teachers.teacher import Lesson, already_seen, last_lesson, progress
+from recrl.teachers.teacher import already_seen, progress
 
 
 class HalvingConfig(BaseModel, frozen=True, extra="forbid"):
@@ -32,7 +32,7 @@ class Halving:
 
     def step(self, state, report):
         if already_seen(state, report):  # asked again after a crash: the same answer
-            return last_lesson(state), state
+            return CurriculumStep.from_json(state), state
         limits = CostLimits.from_json(state["limits"])
         costs = [*state["costs"], *(list(episode.costs) for episode in report.episodes)]
         if progress(report.env_steps, self.spec.train_steps) >= 1.0:
@@ -44,8 +44,8 @@ class Halving:
         return self._state(report.update, CostLimits(tuple(lower)), [])
 
     def _state(self, update, limits, costs):
-        state = {"update": update, "limits": limits.to_json(), "policy_noise": 0.0, "costs": costs}
-        return Lesson(limits), state
+        asked = CurriculumStep(limits)
+        return asked, {"update": update, "costs": costs, **asked.to_json()}
 
 
 HALVING = TeacherKind(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
@@ -13,7 +15,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import other_code_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import GridSpec, read_grid
-from recrl.orchestrator.grid.plan import Plan, estimate, make_plan, trials_at_once
+from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, trials_at_once, unmeasured
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialState
 
@@ -36,7 +38,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
 
 
 def run_plan(request: PlanRequest, console: Console) -> ExitCode:
-    """Say what a launch would do; nothing is started, and nothing written but a mirror of what is kept."""
+    """Say what a launch would do; nothing is started, and nothing written but the copy of an object store."""
     grid = read_grid(request.grid)
     store = SweepStore(request.root, grid.name)
     sweep_place(store, request.storage).refresh()
@@ -51,7 +53,10 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     at_once, where = room(grid, request)
     console.print(display.plan_table(plan))
     say(console, "")
-    say_plan(plan, grid, console, at_once=at_once, where=where)
+    speeds = _measured(plan, console) if request.measure else {}
+    say_plan(plan, grid, console, at_once=at_once, where=where, speeds=speeds)
+    if not request.measure and unmeasured(plan):
+        say(console, "To measure about a second of each: recrl-sweep plan --measure")
     for line in display.damages_of_plan(plan):
         say(console, line)
     say_other_code(plan, console)
@@ -75,10 +80,30 @@ def room(grid: GridSpec, request: GridRequest) -> tuple[int, str]:
     return fitting, f"on {cores} cores" if cores else "on this machine"
 
 
-def say_plan(plan: Plan, grid: GridSpec, console: Console, *, at_once: int, where: str) -> None:
+def _measured(plan: Plan, console: Console) -> dict[str, float]:
+    """Run about a second of each task and agent that has not run yet; their speeds, by kind."""
+    from recrl.orchestrator.trial.speed import measured_speed  # noqa: PLC0415  (imports torch)
+
+    speeds = {}
+    for spec in unmeasured(plan):
+        speed = measured_speed(spec)
+        say(console, f"{spec.task.label} {spec.agent.label}: {speed:,.0f} steps/s on one core")
+        speeds[kind_of(spec)] = speed
+    return speeds
+
+
+def say_plan(
+    plan: Plan,
+    grid: GridSpec,
+    console: Console,
+    *,
+    at_once: int,
+    where: str,
+    speeds: Mapping[str, float] | None = None,
+) -> None:
     """Say what a launch would do, and about what it takes."""
     say(console, f"{grid.name}: {display.plan_sentence(plan)}")
-    say(console, display.estimate_sentence(estimate(plan, concurrent=at_once), where))
+    say(console, display.estimate_sentence(estimate(plan, concurrent=at_once, speeds=speeds), where))
 
 
 def say_other_code(plan: Plan, console: Console) -> None:

@@ -96,25 +96,43 @@ def run_stop(request: StopRequest, console: Console) -> ExitCode:
 def run_logs(request: LogsRequest, console: Console) -> ExitCode:
     """Print a trial's log, or say where its folder is."""
     store = open_store(request)
-    trial = _trial(store, " ".join(request.trial))
+    text = " ".join(request.trial)
     if request.folder:
-        say(console, str(short(trial.folder)))
+        say(console, str(short(_trial(store, text).folder)))
         return ExitCode.OK
     with contextlib.ExitStack() as following:
-        if request.follow and not store.is_locked():
-            place = sweep_place(store, request.storage)
-            following.enter_context(place.mirrored(threading.Event()))
-        for text in display.lines_of(trial, follow=request.follow):
-            say(console, text)
+        if request.follow:
+            if not store.is_locked():
+                place = sweep_place(store, request.storage)
+                following.enter_context(place.mirrored(threading.Event()))
+            _wait_for_start(store, text, console)
+        for line in display.lines_of(_trial(store, text), follow=request.follow):
+            say(console, line)
     return ExitCode.OK
 
 
-def _trial(store: SweepStore, text: str) -> TrialStore:
-    """The trial that a person means; the one that runs if they do not say."""
+def _wait_for_start(store: SweepStore, text: str, console: Console) -> None:
+    """Wait until a trial that is meant has begun, as long as a launch runs that may begin it."""
+    told = False
+    while not _meant(store, text) and store.is_locked():
+        if not told:
+            say(console, f"{store.name}: waiting for {f'a trial {text!r}' if text else 'a trial'} to start")
+        told = True
+        time.sleep(display.LOG_SECONDS)
+
+
+def _meant(store: SweepStore, text: str) -> list[TrialStore]:
+    """The trials on disk that a person may mean; those that run if they do not say."""
     found = store.find(text)
-    if not text:
-        now = time.time()
-        found = [trial for trial in found if standing_of(trial.record(), now=now) is Standing.RUNNING]
+    if text:
+        return found
+    now = time.time()
+    return [trial for trial in found if standing_of(trial.record(), now=now) is Standing.RUNNING]
+
+
+def _trial(store: SweepStore, text: str) -> TrialStore:
+    """The one trial that a person means."""
+    found = _meant(store, text)
     if len(found) == 1:
         return found[0]
     titles = [f"{trial.trial_id} {trial.title}" for trial in found[:10]]

@@ -31,6 +31,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from recrl.agents.registry import agent_config
 from recrl.environments.cmdp import CMDPSpec, CostLimits
+from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.environments.registry import make_vector, task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
@@ -315,15 +316,23 @@ class _Check:
                 return
 
     def _cmdp(self, index: int, task: Choice) -> CMDPSpec | None:
-        """What the task fixes, found by building one environment of it."""
+        """What the task fixes, found by building one environment of it; a user's is also stepped once."""
         try:
             envs = make_vector(task.name, 1, options=task.options)
         except USERS_ERRORS as error:
             self._add(("tasks", index), f"{task.name} cannot be built: {described(error)}")
             return None
-        cmdp = envs.cmdp
-        envs.close()
-        return cmdp
+        try:
+            if isinstance(envs, SyncCMDPVectorEnv):  # a user's: does a step report its cost?
+                envs.reset(seed=0)
+                envs.action_space.seed(0)
+                envs.step(envs.action_space.sample())
+        except USERS_ERRORS as error:
+            self._add(("tasks", index), f"{task.name} fails in its first step: {described(error)}")
+            return None
+        finally:
+            envs.close()
+        return envs.cmdp
 
     def _both_limits(self, index: int, label: str, cmdp: CMDPSpec) -> tuple[CostLimits, CostLimits] | None:
         """The task's d_t and d_d."""

@@ -162,7 +162,7 @@ def make_plan(
     return Plan(tuple(trials), orphans)
 
 
-def estimate(plan: Plan, *, concurrent: int) -> Estimate:
+def estimate(plan: Plan, *, concurrent: int, speeds: Mapping[str, float] | None = None) -> Estimate:
     """Time from the speed of the trials that have run so far, memory from what a trial's process takes.
 
     A speed is measured in environment steps per CPU second, for each task and student with their options.
@@ -170,20 +170,24 @@ def estimate(plan: Plan, *, concurrent: int) -> Estimate:
     Args:
         plan: what is to do.
         concurrent: trials at once, at least 1.
+        speeds: measured ones by ``kind_of``, in environment steps per CPU second, for what has not run yet.
     """
+    measured = speeds or {}
     steps: defaultdict[str, int] = defaultdict(int)
     seconds: defaultdict[str, float] = defaultdict(float)
     for trial in plan.trials:
         if trial.record.cpu_seconds > 0.0:
-            steps[_kind(trial.spec)] += trial.record.env_steps
-            seconds[_kind(trial.spec)] += trial.record.cpu_seconds
+            steps[kind_of(trial.spec)] += trial.record.env_steps
+            seconds[kind_of(trial.spec)] += trial.record.cpu_seconds
     cpu_seconds, unknown = 0.0, {}
     for trial in plan.trials:
         if not trial.steps_left:
             continue
-        kind = _kind(trial.spec)
+        kind = kind_of(trial.spec)
         if steps[kind] > 0:
             cpu_seconds += trial.steps_left * seconds[kind] / steps[kind]
+        elif kind in measured:
+            cpu_seconds += trial.steps_left / measured[kind]
         else:
             unknown[kind] = f"{trial.spec.task.label} {trial.spec.agent.label}"
     running = min(concurrent, len(plan.to_do))
@@ -194,6 +198,13 @@ def estimate(plan: Plan, *, concurrent: int) -> Estimate:
         gigabytes=GIGABYTES_AROUND + running * GIGABYTES_PER_TRIAL if running else 0.0,
         unknown=tuple(unknown.values()),
     )
+
+
+def unmeasured(plan: Plan) -> tuple[TrialSpec, ...]:
+    """One trial to do of each kind of which none has run."""
+    known = {kind_of(trial.spec) for trial in plan.trials if trial.record.cpu_seconds > 0.0}
+    kinds = {kind_of(spec): spec for spec in reversed(plan.to_do)}
+    return tuple(spec for kind, spec in reversed(kinds.items()) if kind not in known)
 
 
 def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: int | None = None) -> int:
@@ -236,7 +247,7 @@ def _work(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> Wo
             return Work.RESUME if record.attempt else Work.NEW
 
 
-def _kind(spec: TrialSpec) -> str:
+def kind_of(spec: TrialSpec) -> str:
     """What trials of about equal speed share: the task and the student, options and width included."""
     kind: tuple[Choice | int, ...] = (spec.task, spec.agent, spec.num_envs, spec.rollout_steps)
     return repr(kind)

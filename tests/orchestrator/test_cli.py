@@ -1,9 +1,12 @@
 """The command line: quick to start, honest in its exit codes, and its errors are sentences."""
 
+import re
 import resource
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -12,8 +15,9 @@ from recrl.analysis.figures import learning_curves
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.grid import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.trial.speed import measured_speed
 
 GRID = """\
 name: small
@@ -121,13 +125,22 @@ def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     out = capsys.readouterr().out
     assert "Results    runs/small\n" in out
     assert "Figures    runs/small/figures\n" in out
+    assert "Starting Ray" not in out
+    table = out.partition("\n\n")[2].splitlines()
+    assert table[0].split() == ["task", "agent", "method", "n", "return", "cost", "limit", "feasible"]
+    assert [line.split()[:4] for line in table[1:3]] == [
+        ["two-state", "ppo-lag", "none", "1"],
+        ["two-state", "ppo-lag", "linear", "1"],
+    ]
+    assert table[1].split()[-4:] in (["2.00", "1", "of", "1"], ["2.00", "0", "of", "1"])
+    assert table[-2] == "Report     runs/small/figures/report.html"
     assert "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n" in out
     assert any((folder / "runs/small/figures").glob("*.png"))
 
     assert main(["plan", "grid.yaml", "--check"]) == ExitCode.OK
     assert "small: 2 trials: 2 complete\nnothing to do\n" in capsys.readouterr().out
 
-    for sweep in ([], ["small"], ["grid.yaml"]):
+    for sweep in ([], ["small"], ["grid.yaml"], ["runs/small"], [f"{folder}/runs/small/"]):
         assert main(["status", "--brief", *sweep]) == ExitCode.OK
         assert capsys.readouterr().out == "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
 
@@ -147,8 +160,8 @@ def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
         "Figures    not all are drawn (KeyError: 'river'), by a mistake in recrl\n"
         "           for its traceback: recrl-sweep figures small\n"
         "Results    runs/small\n"
-        "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n"
     ) in out
+    assert out.endswith("small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n")
     with pytest.raises(KeyError, match="river"):
         main(["figures", "small"])
 
@@ -416,3 +429,127 @@ def test_a_root_below_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
     with pytest.raises(SystemExit):
         main(["status", "x", "--root", str(tmp_path / "grid.yaml" / "below")])
     assert f"must be a folder, but '{tmp_path / 'grid.yaml'}' is a file" in capsys.readouterr().err
+
+
+def test_plan_measures_what_has_not_run_yet(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "grid.yaml"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert "\ntime unknown until a first trial has run (two-state ppo-lag); " in out
+    assert out.endswith("To measure about a second of each: recrl-sweep plan --measure\n")
+    assert main(["plan", "grid.yaml", "--measure", "--cores", "1"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert re.search(r"\ntwo-state ppo-lag: [0-9,]+ steps/s on one core\n", out)
+    assert re.search(r"\nabout \d+ s with 1 trial at once on 1 cores, ", out)
+    assert not (folder / "runs").exists()
+
+
+def test_a_measured_speed_is_that_of_a_run(folder: Path) -> None:
+    """Within a factor of three, as other processes share the machine."""
+    (folder / "grid.yaml").write_text(GRID.replace("total_steps: 160", "total_steps: 20_000"))
+    speed = measured_speed(read_grid(folder / "grid.yaml").trials()[0], seconds=0.5)
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    record = SweepStore(Path("runs"), "small").trials()[0].record()
+    assert 1 / 3 < speed / (record.env_steps / record.cpu_seconds) < 3
+
+
+ROOM = """\
+import gymnasium
+import numpy as np
+
+class Room(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(1, np.float32), 1.0, False, self.steps == 5, INFO
+
+gymnasium.register("Room-v0", Room)
+"""
+
+
+def _own_room(folder: Path, module: str, info: str, task: str) -> None:
+    (folder / f"{module}.py").write_text(ROOM.replace("INFO", info))
+    (folder / "grid.yaml").write_text(GRID.replace("{name: two-state,", f"{{{task},"))
+
+
+SCRIPT = "import sys; sys.path.remove(''); from recrl.orchestrator.cli.main import main; sys.exit(main({}))"
+
+
+@pytest.mark.parametrize("task", ["name: 'room_a:Room'", "name: gymnasium, options: {id: 'room_a:Room-v0'}"])
+def test_modules_in_the_working_directory_are_found(folder: Path, task: str) -> None:
+    """Also by Ray's workers; the installed command does not look there by itself."""
+    _own_room(folder, "room_a", "{'cost': 1.0}", task)
+    done = _python(SCRIPT.format(["validate", "grid.yaml", "--trust"]), folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = _python(SCRIPT.format(["launch", "grid.yaml", "--no-mlflow", "--no-figures"]), folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\nStarting Ray ...\n" in done.stdout
+    assert "small: 2 of 2 complete" in done.stdout
+
+
+def test_a_module_that_is_nowhere_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("two-state", "'my_nav:make'"))
+    assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith(
+        "grid.yaml:2: tasks.0.name: cannot import 'my_nav:make': there is no module my_nav; "
+        "start the command in the folder that holds it, name that folder in PYTHONPATH, or install "
+        "the module's package\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("task", "sentence"),
+    [
+        (
+            "name: 'room_b:Room'",
+            "grid.yaml:2: tasks.0: room_b:Room fails in its first step: ValueError: room_b:Room: the "
+            "environment must report info['cost'] at every step, got only ['speed']",
+        ),
+        (
+            "name: gymnasium, options: {id: Pendulum-v1}",
+            "grid.yaml:2: tasks.0: gymnasium fails in its first step: ValueError: gymnasium: the "
+            "environment must report info['cost'] at every step, got only []",
+        ),
+    ],
+)
+def test_an_environment_without_costs_is_refused_at_validate(
+    folder: Path, capsys: pytest.CaptureFixture[str], task: str, sentence: str
+) -> None:
+    _own_room(folder, "room_b", "{'speed': 1.0}", task)
+    assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith(sentence)
+
+
+def test_logs_show_return_and_cost(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["logs", "small", "two-state"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    line = r"update 4 of 4, deployment: return -?[0-9.]+, [a-z]+ [0-9.]+ of limit 2\.00\n"
+    assert len(re.findall(line, out)) == 1
+
+
+def test_following_a_log_waits_for_the_start(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = parse_grid(GRID.encode(), source="grid.yaml")
+    store = SweepStore(folder / "runs", "small")
+    spec = grid.trials()[0]
+
+    def begin_later() -> None:
+        time.sleep(1.0)
+        writer = store.trial(spec).begin(spec)
+        store.trial(spec).log_path.write_text("it began\n")
+        time.sleep(1.0)
+        writer.close(TrialState.WAITING)
+
+    with store.lock():
+        store.write_info({"name": store.name})
+        store.write_specs(grid.trials(), grid.text)
+        thread = threading.Thread(target=begin_later)
+        thread.start()
+        assert main(["logs", "small", "--follow"]) == ExitCode.OK
+        thread.join()
+    assert capsys.readouterr().out == "small: waiting for a trial to start\nit began\n"

@@ -1,0 +1,58 @@
+"""How fast a trial learns on this machine, measured by running a little of it."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.trial.trial import Trial
+from recrl.teachers.registry import make_teacher
+
+MEASURED_SECONDS = 1.0
+
+
+def measured_speed(spec: TrialSpec, *, seconds: float = MEASURED_SECONDS) -> float:
+    """Return a trial's environment steps per CPU second, collecting and learning together.
+
+    It runs in a folder that is deleted afterwards. The first update does not count, as it compiles and fills
+    caches, unless it alone takes the whole time.
+
+    Args:
+        spec: the trial.
+        seconds: of CPU time that the measurement takes, about; at least one update.
+
+    Raises:
+        RecrlError: the task or the agent raised something.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
+            store = TrialStore(Path(scratch) / spec.folder_name)
+            trial = Trial(spec, store.begin(spec), make_teacher(spec.teacher))
+            return _speed(trial, seconds)
+    except RecrlError:
+        raise
+    except USERS_ERRORS as error:
+        raise RecrlError(f"{spec.title}: cannot be measured: {described(error)}") from error
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _speed(trial: Trial, seconds: float) -> float:
+    began = time.process_time()
+    trial.advance()
+    took = time.process_time() - began
+    first = trial.env_steps
+    if took >= seconds or trial.learned:
+        return first / max(took, 1e-9)
+    began = time.process_time()
+    while not trial.learned and time.process_time() - began < seconds:
+        trial.advance()
+    return (trial.env_steps - first) / max(time.process_time() - began, 1e-9)
