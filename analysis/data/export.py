@@ -50,7 +50,6 @@ from recrl.orchestrator.validation import sentences
 
 SUFFIX = ".zip"
 FORMAT = 2
-WITHOUT_DIGESTS = 1  # the format before: its tables are read as they are
 DIGITS = 6
 ROUNDED = ("updates", "policies")
 MAX_BYTES = 512 * 2**20  # unpacked; about 50 times the largest sweep so far
@@ -127,12 +126,12 @@ def load(path: Path) -> Sweep:
         reason = getattr(error, "strerror", None) or error
         raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({reason})") from error
     found = told.get("format") if isinstance(told, dict) else None
-    if found not in (FORMAT, WITHOUT_DIGESTS):
-        raise RecrlError(f"{path}: its format must be {FORMAT} or {WITHOUT_DIGESTS}, got {found!r:.60}")
+    if found != FORMAT:
+        raise RecrlError(f"{path}: its format must be {FORMAT}, got {found!r:.60}; export the sweep again")
     try:
         checked = _SweepFile.model_validate(told)
         for name, data in zip(names[1:], frames, strict=True):
-            if found == FORMAT and Extent.of(data).sha256 != checked.digests.get(name):
+            if Extent.of(data).sha256 != checked.digests.get(name):
                 raise DamagedError(f"{path}: its {name} is not what was written; export the sweep again")
         facts = [_facts(trial, checked.provenance) for trial in told["trials"]]
         for name, frame in rows.items():
@@ -173,7 +172,7 @@ class _SweepFile(BaseModel):
     grid: str
     provenance: list[str]
     trials: list[_TrialFile]
-    digests: dict[str, str] = Field(default_factory=dict)
+    digests: dict[str, str]
 
 
 def _check_task(name: str, options: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ def doubts(sweep: Sweep) -> list[str]:
 
 
 def _attempts(trial: TrialFacts) -> list[dict[str, Any]]:
-    """What is known of where each attempt comes from; nothing in files of older versions."""
+    """What is known of where each attempt comes from; nothing where no attempt began."""
     try:
         attempts = json.loads(trial.provenance).get("attempts", [])
     except (ValueError, AttributeError):

@@ -100,7 +100,7 @@ def test_a_file_that_would_fill_the_memory_is_refused(
         export.save(finished, path)
 
 
-@pytest.mark.parametrize("told", ["[]", '{"format": 3}', "null"])
+@pytest.mark.parametrize("told", ["[]", '{"format": 1}', '{"format": 3}', "null"])
 def test_a_file_of_another_format_is_named(finished: Sweep, tmp_path: Path, told: str) -> None:
     path = export.save(finished, tmp_path / "sweep.zip")
     with zipfile.ZipFile(path) as archive:
@@ -108,7 +108,7 @@ def test_a_file_of_another_format_is_named(finished: Sweep, tmp_path: Path, told
     with zipfile.ZipFile(path, "w") as archive:
         for name, member in (members | {"sweep.json": told.encode()}).items():
             archive.writestr(name, member)
-    with pytest.raises(RecrlError, match=r"sweep\.zip: its format must be 2 or 1, got (3|None)"):
+    with pytest.raises(RecrlError, match=r"sweep\.zip: its format must be 2, got (1|3|None); export"):
         export.load(path)
 
 
