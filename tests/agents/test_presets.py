@@ -1,11 +1,7 @@
-"""The table of what the presets differ in is complete, and is the README's."""
+"""The table of what the presets differ in is complete."""
 
-from pathlib import Path
-
-from recrl.agents.presets import deviations, options_of, table
+from recrl.agents.presets import deviations, options_of
 from recrl.agents.registry import AGENTS
-
-README = Path(__file__).parents[2] / "README.md"
 
 
 def test_paper_is_recommended_with_every_deviation_switched() -> None:
@@ -17,7 +13,3 @@ def test_paper_is_recommended_with_every_deviation_switched() -> None:
         }
         assert {**options_of(student, "recommended"), **switched} == options_of(student, "paper")
         assert all(options_of(student, "recommended")[option] != value for option, value in switched.items())
-
-
-def test_the_readme_has_the_table() -> None:
-    assert table() in README.read_text(encoding="utf-8")
