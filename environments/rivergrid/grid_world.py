@@ -1,6 +1,7 @@
 """RiverGrid (paper, section 5 and figure 1): a grid world in which the short way leads through a river.
 
-Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), float32 [width + height + 4].
+Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), float32 [width + height + 4];
+    with ``observation: joint`` one-hot (x, y, heading) as a whole, float32 [4 width height].
 Action: Discrete(3), MiniGrid's first three: 0 turn left, 1 turn right, 2 forward (into a wall: stay).
 Reward: -0.1 a step; +10 instead on the step that reaches a goal.
 Cost: ``river`` 1 for every time step that ends on a river tile, turning and bumping there included; on demand
@@ -50,6 +51,7 @@ HORIZON = 200
 HEADINGS = 4
 LEFT, RIGHT, FORWARD = 0, 1, 2
 CostName = Literal["river", "turns", "mud"]
+ObservationName = Literal["factored", "joint"]
 
 
 class RiverGridOptions(BaseModel):
@@ -64,6 +66,11 @@ class RiverGridOptions(BaseModel):
         default=("river",),
         min_length=1,
         description="The cost functions in order, river (the paper's), turns and mud (ours), 1 a step each.",
+    )
+    observation: ObservationName = Field(
+        default="factored",
+        description="What agents see: x, y and heading, each one-hot, so that what is learnt of a tile "
+        "carries over to its row and column; or the joint state, one-hot as a whole, as in a table (ours).",
     )
 
     @field_validator("costs")
@@ -127,9 +134,11 @@ def state_index(river_map: RiverMap, x: int, y: int, heading: int) -> int:
     return (x * river_map.height + y) * HEADINGS + heading
 
 
-def river_observations(river_map: RiverMap) -> npt.NDArray[np.float32]:
-    """What an agent sees in each state, float32 [S, width + height + 4]."""
+def river_observations(river_map: RiverMap, observation: ObservationName) -> npt.NDArray[np.float32]:
+    """What an agent sees in each state, float32 [S, width + height + 4], or [S, S] with ``joint``."""
     shape = (river_map.width, river_map.height, HEADINGS)
+    if observation == "joint":
+        return np.eye(math.prod(shape), dtype=np.float32)
     columns = np.indices(shape).reshape(3, -1)
     return np.concatenate(
         [np.eye(size, dtype=np.float32)[index] for size, index in zip(shape, columns, strict=True)], axis=1
@@ -189,7 +198,7 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
     def __init__(self, name: str, river_map: RiverMap, options: RiverGridOptions, *, num_envs: int) -> None:
         model = river_cmdp(river_map, costs=options.costs, horizon=options.horizon)
-        observations = river_observations(river_map)
+        observations = river_observations(river_map, options.observation)
         super().__init__(name, model, observations, num_envs=num_envs)
         self.river_map = river_map
 

@@ -30,6 +30,7 @@ from recrl.environments.rivergrid.grid_world import (
     HORIZON,
     STEP_REWARD,
     CostName,
+    ObservationName,
     RiverGridOptions,
     river_observations,
     state_index,
@@ -76,6 +77,7 @@ class RiverGridEnv(MiniGridEnv):
         drawing: the map, see ``recrl.environments.rivergrid.maps``.
         max_steps: H, steps after which an episode is truncated.
         costs: the cost functions, in order.
+        observation: what is seen, ``factored`` or ``joint``.
         **minigrid: MiniGrid's own, such as ``render_mode``.
     """
 
@@ -85,11 +87,12 @@ class RiverGridEnv(MiniGridEnv):
         *,
         max_steps: int = HORIZON,
         costs: Sequence[CostName] = ("river",),
+        observation: ObservationName = "factored",
         **minigrid: Any,
     ) -> None:
         self.river_map = parse_map(drawing)
         self.cost_names = tuple(costs)
-        self._observations = river_observations(self.river_map)
+        self._observations = river_observations(self.river_map, observation)
         super().__init__(
             mission_space=MissionSpace(mission_func=mission),
             width=self.river_map.width,
@@ -132,5 +135,6 @@ def draw_river_grid(name: str, options: RiverGridOptions) -> RiverGridEnv:
         str(task_map(name, options)),
         max_steps=options.horizon,
         costs=options.costs,
+        observation=options.observation,
         render_mode="rgb_array",
     )

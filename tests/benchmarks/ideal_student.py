@@ -138,7 +138,7 @@ def main() -> None:
     for map_seed in arguments.maps:
         river_map = RiverGridGeneratedOptions(map_seed=map_seed).river_map()
         model = river_cmdp(river_map, costs=("river",), horizon=HORIZON)
-        coordinates = river_observations(river_map).astype(np.float64)
+        coordinates = river_observations(river_map, "factored").astype(np.float64)
         expressible = "yes" if linear(model, coordinates) else "no"
         for price in (3.0, 10.0):
             directions = (by_pose, by_features(coordinates))

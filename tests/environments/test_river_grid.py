@@ -21,6 +21,7 @@ from recrl.environments.rivergrid.grid_world import (
     LEFT,
     RIGHT,
     CostName,
+    ObservationName,
     RiverGridMapOptions,
     RiverGridVectorEnv,
     state_index,
@@ -113,6 +114,16 @@ def test_the_observation_is_one_hot_x_y_and_heading() -> None:
     assert observation.tolist() == [*(0, 1, 0, 0), *(0, 0, 0, 1, 0), *(0, 0, 0, 1)]
 
 
+def test_the_joint_state_is_one_hot_as_a_whole() -> None:
+    options = {"map": "####\n#.~#\n#.G#\n#^.#\n####", "observation": "joint"}
+    environment = make_vector("rivergrid", 1, options=options)
+    observation = environment.reset(seed=0)[0][0]
+    assert observation.shape == (4 * 5 * 4,)
+    assert np.flatnonzero(observation).tolist() == [(1 * 5 + 3) * 4 + 3]  # x = 1, y = 3, north
+    assert observation.sum() == 1.0
+
+
+@pytest.mark.parametrize("observation", ["factored", "joint"])
 @pytest.mark.parametrize("costs", [("river",), ("mud", "turns", "river")])
 @pytest.mark.parametrize(
     "drawing",
@@ -125,11 +136,11 @@ def test_the_observation_is_one_hot_x_y_and_heading() -> None:
     ids=["1a", "1b", "mud", "random-0", "random-1", "random-2", "random-3"],
 )
 def test_the_fast_environment_equals_minigrids_step_for_step(
-    drawing: str, costs: tuple[CostName, ...]
+    drawing: str, costs: tuple[CostName, ...], observation: ObservationName
 ) -> None:
     horizon = 40
-    slow = RiverGridEnv(drawing, max_steps=horizon, costs=costs)
-    options = RiverGridMapOptions(map=drawing, horizon=horizon, costs=costs)
+    slow = RiverGridEnv(drawing, max_steps=horizon, costs=costs, observation=observation)
+    options = RiverGridMapOptions(map=drawing, horizon=horizon, costs=costs, observation=observation)
     fast = RiverGridVectorEnv("rivergrid", parse_map(drawing), options, num_envs=2)
     generator = np.random.default_rng(0)
     slow_observation, _ = slow.reset(seed=1)
