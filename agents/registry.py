@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from recrl.agents.agent import Agent
-from recrl.agents.algorithms.configs import (
+from recrl.agents.algorithms.own_options import (
     CPOConfig,
     CRPOConfig,
     FOCOPSConfig,

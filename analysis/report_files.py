@@ -15,7 +15,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
 from recrl.analysis.statistics.metrics import Measure
-from recrl.analysis.statistics.verdicts import verdicts
+from recrl.analysis.statistics.verdict_counts import verdicts
 
 BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from recrl.analysis.report_tables import DASH, number, with_error, with_interval
-from recrl.analysis.statistics.metrics import COST_TOLERANCE, OPTIMAL_GAP
+from recrl.analysis.statistics.feasibility import COST_TOLERANCE, OPTIMAL_GAP
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"

@@ -26,7 +26,7 @@ from recrl.orchestrator.grid.grid import GridSpec
 from recrl.orchestrator.grid.plan import Plan, Work, make_plan, select
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress
+from recrl.orchestrator.sweep_progress import Standing, SweepProgress, TrialProgress, progress
 
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
 MIRROR_SECONDS = 120.0

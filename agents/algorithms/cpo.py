@@ -19,8 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.algorithms.configs import CPOConfig
-from recrl.agents.config import TrustRegionConfig
+from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
@@ -29,6 +28,7 @@ from recrl.agents.learning.batch import to_tensor
 from recrl.agents.learning.distributions import Distribution, mean_divergence
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
 from recrl.agents.learning.surrogates import surrogate
+from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.agents.trust_region.line_search import conjugate_gradient, line_search
 from recrl.environments.cmdp import CMDPSpec, Floats

@@ -32,8 +32,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from recrl.agents.algorithms.configs import CRPOConfig
 from recrl.agents.algorithms.cpo import LocalModel, linearise, to_parameter_step
+from recrl.agents.algorithms.own_options import CRPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.learning.advantages import SMALLEST_STD, reward_spread

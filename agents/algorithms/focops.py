@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.algorithms.configs import FOCOPSConfig
+from recrl.agents.algorithms.own_options import FOCOPSConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed

@@ -31,7 +31,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.algorithms.configs import IPOConfig
+from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.batch import LearningBatch, to_tensor

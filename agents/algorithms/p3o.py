@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.algorithms.configs import P3OConfig
+from recrl.agents.algorithms.own_options import P3OConfig
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.batch import LearningBatch, to_tensor

@@ -21,8 +21,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from recrl.agents.algorithms.configs import PCPOConfig
 from recrl.agents.algorithms.cpo import constrained_step
+from recrl.agents.algorithms.own_options import PCPOConfig
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent
 from recrl.agents.learning.policies import StochasticPolicy

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from recrl.agents.algorithms.configs import PPOConfig
+from recrl.agents.algorithms.own_options import PPOConfig
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
 from recrl.agents.learning.advantages import scaled_advantages

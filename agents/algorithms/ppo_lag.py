@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 from torch import Tensor
 
-from recrl.agents.algorithms.configs import PPOLagConfig
+from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed

@@ -13,14 +13,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from recrl.agents.algorithms.configs import TRPOConfig
 from recrl.agents.algorithms.cpo import LocalModel
-from recrl.agents.config import TrustRegionConfig
+from recrl.agents.algorithms.own_options import TRPOConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
 from recrl.agents.learning.advantages import scaled_advantages
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.line_search import conjugate_gradient, line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recrl.agents.algorithms.configs import TRPOLagConfig
+from recrl.agents.algorithms.own_options import TRPOLagConfig
 from recrl.agents.algorithms.trpo import step_up
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from recrl.agents.config import LagrangianConfig
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
     MultiplierState,
@@ -34,6 +33,7 @@ from recrl.agents.constraints.multiplier_rules import (
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import penalised_advantages, reward_spread
 from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.agents.shared_options import LagrangianConfig
 from recrl.environments.cmdp import Floats
 
 # (state, gaps in the rule's unit [k]) -> the next state

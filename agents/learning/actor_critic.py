@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from recrl.agents.agent import Rollout
-from recrl.agents.config import ActorCriticConfig
 from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, TailCost
 from recrl.agents.encoding import Encoder
 from recrl.agents.errors import require_finite
@@ -38,6 +37,7 @@ from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.agents.learning.surrogates import surrogate
+from recrl.agents.shared_options import ActorCriticConfig
 from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
 from recrl.environments.plugins import trusted_attribute

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.config import AscentConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import Stateful
@@ -27,6 +26,7 @@ from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Distribution, mean_divergence
 from recrl.agents.learning.networks import Adam
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.shared_options import AscentConfig
 
 # What is climbed: a differentiable scalar of the policy's distributions at the rows of some samples, and of
 # the probability ratios pi(a | s) / pi_old(a | s) of their pairs, [D].

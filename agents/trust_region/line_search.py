@@ -10,8 +10,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from recrl.agents.config import TrustRegionConfig
 from recrl.agents.learning.networks import FlatParameters
+from recrl.agents.shared_options import TrustRegionConfig
 
 # Of a system scaled to a right-hand side of length 1.
 CONVERGED_SQUARED_RESIDUAL = 1e-10

@@ -22,7 +22,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.curves import MEAN, Averaging, mean_curve, step_grid
-from recrl.analysis.statistics.metrics import OPTIMAL_GAP
+from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
 from recrl.environments.cmdp import Floats
 
 BINS = 100

@@ -18,8 +18,9 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.styles import OPTIMUM_COLOUR, TEXT_WIDTH
 from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
 from recrl.analysis.statistics.intervals import performance_profile
-from recrl.analysis.statistics.metrics import OPTIMAL_GAP, Measure
+from recrl.analysis.statistics.metrics import Measure
 from recrl.environments.cmdp import Floats
 
 THRESHOLDS = 400

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from recrl.analysis.statistics.feasibility import optimal, within_limits
 from recrl.analysis.statistics.intervals import share_text, wilson_interval
-from recrl.analysis.statistics.metrics import Measure, optimal, within_limits
+from recrl.analysis.statistics.metrics import Measure
 
 STATIC = ("linear", "cosine", "exponential")
 

@@ -4,16 +4,11 @@ A trial's outcome is measured three ways, never mixed (``Measure``). Learning go
 so that phase averages over policies. The final policy is the one a user would take away. Its values are exact
 where the task is finite and its table was recorded; otherwise they are means over episodes.
 
-There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``: a share
-COST_TOLERANCE of the limit, or one standard error of the mean where that is more. A policy with softmax
-outputs cannot meet a limit exactly where the optimum does: each action keeps some probability.
-
-Solved (the column ``optimal``) means feasible and at most OPTIMAL_GAP below J*(d_d), where that is known.
+What is feasible and what is solved: ``recrl.analysis.statistics.feasibility``.
 """
 
 from __future__ import annotations
 
-import math
 from enum import StrEnum
 from typing import Any
 
@@ -22,6 +17,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.statistics.feasibility import costs_of, is_cost, optimal, within_limits
 from recrl.analysis.statistics.intervals import (
     Interval,
     improvement_interval,
@@ -33,10 +29,6 @@ from recrl.analysis.statistics.intervals import (
 )
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialState
-
-OPTIMAL_GAP = 0.2  # of the return to J*(d_d)
-COST_TOLERANCE = 0.01  # of a limit; in episode cost where the limit is 0
-ROUNDING = 1e-9  # of a difference of two returns: 9.5 - 9.3 is more than 0.2
 
 
 class Measure(StrEnum):
@@ -75,7 +67,7 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     rows = measured.merge(complete[[*KEY, *limits, "optimal_return"]], on=list(KEY))
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
     rows["excess"] = pd.DataFrame(
-        {i: rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"] for i in _costs_of(rows)}
+        {i: rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"] for i in costs_of(rows)}
     ).max(axis=1)
     rows["feasible"] = within_limits(rows)
     rows["optimal"] = optimal(rows)
@@ -83,41 +75,6 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     by_measure = rows["measure"].map(order).rename("_order")
     rows = rows.assign(_order=by_measure).sort_values([*KEY, "_order"], kind="stable", ignore_index=True)
     return rows.drop(columns="_order")
-
-
-def within_limits(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether every mean cost is at most its limit plus ``tolerance``; costs that a task lacks are.
-
-    Args:
-        rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se where costs are sampled.
-    """
-    within: pd.Series[bool] = pd.Series(True, index=rows.index)
-    for i in _costs_of(rows):
-        limit = rows[f"deploy_limit_{i}"]
-        errors = rows[f"cost_{i}_se"] if f"cost_{i}_se" in rows else pd.Series(0.0, index=rows.index)
-        within = within & ((rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna())
-    return within
-
-
-def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[float]:
-    """How far a mean cost may be above its limit: COST_TOLERANCE of it, or a standard error if that is more.
-
-    Args:
-        limits: d_d,i; at a limit of 0 the tolerance is COST_TOLERANCE itself.
-        errors: standard errors of the mean costs; NaN counts as 0.
-    """
-    share = COST_TOLERANCE * limits.where(limits > 0.0, 1.0)
-    return pd.Series(np.maximum(share, errors.fillna(0.0)) + ROUNDING * (1.0 + limits), index=limits.index)
-
-
-def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether a trial is solved: feasible, and at most OPTIMAL_GAP below J*(d_d), which is known.
-
-    Args:
-        rows: gap, and what ``within_limits`` takes.
-    """
-    near = (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & (rows["gap"] > -math.inf)  # NaN is neither
-    return near & within_limits(rows)
 
 
 def training_totals(sweep: Sweep) -> pd.DataFrame:
@@ -247,11 +204,6 @@ def _ends(name: str, interval: Interval) -> dict[str, float]:
     return {name: interval.estimate, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
-def is_cost(name: str) -> bool:
-    """Whether a column is a cost_i itself, not its error, limit or total."""
-    return name.startswith("cost_") and name.removeprefix("cost_").isdigit()
-
-
 def _deployment(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
     chosen = sweep.phases[sweep.phases["phase"] == Phase.DEPLOYMENT.value]
     rows = chosen[[*KEY, "episodes"]].assign(measure=Measure.DEPLOYMENT.value, exact=False)
@@ -286,9 +238,3 @@ def _with_exact(sampled: pd.DataFrame, exact: pd.DataFrame) -> pd.DataFrame:
             known, np.where(np.isnan(values), np.nan, 0.0), sampled[f"{name}_se"]
         )
     return sampled
-
-
-def _costs_of(rows: pd.DataFrame) -> list[str]:
-    """Which i have a column deploy_limit_i."""
-    names = [str(name) for name in rows]
-    return [name.removeprefix("deploy_limit_") for name in names if name.startswith("deploy_limit_")]

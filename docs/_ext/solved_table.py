@@ -4,7 +4,7 @@
     :methods: none, linear, dynamic
     ```
 
-What solved means, and its one tolerance, is defined in recrl.analysis.statistics.metrics.
+What solved means, and its one tolerance, is defined in recrl.analysis.statistics.feasibility.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from recrl.analysis.statistics.metrics import optimal
+from recrl.analysis.statistics.feasibility import optimal
 
 ROOT = Path(__file__).resolve().parents[2]
 MEASURES = {

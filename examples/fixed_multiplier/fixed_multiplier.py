@@ -3,10 +3,10 @@
 from pydantic import Field
 
 from recrl.agents.algorithms.trpo import step_up
-from recrl.agents.config import TrustRegionConfig
 from recrl.agents.learning.actor_critic import fresh_agent, indexed
 from recrl.agents.learning.advantages import SMALLEST_STD
 from recrl.agents.registry import AgentEntry
+from recrl.agents.shared_options import TrustRegionConfig
 
 
 class FixedMultiplierConfig(TrustRegionConfig):

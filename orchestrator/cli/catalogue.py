@@ -13,7 +13,7 @@ from recrl.orchestrator.cli.requests import ListRequest, OptionsRequest, SchemaR
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.catalogue import KINDS, Kind, kinds_of, listed, options_of
-from recrl.orchestrator.grid.schema import grid_schema
+from recrl.orchestrator.grid.json_schema import grid_schema
 
 
 def run_list(request: ListRequest, console: Console) -> ExitCode:

@@ -18,7 +18,7 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import Estimate, Plan, Work
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, standing_of
+from recrl.orchestrator.sweep_progress import Standing, SweepProgress, TrialProgress, standing_of
 
 TERMINAL_SECONDS = 1.0
 LINE_SECONDS = 10.0

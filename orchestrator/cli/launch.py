@@ -15,9 +15,9 @@ from rich.console import Console
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.plan import room, say_plan
-from recrl.orchestrator.cli.progress import say_failures
 from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.cli.results import draw
+from recrl.orchestrator.cli.status import say_failures
 from recrl.orchestrator.cli.sweeps import DEFAULT_ROOT, wanted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.executors import Executor, InlineExecutor
@@ -29,8 +29,8 @@ from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
-from recrl.orchestrator.status import Standing, SweepProgress, progress
 from recrl.orchestrator.sweep import LaunchSettings, Mirror, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep_progress import Standing, SweepProgress, progress
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
 from recrl.orchestrator.tracking.mlflow_sync import last_report

@@ -11,7 +11,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report_tables import number, with_error
 from recrl.analysis.report_verdicts import verdict_text
 from recrl.analysis.statistics.metrics import outcomes
-from recrl.analysis.statistics.verdicts import verdicts
+from recrl.analysis.statistics.verdict_counts import verdicts
 
 CAPTION = (
     "Final policies (stochastic), evaluated without learning: means over n seeds, returns ± standard error.\n"

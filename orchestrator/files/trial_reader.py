@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.errors import CheckpointError, DamagedError, OtherFormatError, StorageError
-from recrl.orchestrator.files import checkpoint
+from recrl.orchestrator.files import checkpoint_format
 from recrl.orchestrator.files.row_files import Extent, digest_of, shortage
 from recrl.orchestrator.files.small_files import read_sealed
 from recrl.orchestrator.files.trial_paths import TrialPaths
@@ -217,7 +217,7 @@ class TrialReader(TrialPaths):
         Raises:
             CheckpointError: it is missing, damaged, of another version, or of another trial.
         """
-        tree = checkpoint.load(path)
+        tree = checkpoint_format.load(path)
         owner = tree.get("trial_id")
         if owner != self.trial_id:
             raise CheckpointError(f"{path}: the checkpoint is that of another trial, {owner}")

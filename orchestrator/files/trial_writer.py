@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from recrl.environments.cmdp import EpisodeStats
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, RowError
-from recrl.orchestrator.files import checkpoint
+from recrl.orchestrator.files import checkpoint_format
 from recrl.orchestrator.files.row_files import Extent, RowFile, rows_text
 from recrl.orchestrator.files.small_files import write_atomically, write_sealed
 from recrl.orchestrator.files.trial_paths import PROVENANCE
@@ -183,7 +183,7 @@ class TrialWriter:
                 for file, (length, digest) in zip(self._rows, written, strict=True)
             }
             cpu_seconds = self.cpu_seconds
-            data = checkpoint.encode(
+            data = checkpoint_format.encode(
                 {
                     "trial_id": self.store.trial_id,
                     "trial": tree,

@@ -35,7 +35,7 @@ from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.environments.registry import make_vector, task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
-from recrl.orchestrator.grid.file_models import (
+from recrl.orchestrator.grid.grid_file import (
     Entry,
     Exclusion,
     GridFile,

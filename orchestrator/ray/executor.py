@@ -44,12 +44,12 @@ from recrl.orchestrator.ray.process_state import environment, own_signal_handler
 from recrl.orchestrator.ray.services import LostServices
 from recrl.orchestrator.ray.teacher_service import start_teacher_service
 from recrl.orchestrator.ray.tune_callbacks import DriverWatch, StopWhenIdle
-from recrl.orchestrator.ray.worker import TuneTrial
+from recrl.orchestrator.ray.tune_trial import TuneTrial
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.status import SILENCE_SECONDS
+from recrl.orchestrator.sweep_progress import SILENCE_SECONDS
 
 if TYPE_CHECKING:
-    from recrl.orchestrator.grid.file_models import Resources
+    from recrl.orchestrator.grid.grid_file import Resources
 
 logger = logging.getLogger("recrl.sweep")
 

@@ -15,7 +15,7 @@ import ray
 
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.places import SweepPlace
-from recrl.orchestrator.ray.worker import spec_of
+from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.spec import TrialState
 
 HEARTBEAT_SECONDS = 2.0  # between two looks at the heartbeats, at least

@@ -25,7 +25,7 @@ from recrl.orchestrator.places import StopSign, SweepPlace
 from recrl.orchestrator.ray.clusters import first_line
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.services import LostServices
-from recrl.orchestrator.ray.worker import spec_of
+from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import RedactedStream
-from recrl.orchestrator.status import Standing, standing_of
+from recrl.orchestrator.sweep_progress import Standing, standing_of
 from recrl.orchestrator.tracking.client import ENVIRONMENT
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker

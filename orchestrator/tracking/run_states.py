@@ -6,12 +6,12 @@ import time
 from collections.abc import Mapping
 
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.status import Standing, standing_of
+from recrl.orchestrator.sweep_progress import Standing, standing_of
 
 MAX_ERROR = 5_000  # characters of a failed trial's error
 
 
-def run_status(record: TrialRecord, *, live: bool) -> str:
+def mlflow_status(record: TrialRecord, *, live: bool) -> str:
     """Return what MLflow calls the state of a trial that has begun.
 
     Args:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.status import Standing, standing_of
+from recrl.orchestrator.sweep_progress import Standing, standing_of
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.points import Summary, charts_page, note
 from recrl.orchestrator.tracking.positions import Position, mirror_folder, read_position

@@ -28,7 +28,7 @@ from recrl.orchestrator.tracking.points import (
     thinned,
 )
 from recrl.orchestrator.tracking.positions import Position, file_mark, mirror_folder, read_position
-from recrl.orchestrator.tracking.run_states import run_status, state_tags
+from recrl.orchestrator.tracking.run_states import mlflow_status, state_tags
 from recrl.orchestrator.tracking.runs import SweepRuns
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class TrialSync:
 def _shown(trial: TrialStore, record: TrialRecord, *, live: bool) -> dict[str, Any]:
     """Return what the run is to show; as long as it does not change, nothing is sent."""
     return {
-        "status": run_status(record, live=live),
+        "status": mlflow_status(record, live=live),
         "attempt": record.attempt,
         "committed": record.committed.get(trial.updates_path.name, 0),
         "error": record.error,

@@ -11,12 +11,12 @@ import torch
 
 from recrl.agents.agent import Agent, EntropyRewarded, Rollout
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
-from recrl.agents.config import AscentConfig
 from recrl.agents.errors import DivergedError
 from recrl.agents.registry import AGENTS, agent_config, make_agent
+from recrl.agents.shared_options import AscentConfig
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
-from recrl.orchestrator.files.checkpoint import decode, encode
+from recrl.orchestrator.files.checkpoint_format import decode, encode
 
 TASKS = {"two-state": 3.0, "two-state-2": 3.0, "continuous-bandit": 2.5}
 OPTIONS = {"hidden_sizes": [16, 16], "critic_steps": 5}

@@ -6,9 +6,9 @@ import sys
 import pytest
 from pydantic import ValidationError
 
-from recrl.agents.algorithms.configs import CPOConfig, PPOLagConfig
-from recrl.agents.config import ActorCriticConfig
+from recrl.agents.algorithms.own_options import CPOConfig, PPOLagConfig
 from recrl.agents.registry import AGENTS, agent_config, find_agent
+from recrl.agents.shared_options import ActorCriticConfig
 from recrl.environments.plugins import UnknownNameError
 
 

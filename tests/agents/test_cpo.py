@@ -7,8 +7,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.algorithms.configs import CPOConfig
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
+from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.learning.actor_critic import improve_and_measure
 from recrl.agents.learning.batch import LearningBatch

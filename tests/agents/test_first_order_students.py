@@ -7,7 +7,6 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 
-from recrl.agents.algorithms.configs import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.algorithms.focops import FirstOrderConstrainedOptimisation, projection_objective
 from recrl.agents.algorithms.ipo import (
     InteriorPointPolicyOptimisation,
@@ -16,6 +15,7 @@ from recrl.agents.algorithms.ipo import (
     relief_of,
     slopes,
 )
+from recrl.agents.algorithms.own_options import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.algorithms.p3o import PenalisedProximalPolicyOptimisation, penalised_surrogate_objective
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.actor_critic import PolicyRule, improve_and_measure

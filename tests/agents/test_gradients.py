@@ -8,9 +8,9 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.algorithms.configs import IPOConfig
 from recrl.agents.algorithms.focops import projection_objective
 from recrl.agents.algorithms.ipo import barrier_surrogate_objective
+from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.algorithms.p3o import penalised_surrogate_objective
 from recrl.agents.algorithms.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
 from recrl.agents.experience import Constraints, Experience

@@ -9,13 +9,13 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 from scipy.optimize import nnls
 
-from recrl.agents.algorithms.configs import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.algorithms.crpo import (
     ConstraintRectifiedPolicyOptimisation,
     most_violated,
     step_down,
     step_up,
 )
+from recrl.agents.algorithms.own_options import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.algorithms.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
 from recrl.agents.experience import Constraints, Experience

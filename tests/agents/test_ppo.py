@@ -7,8 +7,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.algorithms.configs import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
+from recrl.agents.algorithms.own_options import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.algorithms.ppo import ProximalPolicyOptimisation
 from recrl.agents.algorithms.trpo import TrustRegionPolicyOptimisation, step_up
 from recrl.agents.experience import Constraints, Experience

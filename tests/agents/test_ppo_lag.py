@@ -7,7 +7,7 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 
-from recrl.agents.algorithms.configs import PPOLagConfig
+from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import SURROGATE_OBJECTIVES, PPOLagrangian
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.actor_critic import improve_and_measure

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from recrl.analysis import report_page, report_verdicts
-from recrl.analysis.statistics.verdicts import verdicts
+from recrl.analysis.statistics.verdict_counts import verdicts
 
 NONE_COMPARED = pd.DataFrame()
 

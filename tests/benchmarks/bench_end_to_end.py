@@ -35,8 +35,8 @@ from gymnasium.vector.utils import batch_space
 
 from recrl.agents.agent import Policy
 from recrl.agents.collection import Collector, episode_costs
-from recrl.agents.config import ActorCriticConfig
 from recrl.agents.registry import agent_config, make_agent
+from recrl.agents.shared_options import ActorCriticConfig
 from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 from recrl.environments.safety_gym.environments import SafetyGymVectorEnv

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.orchestrator.files.checkpoint import decode, encode
+from recrl.orchestrator.files.checkpoint_format import decode, encode
 
 NUM_ENVS = 3
 SHORT_HORIZON = 12

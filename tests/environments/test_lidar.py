@@ -10,7 +10,7 @@ import pytest
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
-from recrl.environments.safety_gym.native.environment_step import show, turned
+from recrl.environments.safety_gym.native.environment_step import add_to_lidar, turned
 from recrl.environments.safety_gym.scene import rotation_matrices, upright
 
 
@@ -18,7 +18,7 @@ def reading(*places: tuple[float, float]) -> npt.NDArray[np.float32]:
     """What 16 bins read of objects in the robot's frame."""
     bins = np.zeros(16, np.float32)
     for x, y in places:
-        show(float(x), float(y), 3.0, bins)
+        add_to_lidar(float(x), float(y), 3.0, bins)
     return bins
 
 

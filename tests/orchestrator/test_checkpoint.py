@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recrl.orchestrator.errors import CheckpointError
-from recrl.orchestrator.files import checkpoint
+from recrl.orchestrator.files import checkpoint_format
 
 TREE = {
     "weights": [np.arange(6, dtype=np.float32).reshape(2, 3), np.array(2.5)],
@@ -19,7 +19,7 @@ TREE = {
 
 
 def test_a_tree_comes_back_exactly() -> None:
-    again = checkpoint.decode(checkpoint.encode(TREE), source="here")
+    again = checkpoint_format.decode(checkpoint_format.encode(TREE), source="here")
     np.testing.assert_equal(again, TREE)
     assert again["weights"][0].dtype == np.float32
     assert again["weights"][1].shape == ()
@@ -27,35 +27,37 @@ def test_a_tree_comes_back_exactly() -> None:
 
 
 def test_equal_trees_give_equal_bytes() -> None:
-    assert checkpoint.encode(TREE) == checkpoint.encode(TREE)
+    assert checkpoint_format.encode(TREE) == checkpoint_format.encode(TREE)
 
 
 def test_a_transposed_array_keeps_its_values() -> None:
     array = np.arange(6).reshape(2, 3).T
-    np.testing.assert_equal(checkpoint.decode(checkpoint.encode({"a": array}), source="here")["a"], array)
+    np.testing.assert_equal(
+        checkpoint_format.decode(checkpoint_format.encode({"a": array}), source="here")["a"], array
+    )
 
 
 @given(st.data())
 def test_damage_anywhere_is_noticed(data: st.DataObject) -> None:
-    intact = checkpoint.encode(TREE)
+    intact = checkpoint_format.encode(TREE)
     position = data.draw(st.integers(0, len(intact) - 1))
     flipped = bytes([intact[position] ^ data.draw(st.integers(1, 255))])
     with pytest.raises(CheckpointError):
-        checkpoint.decode(intact[:position] + flipped + intact[position + 1 :], source="here")
+        checkpoint_format.decode(intact[:position] + flipped + intact[position + 1 :], source="here")
 
 
-@given(st.integers(0, len(checkpoint.encode(TREE)) - 1))
+@given(st.integers(0, len(checkpoint_format.encode(TREE)) - 1))
 def test_truncation_is_noticed(length: int) -> None:
     with pytest.raises(CheckpointError):
-        checkpoint.decode(checkpoint.encode(TREE)[:length], source="here")
+        checkpoint_format.decode(checkpoint_format.encode(TREE)[:length], source="here")
 
 
 def test_objects_are_refused() -> None:
     with pytest.raises(TypeError, match=r"checkpoint: \$\.a\.0: cannot store a PosixPath"):
-        checkpoint.encode({"a": [Path("x")]})
+        checkpoint_format.encode({"a": [Path("x")]})
 
 
 def test_missing_file_is_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "gone.recrl"
     with pytest.raises(CheckpointError, match=rf"{path}: cannot be read: No such file or directory"):
-        checkpoint.load(path)
+        checkpoint_format.load(path)

@@ -28,7 +28,7 @@ seeds: 1
 run: {total_steps: 160, deploy_fraction: 0.5, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
 UNLUCKY_STUDENT = """\
-from recrl.agents.algorithms.configs import PPOLagConfig
+from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.registry import AgentEntry
 
 def make(cmdp, config, seed):

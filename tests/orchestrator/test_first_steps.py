@@ -16,7 +16,7 @@ from recrl.orchestrator.cli.command_arguments import TEMPLATES
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.grid.schema import grid_schema
+from recrl.orchestrator.grid.json_schema import grid_schema
 from recrl.teachers.registry import TEACHERS
 
 ROOT = Path(__file__).parents[2]

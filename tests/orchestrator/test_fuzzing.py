@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from recrl.orchestrator.errors import CheckpointError, GridError
-from recrl.orchestrator.files.checkpoint import MAGIC, decode, encode
+from recrl.orchestrator.files.checkpoint_format import MAGIC, decode, encode
 from recrl.orchestrator.grid.grid import GridSpec, parse_grid
 
 EXAMPLES = int(os.environ.get("RECRL_FUZZ_EXAMPLES", "60"))

@@ -440,7 +440,7 @@ def test_a_row_with_other_columns_names_the_agent(
 
 
 FICKLE = """\
-from recrl.agents.algorithms.configs import PPOLagConfig
+from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import make_ppo_lag
 from recrl.agents.registry import AgentEntry
 

@@ -14,7 +14,7 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.plan import make_plan
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.status import (
+from recrl.orchestrator.sweep_progress import (
     SILENCE_SECONDS,
     Standing,
     SweepProgress,

@@ -17,8 +17,8 @@ from recrl.orchestrator.grid.grid import GridSpec, parse_grid
 from recrl.orchestrator.grid.plan import Plan, Work
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.status import SweepProgress
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep_progress import SweepProgress
 
 GRID = """\
 name: small
@@ -32,7 +32,7 @@ run: {total_steps: 120, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 # A user's own student that breaks down as long as a file called "broken" is in the working directory.
 FRAGILE_STUDENT = """\
 from pathlib import Path
-from recrl.agents.algorithms.configs import PPOLagConfig
+from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import make_ppo_lag
 from recrl.agents.registry import AgentEntry
 

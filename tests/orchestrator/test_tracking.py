@@ -35,7 +35,7 @@ from recrl.orchestrator.tracking.points import (
     rows_after,
     thinned,
 )
-from recrl.orchestrator.tracking.run_states import run_status
+from recrl.orchestrator.tracking.run_states import mlflow_status
 from recrl.orchestrator.tracking.ui import open_ui, ui_command, ui_url
 from tests.faults.committing import commit_file
 
@@ -200,7 +200,7 @@ def test_run_states_are_true(status: TrialState, live: bool, expected: str) -> N
     record = TrialRecord(
         status=status, attempt=1, heartbeat=time.time(), host=socket.gethostname(), pid=os.getpid()
     )
-    assert run_status(record, live=live) == expected
+    assert mlflow_status(record, live=live) == expected
 
 
 def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
@@ -209,10 +209,10 @@ def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
     here = TrialRecord(
         status=TrialState.RUNNING, heartbeat=time.time(), host=socket.gethostname(), pid=process.pid
     )
-    assert run_status(here, live=True) == "KILLED"
+    assert mlflow_status(here, live=True) == "KILLED"
     elsewhere = replace(here, host="elsewhere")
-    assert run_status(elsewhere, live=True) == "RUNNING"
-    assert run_status(replace(elsewhere, heartbeat=time.time() - 301.0), live=True) == "KILLED"
+    assert mlflow_status(elsewhere, live=True) == "RUNNING"
+    assert mlflow_status(replace(elsewhere, heartbeat=time.time() - 301.0), live=True) == "KILLED"
 
 
 # Against a real database

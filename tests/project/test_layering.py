@@ -53,7 +53,7 @@ ADAPTERS = {
 LAYERS = (
     ("background", "errors", "exit_codes", "located_yaml", "redaction", "spec", "untrusted", "validation"),
     ("files",),
-    ("executors", "places", "status", "trial"),
+    ("executors", "places", "sweep_progress", "trial"),
     ("grid", "remote"),
     ("tracking",),
     ("ray", "report_refresh", "sweep"),

@@ -201,7 +201,7 @@ def write_rotation(quaternion: Any, out: Any) -> None:
 
 
 @compiled
-def show(x: float, y: float, lidar_range: float, bins: Any) -> None:
+def add_to_lidar(x: float, y: float, lidar_range: float, bins: Any) -> None:
     """Let one object be seen by the pseudo-lidar: bin b shows the most that any object has there.
 
     The circle around the robot is divided into sectors. An object at distance d reads max(0, 1 - d / range)
@@ -389,7 +389,7 @@ def observe(task: Any, world: Any, data: int, index: int) -> None:
         for place in range(task.start[kind], task.stop[kind]):
             point = world.points[place]
             x, y, _ = turned(rotation, point[0] - robot[0], point[1] - robot[1], -robot[2])
-            show(x, y, task.lidar_range, bins)
+            add_to_lidar(x, y, task.lidar_range, bins)
     feel(task, world, data, seen)
 
 

@@ -21,8 +21,8 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import make_plan
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.status import Standing, SweepProgress, TrialProgress, progress, standing_of
 from recrl.orchestrator.sweep import REQUEST_SECONDS
+from recrl.orchestrator.sweep_progress import Standing, SweepProgress, TrialProgress, progress, standing_of
 
 
 def run_status(request: StatusRequest, console: Console) -> ExitCode:

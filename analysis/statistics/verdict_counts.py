@@ -11,7 +11,8 @@ import math
 import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
-from recrl.analysis.statistics.metrics import Measure, is_cost
+from recrl.analysis.statistics.feasibility import is_cost
+from recrl.analysis.statistics.metrics import Measure
 
 FINAL = Measure.STOCHASTIC
 

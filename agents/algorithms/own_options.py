@@ -1,4 +1,4 @@
-"""What can be set of each algorithm; ``recrl.agents.config`` has what several of them share.
+"""What can be set of each algorithm; ``recrl.agents.shared_options`` has what several of them share.
 
 Imports no torch, so that a grid is validated in a moment: that is why these are not beside the algorithms.
 """
@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from recrl.agents.config import (
+from recrl.agents.shared_options import (
     STARTER_AGENTS_ASCENT,
     STARTER_AGENTS_MULTIPLIERS,
     STARTER_AGENTS_SETTING,
