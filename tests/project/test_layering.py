@@ -35,7 +35,7 @@ ALLOWED = {
 ADAPTERS = {
     "PIL": r"orchestrator\.trial\.videos",
     "av": r"orchestrator\.trial\.videos",
-    "torch": r"agents\..*|orchestrator\.(trial\.(trial|speed)|ray\.worker)",
+    "torch": r"agents\..*|orchestrator\.(trial\.(trial|speed)|ray\.tune_trial)",
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\.rivergrid\..*",
     "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
@@ -45,7 +45,7 @@ ADAPTERS = {
     "matplotlib": r"analysis\..*",
     "yaml": r"orchestrator\.located_yaml",
     "rich": r"orchestrator\.cli\..*",
-    "safetensors": r"orchestrator\.files\.checkpoint",
+    "safetensors": r"orchestrator\.files\.checkpoint_format",
     "fsspec": r"orchestrator\.remote\.object_store",
 }
 # The order inside the orchestrator, of its folders and of the modules beside them: nothing may import what
