@@ -2,10 +2,10 @@
 
 A CMDP is (S, A, T, gamma, R, C, d) (paper, section 3). ``CMDPSpec`` is all of it that a task fixes;
 the limits d are never part of it, because in RECRL they change (``CostLimits``). The discount gamma
-belongs to the student's critics: returns, episode costs and limits are *undiscounted* sums over an
+belongs to the agent's critics: returns, episode costs and limits are *undiscounted* sums over an
 episode, which is the unit in which the paper states its limits.
 
-Letters: k is the number of cost functions, b an episode's index, B the training budget.
+Notation: k is the number of cost functions, b an episode's index, B the training budget.
 
 Imports neither Gymnasium nor torch at run time, so that teachers can use it alone.
 """

@@ -1,4 +1,4 @@
-"""Finding tasks, students and teachers by name, so that a user's package plugs in without a fork.
+"""Finding tasks, agents and teachers by name, so that a user's package plugs in without a fork.
 
 A name is, in this order: one of ours; an entry point of an installed package; an import path
 ``package.module:attribute``. Imports nothing but the standard library.
@@ -24,7 +24,7 @@ from typing import Any
 
 
 class UnknownNameError(ValueError):
-    """A task, student or teacher that nobody provides."""
+    """A task, agent or teacher that nobody provides."""
 
 
 class UntrustedNameError(Exception):

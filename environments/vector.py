@@ -15,7 +15,7 @@ Every task reaches the agents as a ``CMDPVectorEnv``. What crosses, and nothing 
 - ``state_dict`` holds everything that the future depends on, generators included; a tree of dicts,
   lists, JSON scalars and NumPy arrays. ``load_state_dict`` continues exactly from there.
 
-Letters: B environments, k costs.
+Notation: B environments, k costs.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class TrackingError(RecrlError):
     """MLflow cannot be used in the way that was asked for; training does not depend on it."""
 
 
-# What a user's own task, student or teacher may raise, and what must not end more than its own work.
+# What a user's own task, agent or teacher may raise, and what must not end more than its own work.
 USERS_ERRORS = (Exception, SystemExit)
 
 

@@ -4,7 +4,7 @@ Two trials with equal specs give equal bytes. Paths, cluster addresses, logging 
 are therefore not in it. ``trial_id`` is a hash of the spec's canonical JSON; ``group`` is the same hash
 without the seed, so that runs to be averaged share it.
 
-Letters: d_t training limits, d_d deployment limits, B the training budget, T rollout steps.
+Notation: d_t training limits, d_d deployment limits, B the training budget, T rollout steps.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class TrialState(StrEnum):
 
 @dataclass(frozen=True)
 class Choice:
-    """A task, student or teacher chosen in a grid.
+    """A task, agent or teacher chosen in a grid.
 
     Attributes:
         name: registry name, entry point or import path.
@@ -67,7 +67,7 @@ class TrialSpec:
 
     Attributes:
         task: the CMDP.
-        agent: the student.
+        agent: the agent.
         method: the teacher; its label is the method's name in tables and figures.
         train_limits: d_t, [k]; infinite where the teacher is to measure its start or needs none.
         deploy_limits: d_d, [k], finite, at most d_t.

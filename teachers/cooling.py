@@ -1,9 +1,9 @@
 """The cooling curriculum: a reward for being random, and a limit that is relaxed in proportion to it (ours).
 
-A student that settles on the first way it finds tries no other, and noise in its parameters is undone before
+An agent that settles on the first way it finds tries no other, and noise in its parameters is undone before
 it leads anywhere. Here randomness is *worth* something: every nat of the policy's entropy counts as so much
-reward, a temperature that falls in a straight line. While it is high the student keeps several ways open and
-the best of them gains as it falls, instead of the first. A random policy cannot keep d_d, and a student that
+reward, a temperature that falls in a straight line. While it is high the agent keeps several ways open and
+the best of them gains as it falls, instead of the first. A random policy cannot keep d_d, and an agent that
 is held to it all the same stays where nothing costs anything; so the limit is relaxed as far as the
 temperature is high, and both arrive together.
 

@@ -1,33 +1,33 @@
-"""The dynamic curriculum: the cost limit follows the student (CLiC_D, Algorithm 2 of the paper).
+"""The dynamic curriculum: the cost limit follows the agent (CLiC_D, Algorithm 2 of the paper).
 
-The teacher compares the student's last two windows. Once return and costs have stopped changing, a student
-that keeps its limit is given a lower one, and a student that does not is stuck: its policy gets noise.
+The teacher compares the agent's last two windows. Once return and costs have stopped changing, an agent
+that keeps its limit is given a lower one, and an agent that does not is stuck: its policy gets noise.
 
 Where Algorithm 2 is silent or goes wrong, and what is done here; the preset ``paper`` is the pseudocode to
 the letter wherever it is defined.
 
-- *Clock.* The student learns once per policy update, so it is judged once per update, over windows of whole
+- *Clock.* The agent learns once per policy update, so it is judged once per update, over windows of whole
   updates (``windows``). With one episode an update this is Algorithm 2's clock.
 - *Enough episodes* (``window_grows``). The ratio of two noisy means passes the test of line 5 by chance: with
   8 episodes a window, frozen policies of Safety Gym did in up to 59% of the cases. So a window takes in more
   updates until the standard errors of its means are within the tolerances, and until then nothing is decided.
   The tolerances are of the mean or of the episodes' standard deviation, whichever is more, so that 100
   episodes always are enough.
-- *Zero and negative means* (line 5). |new / old - 1| divides by zero for a student that has become perfectly
+- *Zero and negative means* (line 5). |new / old - 1| divides by zero for an agent that has become perfectly
   safe, and it would wait for ever. |new - old| <= eps max(|old|, floor) is the same test where that is
   defined, and 0 against 0 has converged. The floor keeps small means from being compared by their noise.
 - *Nothing finished.* A window without an episode says nothing: hold.
-- *Adherence* (line 6). A student at its optimum has a mean cost a little above its limit as often as below,
+- *Adherence* (line 6). An agent at its optimum has a mean cost a little above its limit as often as below,
   or always (whoever must cross five tiles of river and slips once in a while costs 5.004), and C <= d would
   kick it for ever. C may exceed d by as much as line 5 lets equal costs differ, or by its standard error.
 - *The step* (line 7). B - b counts episodes, b being the one about to be played, but a limit moves only once
   per window, so that the limits stay far above d_d. Counted in windows that are left, the steps add up to the
-  whole way. The last two are not counted: so long a student may need to settle after a large step, and it
+  whole way. The last two are not counted: so long an agent may need to settle after a large step, and it
   would meet d_d only at B.
 - *Which limits a window was played under.* The newer window lies wholly after the last change (line 4); the
-  older one may lie before it, so that a student who follows each change at once is not made to wait twice.
+  older one may lie before it, so that an agent who follows each change at once is not made to wait twice.
 - *last_change* is reset when limits or policy have changed. Line 11 also resets it when nothing has, that
-  is, whenever the student has converged: a limit that is d_d already, or noise of 0, then delays the next
+  is, whenever the agent has converged: a limit that is d_d already, or noise of 0, then delays the next
   test by a window (``clock_reset``).
 - *Noise* (line 9) is a disturbance of the teacher's own making: costs jump, and take updates to come back. If
   the next window is compared with the one before the noise, two windows with the same jump in them look
@@ -40,9 +40,9 @@ the letter wherever it is defined.
   would hold the limits of all the others at d_t. Each limit goes its own way: it falls when the return and
   its own cost have converged and its own limit is kept; the policy gets noise when any converged cost is
   above its limit. A step in one dimension makes the others wait for one window, and noise for two.
-- *The end.* At B the limits are d_d whatever the student does, and there is no noise.
+- *The end.* At B the limits are d_d whatever the agent does, and there is no noise.
 
-One consequence of line 7 is kept, and worth knowing: a student whose converged cost is below d_d is given
+One consequence of line 7 is kept, and worth knowing: an agent whose converged cost is below d_d is given
 d_d at once, whatever remains of the budget.
 
 Notation: d limits in force, d_t training limits, d_d deployment limits, B the training budget in environment
@@ -158,7 +158,7 @@ class DynamicConfig(BaseModel):
     clock_reset: Literal["change", "convergence"] = Field(
         default="change",
         description="When last_change begins anew: when limits or policy have changed, or whenever the "
-        "student has converged, also where nothing changes then (line 11, literal).",
+        "agent has converged, also where nothing changes then (line 11, literal).",
         exclude_if=lambda value: value == "change",  # trials from before this option keep their identity
     )
     dimensions: Literal["separate", "joint"] = Field(
@@ -170,7 +170,7 @@ class DynamicConfig(BaseModel):
         default=0.3,
         ge=0.0,
         le=1.0,
-        description="eps_pi: noise added to the policy of a student that is stuck; not given in the paper.",
+        description="eps_pi: noise added to the policy of an agent that is stuck; not given in the paper.",
     )
 
     @model_validator(mode="before")

@@ -57,7 +57,7 @@ TEACHERS: dict[str, TeacherKind] = {
         "CLiC_E: from d_t to d_d, fast at first.", DecayConfig, partial(decay_teacher, decay=exponential)
     ),
     "dynamic": TeacherKind(
-        "CLiC_D: lower limits for a student that keeps them, noise for one that is stuck.",
+        "CLiC_D: lower limits for an agent that keeps them, noise for one that is stuck.",
         DynamicConfig,
         DynamicTeacher,
     ),

@@ -164,7 +164,7 @@ def unconstrained_teacher(spec: TeacherSpec) -> StaticTeacher:
     """A control: no limit at all until B, whatever d_t is, then d_d at once.
 
     It is ``step`` with d_t = infinity, which makes an MDP of the training model (paper, section 4): what the
-    student earns and costs when nothing holds it back.
+    agent earns and costs when nothing holds it back.
     """
     unlimited = CostLimits.unlimited(len(spec.train_limits))
     return StaticTeacher(replace(spec, train_limits=unlimited), decay=hold)

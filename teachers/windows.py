@@ -1,4 +1,4 @@
-"""What a student did over some consecutive policy updates, and the two windows the dynamic teacher compares.
+"""What an agent did over some consecutive policy updates, and the two windows the dynamic teacher compares.
 
 A policy is constant between two updates, so a window is made of whole updates and its episodes are summed
 up once, when they are reported: judging costs nothing per episode, and a state keeps one short record for

@@ -23,7 +23,7 @@ from recrl.orchestrator.tracking.mlflow_sync import sync
 
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0
-# How the made-up students end: return and cost without a curriculum, and with one.
+# How the made-up agents end: return and cost without a curriculum, and with one.
 STUCK, SOLVED = (-15.0, 0.5), (8.0, 4.8)
 
 
@@ -107,7 +107,7 @@ class MadeUpSweep:
 def _write_updates(
     writer: TrialWriter, spec: TrialSpec, updates: int, generator: np.random.Generator
 ) -> tuple[float, float]:
-    """Rows of a made-up student that follows its limit; returns its last return and cost."""
+    """Rows of a made-up agent that follows its limit; returns its last return and cost."""
     steps, index, value, cost = STEPS_PER_UPDATE, 0, 0.0, 0.0
     solves = spec.method.label != "none" or spec.seed % 3 == 0
     value_end, cost_end = SOLVED if solves else STUCK

@@ -31,7 +31,7 @@ Updates under an infinite limit (a d_t that is still being measured) have no bou
 horizon and largest cost are unknown there is no ceiling: the first policy then counts with what it cost, and
 only ``discounted_bound`` can be told.
 
-Letters: b policies, n their number, C_b, D_b cost and limit, d_t, d_d training and deployment limit, H
+Notation: b policies, n their number, C_b, D_b cost and limit, d_t, d_d training and deployment limit, H
 horizon, c_max largest cost of a step, delta, eps, gamma as in ``bounds``.
 """
 

@@ -23,7 +23,7 @@ The same script finds point estimates equal to rliable 1.2.0's within 2e-16 on 5
 ``Interval.is_small`` is true below ``ENOUGH_RUNS``; tables then print a mark. ``mean_interval`` (Student's t)
 keeps its promise for normal data at any n >= 2, and is the one to trust at n = 5.
 
-Letters: n runs (seeds), m tasks, r bootstrap replications. Scores are [..., n, m]: runs in rows, tasks in
+Notation: n runs (seeds), m tasks, r bootstrap replications. Scores are [..., n, m]: runs in rows, tasks in
 columns. NaN never enters: drop unfinished runs first.
 """
 

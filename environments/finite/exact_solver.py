@@ -9,9 +9,9 @@ over all policies, time-dependent and random ones included, undiscounted over a 
 horizons and for tests; ``solve_by_lagrangian`` solves RiverGrid's 200 steps in some 0.1 s. They agree under
 test.
 
-J* bounds what a student can reach from above: a student's policy sees no clock.
+J* bounds what an agent can reach from above: an agent's policy sees no clock.
 
-Letters: H horizon, S states, A actions, k costs, t a time step, x an occupation measure, lambda the
+Notation: H horizon, S states, A actions, k costs, t a time step, x an occupation measure, lambda the
 multipliers [k].
 """
 

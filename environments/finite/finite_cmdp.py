@@ -4,7 +4,7 @@ A finite CMDP with a known model is worth having: its constrained optimum is kno
 (``recrl.environments.finite.exact_solver``), so a learner is scored against the truth, and a batch of it is
 stepped by table look-ups.
 
-Letters: S states, A actions, m successors that a (state, action) pair can have, k costs, B environments,
+Notation: S states, A actions, m successors that a (state, action) pair can have, k costs, B environments,
 n observation components.
 """
 

@@ -1,7 +1,7 @@
 """The smallest CMDPs with a closed-form constrained optimum: on these, learners are tested.
 
 Two states, a camp and a mine. An episode starts in the camp, where nothing is earned; the way to the mine
-takes steps that bring nothing either, so a student must look ahead. In the mine a careful step earns 1; a
+takes steps that bring nothing either, so an agent must look ahead. In the mine a careful step earns 1; a
 hasty step earns 2 and wears the tools; a reckless step earns 3, wears the tools and makes noise. All of them
 stay in the mine. ``two-state`` has the first two and the cost ``wear``; ``two-state-2`` has all three and the
 costs ``wear`` and ``noise``.
@@ -14,7 +14,7 @@ Cost: ``wear`` 1 a hasty or reckless step in the mine, ``noise`` 1 a reckless st
 Termination: never; truncated after ``horizon`` steps.
 Source: ours.
 
-With n the expected number of steps in the mine when a student goes at once,
+With n the expected number of steps in the mine when an agent goes at once,
 
     J*(d) = n + min(d_wear, n) + min(d_wear, d_noise, n),    n = sum_{t=1}^{H-1} (1 - (1 - p)^t),
 
@@ -71,7 +71,7 @@ def two_state_cmdp(options: TwoStateOptions, num_costs: int) -> FiniteCMDP:
 
 
 def expected_steps_in_mine(options: TwoStateOptions) -> float:
-    """The expected steps in the mine of a student that sets off at once, n = sum_{t<H} (1 - (1 - p)^t).
+    """The expected steps in the mine of an agent that sets off at once, n = sum_{t<H} (1 - (1 - p)^t).
 
     >>> expected_steps_in_mine(TwoStateOptions(horizon=10))
     9.0

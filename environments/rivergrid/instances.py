@@ -1,4 +1,4 @@
-"""RiverGrid instances like the paper's two, drawn at random by rules that know no student.
+"""RiverGrid instances like the paper's two, drawn at random by rules that know no agent.
 
 A river of changing width runs through the whole map, from north to south or from west to east; the start is
 drawn on one bank and the goal on the other. There is a dry way round as on 1b, or there is none as on 1a.
@@ -11,7 +11,7 @@ equal maps on every machine: all draws are floor(n u) of the raw 64-bit numbers 
 the same for ever (its distributions it may change).
 
 What makes an instance, and which limit d_d goes with it (``suggested_limit``), is counted on the map, so that
-nothing about it can have been tuned on a student. Steps are a route's actions, turns included; its cost is
+nothing about it can have been tuned on an agent. Steps are a route's actions, turns included; its cost is
 its time steps in the river.
 """
 
@@ -132,7 +132,7 @@ def _shortest(river_map: RiverMap, *, step: tuple[int, int], wet: tuple[int, int
 
 
 def is_instance(river_map: RiverMap, settings: InstanceSettings, *, dry_route: bool) -> bool:
-    """Whether a map asks of a student what the paper's two ask.
+    """Whether a map asks of an agent what the paper's two ask.
 
     - The goal can be reached.
     - The quickest way leads through the river and costs at least the river's least width: without a limit,

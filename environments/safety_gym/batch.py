@@ -13,7 +13,7 @@ Termination: when there is no room for a new goal, or when the physics breaks do
     after 1,000 steps.
 Source: openai/safety-gym ``engine.py``; where safety-gymnasium 1.0.0 differs, this follows Safety Gym.
 
-Letters: B worlds, P objects that the lidar sees, k costs.
+Notation: B worlds, P objects that the lidar sees, k costs.
 """
 
 from __future__ import annotations

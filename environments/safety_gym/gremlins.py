@@ -9,7 +9,7 @@ nothing touches it and it is back on its course. While it is none it hovers, unt
 This halves the cost of a step, and robots cannot tell: over encounters of 120 steps the robot ends within
 1e-15 m of where it ends among six bodies.
 
-Letters: B environments, G gremlins.
+Notation: B environments, G gremlins.
 
 Source: openai/safety-gym ``engine.py``, ``set_mocaps``. Its gremlins hover at 0.2 m and set out from their
 circle's middle at 0.1 m: kept.

@@ -7,7 +7,7 @@ states is not compared: it is chaotic, and engines differ in the last digits.
 
 The recordings' format is described in ``tests/parity/README.md``.
 
-Letters: T steps in an episode, B worlds, one for each state of a chunk of an episode.
+Notation: T steps in an episode, B worlds, one for each state of a chunk of an episode.
 """
 
 from __future__ import annotations

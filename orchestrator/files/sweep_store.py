@@ -14,7 +14,7 @@
             spec.json           the TrialSpec
             state.json          the TrialRecord: status, progress, lease, committed lengths and digests
             episodes.csv        a row an episode: EPISODE_COLUMNS and one cost_i, limit_i per cost
-            updates.csv         a row a policy update: UPDATE_COLUMNS and the student's own metrics
+            updates.csv         a row a policy update: UPDATE_COLUMNS and the agent's own metrics
             events.jsonl        a line an event: noise added, limits measured, phase changed
             evaluation.csv      a row an episode of the frozen-policy evaluations: EVALUATION_COLUMNS
             policy.csv          of finite tasks: the final policy, a row a state, action_j for each action

@@ -38,7 +38,7 @@ class TrialTables(TrialReader):
         return self._committed_csv(self.episodes_path)
 
     def updates(self) -> pd.DataFrame:
-        """The committed policy updates: UPDATE_COLUMNS, cost_i, limit_i, then the student's metrics."""
+        """The committed policy updates: UPDATE_COLUMNS, cost_i, limit_i, then the agent's metrics."""
         return self._committed_csv(self.updates_path)
 
     def events(self) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@
     seeds: 5
     run: {total_steps: 960000}
 
-A grid is a product: every task x student x method x seed, less what ``exclude`` names. ``read_grid`` reports
+A grid is a product: every task x agent x method x seed, less what ``exclude`` names. ``read_grid`` reports
 every mistake at once, each with its line; ``GridSpec.trials`` is pure, ordered and free of duplicates. Seeds
 are the outermost loop, so that every method gets its first seed before any gets its second.
 
@@ -84,7 +84,7 @@ class GridSpec:
     Attributes:
         name: the sweep's name.
         tasks: the CMDPs with their limits.
-        agents: the students.
+        agents: the agents.
         methods: the teachers.
         seeds: at least one, all different.
         run: how long and how wide every trial runs.

@@ -141,7 +141,7 @@ class _Written(BaseModel):
 
 
 class Entry(_Written):
-    """A student or a method: its name, or a mapping."""
+    """An agent or a method: its name, or a mapping."""
 
     name: ShortText = Field(description="Registry name, entry point or package.module:attribute.")
     label: PlainText = Field(

@@ -111,11 +111,11 @@ class Estimate:
     """About what a plan takes.
 
     Attributes:
-        cpu_seconds: CPU time of the trials, or None where no trial of some task and student has run yet.
+        cpu_seconds: CPU time of the trials, or None where no trial of some task and agent has run yet.
         wall_seconds: with ``concurrent`` trials at once, or None.
         concurrent: trials at once.
         gigabytes: main memory while they run.
-        unknown: the tasks and students without a measured speed, as ``task agent``.
+        unknown: the tasks and agents without a measured speed, as ``task agent``.
     """
 
     cpu_seconds: float | None
@@ -165,7 +165,7 @@ def make_plan(
 def estimate(plan: Plan, *, concurrent: int, speeds: Mapping[str, float] | None = None) -> Estimate:
     """Time from the speed of the trials that have run so far, memory from what a trial's process takes.
 
-    A speed is measured in environment steps per CPU second, for each task and student with their options.
+    A speed is measured in environment steps per CPU second, for each task and agent with their options.
 
     Args:
         plan: what is to do.
@@ -248,7 +248,7 @@ def _work(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> Wo
 
 
 def kind_of(spec: TrialSpec) -> str:
-    """What trials of about equal speed share: the task and the student, options and width included."""
+    """What trials of about equal speed share: the task and the agent, options and width included."""
     kind: tuple[Choice | int, ...] = (spec.task, spec.agent, spec.num_envs, spec.rollout_steps)
     return repr(kind)
 

@@ -68,7 +68,7 @@ class TuneTrial(tune.Trainable):
 
 
 def _given_gpu() -> AbstractContextManager[Any]:
-    """Students made meanwhile live on the GPU that Ray gave this worker, if it gave one that can be used."""
+    """Agents made meanwhile live on the GPU that Ray gave this worker, if it gave one that can be used."""
     if not ray.get_gpu_ids():
         return nullcontext()
     import torch  # noqa: PLC0415  (the driver does without)

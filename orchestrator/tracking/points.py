@@ -6,7 +6,7 @@ Metrics are drawn against environment steps and sorted into the UI's chart secti
     train/episodes                        how many those are
     deploy/return, deploy/cost_0, ...     the same, deployment phase
     curriculum/limit_0, curriculum/noise  what the teacher set; curriculum/temperature if it has one
-    student/<name>                        what the student reported: kl, entropy, multiplier_0, ...
+    agent/<name>                        what the agent reported: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
     summary/deploy_return, ..._cost_0     mean over the episodes of the deployment phase; once, at the end
     evaluation/<policy>_return, ..._cost_0    mean over a frozen policy's episodes; once, at the end
@@ -61,7 +61,7 @@ VIEW_STATE = {
             "deleted": False,
             "isGenerated": True,
         }
-        for name in ("train", "curriculum", "deploy", "summary", "evaluation", "student", "perf")
+        for name in ("train", "curriculum", "deploy", "summary", "evaluation", "agent", "perf")
     ],
     "isAccordionReordered": True,
 }
@@ -143,7 +143,7 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
         elif re.fullmatch(r"limit_\d+|temperature", column):
             values[f"curriculum/{column}"] = float(row[column])
         else:
-            values[f"student/{_safe(column)}"] = float(row[column])
+            values[f"agent/{_safe(column)}"] = float(row[column])
     return _points(values, row)
 
 
@@ -192,7 +192,7 @@ class Summary:
     """What the note on a sweep says of one complete trial.
 
     Attributes:
-        group: task, student and method, as people call them.
+        group: task, agent and method, as people call them.
         values: ``summary/...`` by name.
     """
 
@@ -223,7 +223,7 @@ def note(name: str, counts: Mapping[str, int], complete: Sequence[Summary], *, c
     ]
     names = sorted({value.removeprefix("summary/") for trial in complete for value in trial.values})
     if names:
-        heads = ["task", "student", "method", "seeds", *(value.replace("_", " ") for value in names)]
+        heads = ["task", "agent", "method", "seeds", *(value.replace("_", " ") for value in names)]
         lines += ["", "Means over the deployment phase of complete trials:", ""]
         lines += ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for group in sorted({trial.group for trial in complete}):

@@ -47,7 +47,7 @@ class FrozenTrial:
     Attributes:
         store: the trial's folder.
         spec: what the trial is.
-        agent: the student; nobody updates it.
+        agent: the agent; nobody updates it.
         cmdp: what its task fixes.
         update: policy updates it has learnt for.
         env_steps: environment steps it has learnt from.
@@ -66,7 +66,7 @@ class FrozenTrial:
 
         Raises:
             NoCheckpointError: there is no intact checkpoint.
-            RecrlError: the task or the student cannot be built, or the checkpoint does not fit them.
+            RecrlError: the task or the agent cannot be built, or the checkpoint does not fit them.
         """
         spec = store.spec
         checkpoint = store.latest_checkpoint()
@@ -83,7 +83,7 @@ class FrozenTrial:
             raise RecrlError(f"{spec.title}: {error}; if you trust it, add --trust") from error
         except USERS_ERRORS as error:
             raise RecrlError(
-                f"{spec.title}: its checkpoint cannot be used with the task and the student as they are "
+                f"{spec.title}: its checkpoint cannot be used with the task and the agent as they are "
                 f"installed: {described(error)}"
             ) from error
 

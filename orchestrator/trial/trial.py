@@ -1,4 +1,4 @@
-"""One trial, as a pure program: a student learns a task under a teacher's limits, and leaves files.
+"""One trial, as a pure program: an agent learns a task under a teacher's limits, and leaves files.
 
 Knows neither Ray nor MLflow: an executor runs it, a mirror shows it. All of a trial's state (agent,
 optimisers, multipliers, teacher, environments, generators, counters, partial episodes) is in one tree, so a
@@ -69,7 +69,7 @@ class TrialSeeds:
 
     Attributes:
         environment: of the environments it learns in.
-        agent: of the student's initial parameters.
+        agent: of the agent's initial parameters.
         exploration: of the actions it takes while it learns.
         evaluation: of the frozen policy's environments and actions.
     """
@@ -81,7 +81,7 @@ class TrialSeeds:
 
     @classmethod
     def of(cls, spec: TrialSpec) -> Self:
-        """The sources of a trial; the same seed gives the same under every task, student and method."""
+        """The sources of a trial; the same seed gives the same under every task, agent and method."""
         return cls(*np.random.SeedSequence(spec.seed).spawn(4))
 
 
@@ -358,7 +358,7 @@ def run_trial(
     Raises:
         LostLeaseError: another attempt took the trial over.
         StorageError: the disk is full or gone; the last commit stands.
-        Exception: whatever the task, the student or the teacher raised, with a note of where; the last
+        Exception: whatever the task, the agent or the teacher raised, with a note of where; the last
             commit stands.
     """
     life = _Life(writer)

@@ -1,4 +1,4 @@
-"""What every student promises, whatever its algorithm (``recrl.agents.agent.Agent``)."""
+"""What every agent promises, whatever its algorithm (``recrl.agents.agent.Agent``)."""
 
 import gc
 import math
@@ -24,7 +24,7 @@ FINITE, SEVERAL_UPDATES = 3.0, 4
 
 
 class Lessons:
-    """A student with its task, advanced update by update."""
+    """An agent with its task, advanced update by update."""
 
     def __init__(self, agent: str, task: str, options: dict[str, Any] | None = None) -> None:
         environments = make_vector(task, 4)

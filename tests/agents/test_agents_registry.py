@@ -1,4 +1,4 @@
-"""Finding students by name, and their options and presets."""
+"""Finding agents by name, and their options and presets."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The mean of the worst episodes: its estimate, its gradient, and students that keep it within a limit."""
+"""The mean of the worst episodes: its estimate, its gradient, and agents that keep it within a limit."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""The gradient of every loss of every student against finite differences, in float64, through the network."""
+"""The gradient of every loss of every agent against finite differences, in float64, through the network."""
 
 from collections.abc import Callable, Iterator
 from functools import partial

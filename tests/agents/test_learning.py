@@ -1,4 +1,4 @@
-"""Students reach the constrained optimum of tasks whose optimum is known, with the constraint binding."""
+"""Agents reach the constrained optimum of tasks whose optimum is known, with the constraint binding."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,9 +14,9 @@ from recrl.environments.registry import make_vector, optimal_return
 
 @dataclass(frozen=True)
 class Lesson:
-    """A task, a student, limits that bind, how long to learn, and with how many seeds it is tested here.
+    """A task, an agent, limits that bind, how long to learn, and with how many seeds it is tested here.
 
-    With no seed, a lesson is only in the table of ``tests/benchmarks/learning.py``. A student steers by the
+    With no seed, a lesson is only in the table of ``tests/benchmarks/learning.py``. An agent steers by the
     mean cost of an update's episodes; who needs to know it better has more environments.
     """
 

@@ -1,4 +1,4 @@
-"""The students that know no constraint, and the ascent that first-order students share."""
+"""The agents that know no constraint, and the ascent that first-order agents share."""
 
 import math
 

@@ -5,11 +5,11 @@ from recrl.agents.registry import AGENTS
 
 
 def test_paper_is_recommended_with_every_deviation_switched() -> None:
-    for student in AGENTS:
+    for agent in AGENTS:
         switched = {
-            each.option: options_of(student, "paper")[each.option]
+            each.option: options_of(agent, "paper")[each.option]
             for each in deviations()
-            if student in each.agents
+            if agent in each.agents
         }
-        assert {**options_of(student, "recommended"), **switched} == options_of(student, "paper")
-        assert all(options_of(student, "recommended")[option] != value for option, value in switched.items())
+        assert {**options_of(agent, "recommended"), **switched} == options_of(agent, "paper")
+        assert all(options_of(agent, "recommended")[option] != value for option, value in switched.items())

@@ -118,7 +118,7 @@ def test_the_command_says_it(river_grid: SweepStore, capsys: pytest.CaptureFixtu
 
 
 def with_discount(sweep: Sweep, discount: float) -> Sweep:
-    """The sweep of students with this discount."""
+    """The sweep of agents with this discount."""
     cpo = Choice("cpo", {"discount": discount})
     facts = [dataclasses.replace(it, spec=dataclasses.replace(it.spec, agent=cpo)) for it in sweep.facts]
     return dataclasses.replace(sweep, facts=tuple(facts))

@@ -81,7 +81,7 @@ def test_curricula_show_every_run_and_the_mean(finished: Sweep) -> None:
     figure = learning_curves.curricula(finished)
     assert len(figure.axes) == 4
     dynamic = lines_of(figure.axes[0], STYLES["dynamic"].colour)
-    assert len(dynamic) == 3 + 1 + 1  # runs, the student's own mean cost, the mean limit
+    assert len(dynamic) == 3 + 1 + 1  # runs, the agent's own mean cost, the mean limit
     assert max(line.get_linewidth() for line in dynamic) > 3 * min(line.get_linewidth() for line in dynamic)
 
 

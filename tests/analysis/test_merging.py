@@ -109,7 +109,7 @@ def test_notes_that_are_no_longer_true_are_left_out(part: Part) -> None:
     parts = [part(f"limit-{limit}", deploy_limit=limit) for limit in (3.0, 4.0, 5.0)]
     notes = merge([merge(parts[:2]), parts[2]]).notes
     assert {note.split(": ")[1].split()[0] for note in notes} == {"3"}
-    assert len(notes) == 4  # one a student and method
+    assert len(notes) == 4  # one an agent and method
 
 
 def test_parts_of_different_grids_are_named(part: Part) -> None:

@@ -1,4 +1,4 @@
-"""How many environment steps a student learns from in a CPU second, and what the time goes into.
+"""How many environment steps an agent learns from in a CPU second, and what the time goes into.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_end_to_end.py [--tasks stub CarGoal2] [--repeats 3]
 
@@ -160,7 +160,7 @@ def held_megabytes() -> float:
 
 @dataclass(frozen=True)
 class Measured:
-    """Some updates of a student.
+    """Some updates of an agent.
 
     Attributes:
         seconds: CPU seconds by what they went into.
@@ -252,7 +252,7 @@ def main() -> None:
     print(f"{steps:,} steps, {NUM_ENVS} environments; CPU seconds")
     columns = ("environment", "inference", "storage", "update", "bound")
     print(
-        f"{'task':<10}{'student':<9}{'widths':<9}"
+        f"{'task':<10}{'agent':<9}{'widths':<9}"
         + "".join(f"{column:>12}" for column in columns)
         + f"{'steps/s':>9}{'bare':>8}{'OmniSafe':>10}{'times':>7}{'then':>7}"
     )

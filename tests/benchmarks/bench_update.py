@@ -251,8 +251,7 @@ def print_rivergrid() -> None:
     """The table of small batches with repeated observations."""
     rate = flops_a_millisecond()
     print(
-        f"{'student':<10}{'options':<24}{'collect ms':>12}{'update ms':>12}"
-        f"{'policy steps':>14}{'bound ms':>10}"
+        f"{'agent':<10}{'options':<24}{'collect ms':>12}{'update ms':>12}{'policy steps':>14}{'bound ms':>10}"
     )
     for agent_name in ("ppo-lag", "cpo"):
         for options in OPTIONS:
@@ -271,7 +270,7 @@ def print_rivergrid() -> None:
 def print_large(agents: list[str], samples: int) -> None:
     """The table of one large batch of distinct observations, under both presets."""
     print(
-        f"\n{samples:,} distinct observations, {HIDDEN[0]} x {HIDDEN[1]}\n{'student':<10}{'preset':<14}"
+        f"\n{samples:,} distinct observations, {HIDDEN[0]} x {HIDDEN[1]}\n{'agent':<10}{'preset':<14}"
         f"{'update s':>10}{'bare s':>9}{'times':>7}{'square s':>10}{'times':>7}{'policy steps':>14}"
         f"{'of paper':>10}"
     )

@@ -1,8 +1,8 @@
-"""What keeps students from a dry way beside a narrow river: their samples, or what they see?
+"""What keeps agents from a dry way beside a narrow river: their samples, or what they see?
 
     OMP_NUM_THREADS=1 python tests/benchmarks/ideal_student.py [--maps 13 14 16 23]
 
-A student that needs no samples: all its advantages are computed exactly. It climbs reward minus a fixed price
+An agent that needs no samples: all its advantages are computed exactly. It climbs reward minus a fixed price
 of the river's cost plus a bonus on each state's entropy, by natural gradient steps (Kakade 2002):
 
     theta <- (1 - eta) theta + eta w / tau,   w = argmin_w E_visits[(A - phi w)^2],   A = A_r - price A_c

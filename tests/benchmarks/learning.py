@@ -1,12 +1,12 @@
-"""How close every student comes to the known constrained optimum, over five seeds.
+"""How close every agent comes to the known constrained optimum, over five seeds.
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/learning.py [student ...] [--seeds 20 21 22 23 24] [--csv FILE]
+    OMP_NUM_THREADS=1 python tests/benchmarks/learning.py [agent ...] [--seeds 20 21 22 23 24] [--csv FILE]
 
-The settings are each student's defaults but for the multipliers' gains on RiverGrid. A row is one student on
+The settings are each agent's defaults but for the multipliers' gains on RiverGrid. A row is one agent on
 one task: the worst and the mean regret J*(d) - J and the worst excess of a cost over its limit, per episode
 and exact. ``average`` is of the policies of the last quarter of the updates, that is of a policy drawn anew
 from them each episode; ``last`` is the policy that learning ended with. The promise is an average regret of
-at most 0.1 at an average excess of at most 0.05, on every seed. Beware of noise: a student steers by the
+at most 0.1 at an average excess of at most 0.05, on every seed. Beware of noise: an agent steers by the
 costs of the episodes of an update; of 128 episodes of the two-state tasks their mean is known to 0.1, of 512
 to 0.05.
 """
@@ -93,7 +93,7 @@ EXERCISES = {
 
 @dataclass(frozen=True)
 class Lesson:
-    """A student, an exercise, and how long it learns."""
+    """An agent, an exercise, and how long it learns."""
 
     agent: str
     exercise: str
@@ -161,21 +161,21 @@ def mean_value(values: list[Value]) -> Value:
 
 
 def main() -> None:
-    """Print the table of some students, or of all."""
-    parser = argparse.ArgumentParser(description="How close students come to the constrained optimum.")
-    parser.add_argument("students", nargs="*", metavar="STUDENT")
+    """Print the table of some agents, or of all."""
+    parser = argparse.ArgumentParser(description="How close agents come to the constrained optimum.")
+    parser.add_argument("agents", nargs="*", metavar="STUDENT")
     parser.add_argument("--only", nargs="+", default=[], metavar="TASK")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--csv", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(
-        f"{'student':10}{'task':13}{'J*':>7} |{'worst':>7}{'mean':>7}{'excess':>8} |{'worst':>7}{'mean':>7}"
+        f"{'agent':10}{'task':13}{'J*':>7} |{'worst':>7}{'mean':>7}{'excess':>8} |{'worst':>7}{'mean':>7}"
         f"{'excess':>8} |{'updates':>8}{'CPU s':>7}\n{'':31}|{'average':^22} |{'last':^22} |"
     )
     rows = []
     for lesson in LESSONS:
-        if (arguments.students and lesson.agent not in arguments.students) or (
+        if (arguments.agents and lesson.agent not in arguments.agents) or (
             arguments.only and lesson.exercise not in arguments.only
         ):
             continue
@@ -184,7 +184,7 @@ def main() -> None:
         start = time.process_time()
         runs = [learn(lesson, seed) for seed in arguments.seeds]
         seconds = (time.process_time() - start) / len(runs)
-        row: dict[str, Any] = {"student": lesson.agent, "task": lesson.exercise, "optimum": optimum}
+        row: dict[str, Any] = {"agent": lesson.agent, "task": lesson.exercise, "optimum": optimum}
         for name, values in (
             ("average", [mean_value(run) for run in runs]),
             ("last", [run[-1] for run in runs]),

@@ -34,7 +34,7 @@ from recrl.agents.registry import AgentEntry
 def make(cmdp, config, seed):
     raise ArithmeticError("no luck")
 
-ENTRY = AgentEntry("An unlucky student.", PPOLagConfig, make)
+ENTRY = AgentEntry("An unlucky agent.", PPOLagConfig, make)
 """
 INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 

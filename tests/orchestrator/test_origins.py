@@ -166,7 +166,7 @@ def test_the_sentences_count() -> None:
 def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A student that costs less than d_d from the start leaves the curriculum no room."""
+    """An agent that costs less than d_d from the start leaves the curriculum no room."""
     (folder / "grid.yaml").write_text(
         GRID.replace("SEEDS", "0")
         .replace('"my_scaled_task:TASK", label: scaled', "two-state")

@@ -29,7 +29,7 @@ seeds: 1
 run: {total_steps: 120, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
 
-# A user's own student that breaks down as long as a file called "broken" is in the working directory.
+# A user's own agent that breaks down as long as a file called "broken" is in the working directory.
 FRAGILE_STUDENT = """\
 from pathlib import Path
 from recrl.agents.algorithms.own_options import PPOLagConfig
@@ -41,7 +41,7 @@ def make(cmdp, config, seed):
         raise ArithmeticError("the policy is no longer finite")
     return make_ppo_lag(cmdp, config, seed)
 
-ENTRY = AgentEntry("A fragile student.", PPOLagConfig, make)
+ENTRY = AgentEntry("A fragile agent.", PPOLagConfig, make)
 """
 
 
@@ -146,8 +146,8 @@ def test_one_trial_that_fails_leaves_the_others_alone(
     (tmp_path / "broken").touch()
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    student = "{name: 'my_fragile_student:ENTRY', label: fragile}"
-    grid = _grid(GRID.replace("[ppo-lag]", f"[{student}, ppo-lag]").replace("[none, linear]", "[none]"))
+    agent = "{name: 'my_fragile_student:ENTRY', label: fragile}"
+    grid = _grid(GRID.replace("[ppo-lag]", f"[{agent}, ppo-lag]").replace("[none, linear]", "[none]"))
     result = _launch(store, grid)
     assert [trial.spec.agent.label for trial in result.failed] == ["fragile"]
     record, files = result.failed[0].record, store.trial(result.failed[0].spec)

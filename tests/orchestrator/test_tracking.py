@@ -110,8 +110,8 @@ def test_points_are_sorted_into_chart_sections(made_up_sweep: Callable[..., Swee
         "train/episodes": 3.0,
         "curriculum/noise": 0.0,
         "perf/steps_per_second": pytest.approx(400 / 0.4),
-        "student/kl": 0.01,
-        "student/cost_value_loss": 2.0,
+        "agent/kl": 0.01,
+        "agent/cost_value_loss": 2.0,
     }
     assert {(point.step, point.milliseconds) for point in points(row, spec)} == {(2800, 1700000000250)}
     changed = {"phase": "deployment", "cost_0": "4.5", "limit_0": "5.0", "temperature": "0.25"}
@@ -307,8 +307,8 @@ def test_a_sweep_is_shown_as_a_parent_and_a_run_a_trial(write: Callable[..., Swe
     assert (run.data.params["method"], run.data.params["seed"]) == ("dynamic", "0")
     updates = trial_titled(store, DYNAMIC).updates()
     points = history(store, run)
-    assert [value for _, _, value in points["student/kl"]] == updates["kl"].tolist()
-    assert [step for step, _, _ in points["student/kl"]] == updates["end_step"].tolist()
+    assert [value for _, _, value in points["agent/kl"]] == updates["kl"].tolist()
+    assert [step for step, _, _ in points["agent/kl"]] == updates["end_step"].tolist()
     assert len(points["train/return"]) == 38
     assert len(points["deploy/return"]) == 2
     assert len(points["evaluation/deterministic_return"]) == 1
@@ -437,7 +437,7 @@ def test_rows_that_were_cut_back_are_gone_from_mlflow_too(
     text = trial.updates_path.read_text().replace("1700000020.0", "1700009999.0")  # update 20, written anew
     commit_file(trial, "updates.csv", text)
     sync(store, tracking_uri(store, None))
-    points = history(store, runs(store)[DYNAMIC])["student/kl"]
+    points = history(store, runs(store)[DYNAMIC])["agent/kl"]
     assert len(points) == 40
     assert points[19][:2] == (20 * 400, 1700009999000)
 
@@ -581,7 +581,7 @@ def test_a_killed_mirror_leaves_nothing_lost_and_nothing_twice(write: Callable[.
     assert sync(store, uri).is_up_to_date
     shown = everything(store)
     for trial in store.trials():
-        assert len(shown[trial.spec.title]["points"]["student/kl"]) == 40
+        assert len(shown[trial.spec.title]["points"]["agent/kl"]) == 40
     sync(store, uri, rebuild=True)
     assert everything(store) == shown
 

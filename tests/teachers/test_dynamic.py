@@ -1,4 +1,4 @@
-"""Algorithm 2, line by line and in a closed loop with simulated students."""
+"""Algorithm 2, line by line and in a closed loop with simulated agents."""
 
 import math
 from collections.abc import Callable
@@ -24,8 +24,8 @@ from recrl.teachers.windows import WindowStatistics
 
 SPLIT_AT_100 = (slice(0, 100), slice(100, None))
 
-# An episode of a simulated student, (return, costs), from the step and the update's index.
-Student = Callable[[CurriculumStep, int], tuple[float, tuple[float, ...]]]
+# An episode of a simulated agent, (return, costs), from the step and the update's index.
+Agent = Callable[[CurriculumStep, int], tuple[float, tuple[float, ...]]]
 
 
 def window(mean_return: float, *costs: float, episodes: int = 4, scatter: float = 0.0) -> WindowStatistics:
@@ -62,7 +62,7 @@ class Run:
 
 
 def play(
-    student: Student,
+    agent: Agent,
     *,
     train: tuple[float, ...],
     deploy: tuple[float, ...],
@@ -79,7 +79,7 @@ def play(
     for update in range(1, updates + 1):
         finished = []
         for b in range(episodes(step)):
-            episode_return, costs = student(step, update)
+            episode_return, costs = agent(step, update)
             finished.append(
                 EpisodeStats(b, Phase.TRAINING, update, 1, episode_return, costs, step.limits, 0.0)
             )
@@ -90,7 +90,7 @@ def play(
 
 
 def obedient(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
-    """An ideal student: its costs are at the limits at once."""
+    """An ideal agent: its costs are at the limits at once."""
     return 9.5, step.limits.values
 
 
@@ -413,7 +413,7 @@ def test_a_stuck_student_is_kicked_again_and_again_but_not_after_the_end(
 
 
 def kicked_at(**options: Any) -> list[int]:
-    """When a student is kicked that costs 5.9 at first, and 9, 8, 7, 6, 5, 5, 5 ... after each noise."""
+    """When an agent is kicked that costs 5.9 at first, and 9, 8, 7, 6, 5, 5, 5 ... after each noise."""
     last_noise: list[int] = []
 
     def settles(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
@@ -436,7 +436,7 @@ def test_literally_noise_follows_noise_for_ever() -> None:
 
 
 def test_a_student_that_noise_frees_reaches_d_d() -> None:
-    """RiverGrid 1b: the student crosses at cost 5 whatever the limit, until two kicks have freed it."""
+    """RiverGrid 1b: the agent crosses at cost 5 whatever the limit, until two kicks have freed it."""
     kicks = 0
     seen = 0
 

@@ -1,4 +1,4 @@
-"""What every teacher promises, over all of them and over students of any behaviour."""
+"""What every teacher promises, over all of them and over agents of any behaviour."""
 
 import json
 import math
@@ -30,7 +30,7 @@ TRAIN_STEPS = 100
 
 @dataclass(frozen=True)
 class History:
-    """What a trial was set up with and what its student did."""
+    """What a trial was set up with and what its agent did."""
 
     train_limits: CostLimits
     deploy_limits: CostLimits

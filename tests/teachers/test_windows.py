@@ -1,4 +1,4 @@
-"""What is remembered of the student's episodes, and how windows are cut from it."""
+"""What is remembered of the agent's episodes, and how windows are cut from it."""
 
 import math
 

@@ -8,7 +8,7 @@ many there are nor on the threads. Resets and new goals, which are drawn at rand
 What a world is made of is one record ``WORLD``; what all worlds of a task share is one record ``TASK``. These
 have room for every task.
 
-Letters: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
+Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
 
 Source: openai/safety-gym ``engine.py``.
 """
