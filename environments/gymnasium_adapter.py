@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -328,8 +329,12 @@ def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
 
 
 def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:
-    """An environment of a user's callable that draws itself; the callable must take ``render_mode``."""
-    return factory(**{**options.model_dump(), "render_mode": "rgb_array"})
+    """An environment of a user's callable; it draws itself if the callable takes ``render_mode``."""
+    keywords = options.model_dump()
+    parameters = inspect.signature(factory).parameters.values()
+    if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
+        keywords["render_mode"] = "rgb_array"
+    return factory(**keywords)
 
 
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -179,9 +179,14 @@ def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int) ->
         num_outputs: actions, action components, or 1.
 
     Raises:
-        NetworkError: it is no module, has buffers or no parameters, or gives another shape or type.
+        NetworkError: it is no module, has buffers or no parameters, fails, gives another shape or type, or
+            its rows depend on one another.
     """
-    module = factory(num_inputs, num_outputs)
+    name = getattr(factory, "__qualname__", "the network's factory")
+    try:
+        module = factory(num_inputs, num_outputs)
+    except Exception as error:
+        raise NetworkError(f"{name}({num_inputs}, {num_outputs}) failed: {error}") from error
     if not isinstance(module, nn.Module):
         raise NetworkError(f"the network's factory returned a {type(module).__name__}, not a torch.nn.Module")
     module.eval()
@@ -193,12 +198,21 @@ def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int) ->
         )
     if not list(module.parameters()):
         raise NetworkError("the network has no parameters")
-    with torch.no_grad():
-        outputs = module(torch.zeros(2, num_inputs))
+    rows = torch.linspace(-1.0, 1.0, 2 * num_inputs).reshape(2, num_inputs)
+    try:
+        with torch.no_grad():
+            outputs, alone = module(rows), module(rows[1:])
+    except Exception as error:
+        raise NetworkError(f"the network of {name} failed on float32 [2, {num_inputs}]: {error}") from error
     if not isinstance(outputs, Tensor) or outputs.shape != (2, num_outputs) or outputs.dtype != torch.float32:
         found = f"{outputs.dtype} {list(outputs.shape)}" if isinstance(outputs, Tensor) else type(outputs)
         raise NetworkError(
             f"the network maps 2 rows of {num_inputs} numbers to {found}: it must return float32 "
             f"[2, {num_outputs}]"
+        )
+    if not torch.allclose(outputs[1:], alone, rtol=1e-3, atol=1e-5):
+        raise NetworkError(
+            "the network's output for a row depends on the other rows: rows are separate observations, in "
+            "any order"
         )
     return module

@@ -18,7 +18,7 @@ from recrl.orchestrator.grid.json_schema import grid_schema
 
 def run_list(request: ListRequest, console: Console) -> ExitCode:
     """List the tasks, agents or curricula, each with its summary."""
-    kind = KINDS[request.kind]
+    kind = KINDS["curricula" if request.kind == "methods" else request.kind]
     console.print(display.text_table([kind.singular, "summary"], listed(kind)))
     say(console, f"\nOptions of one: recrl-sweep options {kind.ours[0]}")
     return ExitCode.OK

@@ -28,7 +28,7 @@ from recrl.orchestrator.cli.shared_arguments import (
 
 VIDEOS = ("gif", "mp4")
 TEMPLATES = ("demo", "safety-gym", "velocity", "own-task")
-KINDS = ("tasks", "agents", "curricula")
+KINDS = ("tasks", "agents", "curricula", "methods")  # methods: as in a grid
 
 
 def _add_init(commands: Commands) -> None:

@@ -54,7 +54,7 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
 
     Returns:
         An environment with flat observations [n], which a policy's ``act`` takes. ``info["cost"]`` holds each
-        step's costs, [k], or a number for one.
+        step's costs, [k]. An environment of your own draws itself if it takes the keyword ``render_mode``.
 
     Raises:
         RecrlError: there is no such task, an option is wrong, or the task exists as a vector only.
@@ -77,7 +77,23 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
         raise RecrlError(f"the task {task} is no single environment; use recrl.make({task!r})") from error
     space = environment.observation_space
     is_flat = isinstance(space, Box) and len(space.shape) == 1
-    return environment if is_flat else FlattenObservation(environment)
+    return _with_cost_arrays(environment if is_flat else FlattenObservation(environment))
+
+
+def _with_cost_arrays(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """The environment with ``info["cost"]`` as an array [k] also where it reports a number."""
+    import numpy as np  # noqa: PLC0415
+    from gymnasium import Wrapper  # noqa: PLC0415
+
+    class CostArrays(Wrapper[Any, Any, Any, Any]):
+        """Costs as arrays."""
+
+        def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+            observation, reward, terminated, truncated, info = super().step(action)
+            costs = {"cost": np.atleast_1d(np.asarray(info["cost"], np.float64))} if "cost" in info else {}
+            return observation, reward, terminated, truncated, {**info, **costs}
+
+    return CostArrays(environment)
 
 
 def _check(task: str, options: dict[str, Any]) -> None:

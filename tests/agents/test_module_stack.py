@@ -135,6 +135,15 @@ def with_statistics(num_inputs: int, num_outputs: int) -> nn.Module:
     return nn.Sequential(nn.BatchNorm1d(num_inputs), nn.Linear(num_inputs, num_outputs))
 
 
+class _Mixed(nn.Linear):
+    def forward(self, rows: Tensor) -> Tensor:
+        return super().forward(rows.cumsum(dim=0))
+
+
+def mixed_rows(num_inputs: int, num_outputs: int) -> nn.Module:
+    return _Mixed(num_inputs, num_outputs)
+
+
 @pytest.mark.parametrize(
     ("factory", "sentence"),
     [
@@ -142,6 +151,9 @@ def with_statistics(num_inputs: int, num_outputs: int) -> nn.Module:
         (of_another_shape, r"to torch.float32 \[2, 3\]: it must return float32 \[2, 2\]"),
         (with_statistics, "the network has buffers .*use layers without running statistics"),
         (lambda _, __: nn.Identity(), "the network has no parameters"),
+        (lambda _, outputs: nn.Linear(99, outputs), r"failed on float32 \[2, 4\]"),
+        (lambda only: nn.Linear(only, 2), r"\(4, 2\) failed"),
+        (mixed_rows, "depends on the other rows"),
     ],
 )
 def test_what_is_wrong_with_a_network_is_said(factory: Callable[[int, int], Any], sentence: str) -> None:

@@ -44,12 +44,12 @@ BANNED = {
     r"calm(ed|er|ly)?\b": "smaller dual step size",
     r"mended": "corrected",
     r"price of (a|the|its) (violation|cost|constraint)|its price\b|prices\b": "Lagrange multiplier",
-    r"(?<!paper's )agents?\b(?! of the (RECRL )?paper|'s t)": "agent",
+    r"(?<!paper's )students?\b(?! of the (RECRL )?paper|'s t)": "agent",
 }
 # The paper's own word, explained beside it.
 ALLOWED = {
-    "docs/glossary.md": {"agent"},
-    "docs/explanation/recrl-in-five-minutes.md": {"agent"},
+    "docs/glossary.md": {"student"},
+    "docs/explanation/recrl-in-five-minutes.md": {"student"},
 }
 
 

@@ -24,8 +24,6 @@ DEFINITIONS = {
         "1e7": "steps of a published run",
         "240": "trials of the grid",
         "1%": "the tolerance",
-        "0.2": "of the return to the optimum",
-        "1.4": "a bound on costs in outcomes.csv",
     },
 }
 NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
