@@ -26,12 +26,13 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     if not verdicts["exact"].all():
         sampled = int(verdicts.loc[~verdicts["exact"], "episodes"].min())
         how = f"means over {sampled} episodes, or exact where the task is finite"
+    interval = ", with its 95% interval (Student's t)" if (verdicts["seeds"] > 1).any() else ""
     return [
         f"The verdict, the return and the cost are those of the final policy, without learning: {how}.",
         f"Solved: feasible, and within {OPTIMAL_GAP} of the constrained optimum, where that is known.",
         f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error.",
         "The return of an infeasible policy may be above the optimum: it is no success.",
-        "The difference to none is a mean over equal seeds, with its 95% interval (Student's t).",
+        f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
     ]
 
@@ -48,7 +49,8 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
         line = {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
         line["verdict"] = verdict_text(row)
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
-        line["difference to none"] = with_interval(row, "return_difference")
+        all_infeasible = row["infeasible"] == row["seeds"]  # more return is then no gain
+        line["difference to none"] = DASH if all_infeasible else with_interval(row, "return_difference")
         line["optimum"] = number(row["optimal_return"])
         for name in costs:
             title = "cost" if len(costs) == 1 else f"cost {int(name[5:]) + 1}"
