@@ -22,7 +22,7 @@ from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.provenance import collect
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import GridSpec
+from recrl.orchestrator.grid.grid_spec import GridSpec
 from recrl.orchestrator.grid.plan import Plan, Work, make_plan, select
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState

@@ -11,7 +11,8 @@ from pydantic import BaseModel
 
 from recrl.environments.plugins import resolve
 from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
-from recrl.teachers.dynamic import DynamicConfig, DynamicTeacher
+from recrl.teachers.dynamic import DynamicTeacher
+from recrl.teachers.dynamic_options import DynamicConfig
 from recrl.teachers.static import (
     DecayConfig,
     NoConfig,

@@ -22,11 +22,12 @@ from torch import Tensor
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import reward_spread
 from recrl.agents.learning.batch import to_tensor
 from recrl.agents.learning.distributions import Distribution, mean_divergence
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
+from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.learning.surrogates import surrogate
 from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
@@ -176,7 +177,7 @@ def acceptance(
 
 
 class ConstrainedPolicyOptimisation:
-    """The rule of ``cpo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``cpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: CPOConfig) -> None:
         self._config = config

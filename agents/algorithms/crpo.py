@@ -35,9 +35,10 @@ import numpy as np
 from recrl.agents.algorithms.cpo import LocalModel, linearise, to_parameter_step
 from recrl.agents.algorithms.own_options import CRPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import SMALLEST_STD, reward_spread
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.trust_region.cpo_dual import (
     NO_INFLUENCE,
     DualSolution,
@@ -103,7 +104,7 @@ def overshoot(problem: StepProblem, config: CRPOConfig) -> float:
 
 
 class ConstraintRectifiedPolicyOptimisation:
-    """The rule of ``crpo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``crpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: CRPOConfig) -> None:
         self._config = config

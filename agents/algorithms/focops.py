@@ -28,10 +28,11 @@ from torch import Tensor
 from recrl.agents.algorithms.own_options import FOCOPSConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.distributions import Distribution, mean_divergence
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import indexed
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -83,7 +84,7 @@ def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, r
 
 
 class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
-    """The rule of ``focops``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``focops``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: FOCOPSConfig, policy: StochasticPolicy, num_costs: int) -> None:
         super().__init__(config, policy)

@@ -33,10 +33,11 @@ from torch import Tensor
 
 from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.batch import LearningBatch, to_tensor
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.learning.surrogates import (
     SignedAdvantages,
     clipped_surrogate,
@@ -98,7 +99,7 @@ def barrier_surrogate_objective(
 
 
 class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
-    """The rule of ``ipo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``ipo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

@@ -23,10 +23,11 @@ from torch import Tensor
 
 from recrl.agents.algorithms.own_options import P3OConfig
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.batch import LearningBatch, to_tensor
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
 from recrl.environments.cmdp import CMDPSpec, Floats
 
@@ -66,7 +67,7 @@ def penalised_surrogate_objective(
 
 
 class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
-    """The rule of ``p3o``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``p3o``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

@@ -24,8 +24,9 @@ import numpy as np
 from recrl.agents.algorithms.cpo import constrained_step
 from recrl.agents.algorithms.own_options import PCPOConfig
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import Stateful
 from recrl.agents.trust_region.cpo_dual import (
     NO_INFLUENCE,
     DualSolution,
@@ -62,7 +63,7 @@ def projected_step(problem: StepProblem) -> DualSolution:
 
 
 class ProjectionBasedConstrainedPolicyOptimisation:
-    """The rule of ``pcpo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``pcpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: PCPOConfig) -> None:
         self._config = config

@@ -12,16 +12,17 @@ import numpy as np
 
 from recrl.agents.algorithms.own_options import PPOConfig
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import scaled_advantages
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate
 from recrl.environments.cmdp import CMDPSpec
 
 
 class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
-    """The rule of ``ppo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``ppo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator

@@ -20,11 +20,12 @@ from torch import Tensor
 from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import penalised_advantages
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
 
@@ -63,7 +64,7 @@ SURROGATE_OBJECTIVES = {"combined": combined_surrogate_objective, "separate": se
 
 
 class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
-    """The rule of ``ppo-lag``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``ppo-lag``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: PPOLagConfig, policy: StochasticPolicy, num_costs: int) -> None:
         super().__init__(config, policy)

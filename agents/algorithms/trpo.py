@@ -17,9 +17,10 @@ from recrl.agents.algorithms.cpo import LocalModel
 from recrl.agents.algorithms.own_options import TRPOConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import scaled_advantages
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.line_search import conjugate_gradient, line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
@@ -84,7 +85,7 @@ def step_size(squared: float, target_kl: float, kl_price: float) -> float:
 
 
 class TrustRegionPolicyOptimisation:
-    """The rule of ``trpo``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``trpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: TRPOConfig) -> None:
         self._config = config

@@ -18,13 +18,14 @@ from recrl.agents.algorithms.own_options import TRPOLagConfig
 from recrl.agents.algorithms.trpo import step_up
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
-from recrl.agents.learning.actor_critic import ActorCritic, Stateful, fresh_agent, indexed
+from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.environments.cmdp import CMDPSpec
 
 
 class TRPOLagrangian:
-    """The rule of ``trpo-lag``; a ``recrl.agents.learning.actor_critic.PolicyRule``."""
+    """The rule of ``trpo-lag``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: TRPOLagConfig, num_costs: int) -> None:
         self._config = config

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,83 +29,17 @@ from recrl.agents.encoding import Encoder
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import generalised_advantages, next_values
-from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
-from recrl.agents.learning.distributions import mean_divergence
+from recrl.agents.learning.estimates import Estimates, row_targets
 from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
 from recrl.agents.learning.scales import RunningScale, quotient
-from recrl.agents.learning.surrogates import surrogate
 from recrl.agents.shared_options import ActorCriticConfig
 from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
 from recrl.environments.plugins import trusted_attribute
-
-
-class Stateful(Protocol):
-    """Something that is saved and restored with an agent."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """All it has learnt and adapted: a tree of dicts, lists, JSON scalars and NumPy arrays."""
-        ...
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        ...
-
-
-class PolicyRule(Protocol):
-    """How an agent's policy gets better: what tells the algorithms apart."""
-
-    @property
-    def parts(self) -> Mapping[str, Stateful]:
-        """What the rule keeps from one update to the next, by name."""
-        ...
-
-    def improve(
-        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
-    ) -> dict[str, float]:
-        """Change the policy once.
-
-        Args:
-            policy: the one that collected the samples; changed in place.
-            experience: the samples, raw advantages, and how the constraints stand.
-            generator: the agent's own randomness.
-
-        Returns:
-            Metrics, the same keys every time: ``policy_steps``, ``multiplier_i``, and the rule's own.
-        """
-        ...
-
-
-def indexed(name: str, values: npt.NDArray[np.floating]) -> dict[str, float]:
-    """One metric a cost, [k]: ``name_0``, ``name_1``, ...; infinite values are NaN, as metrics must be."""
-    return {
-        f"{name}_{i}": float(value) if np.isfinite(value) else float("nan") for i, value in enumerate(values)
-    }
-
-
-def improve_and_measure(
-    rule: PolicyRule, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
-) -> dict[str, float]:
-    """Let a rule improve the policy; its metrics, and how far the policy has come.
-
-    Returns:
-        The rule's metrics; ``kl``, the mean KL from the old policy in nats; the mean ``entropy``; and
-        ``surrogate_reward`` and ``surrogate_cost_i``, the gains to first order in the advantages' unit.
-    """
-    metrics = rule.improve(policy, experience, generator)
-    batch, advantages = experience.batch, experience.advantages
-    new = policy.distribution(batch.unique_observations)
-    centred = batch.per_pair(advantages - advantages.mean(axis=0))
-    gains = surrogate(experience.ratios(new), centred).numpy(force=True)
-    return {
-        **metrics,
-        "kl": float(mean_divergence(experience.old, new, batch.observation_weights)),
-        "entropy": float(torch.dot(batch.observation_weights, new.entropy())),
-        "surrogate_reward": float(gains[0]),
-        **indexed("surrogate_cost", gains[1:]),
-    }
 
 
 class ActorCritic:
@@ -336,56 +269,6 @@ class ActorCritic:
         """New tensors are where the parameters are; on a CPU they are anyway, and asking costs time."""
         device = self._policy.parameters.values.device
         return nullcontext() if device.type == "cpu" else device
-
-
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """What a rollout says about the signals, all [N, C].
-
-    Attributes:
-        advantages: generalised advantage estimates.
-        targets: what the critics learn.
-        values: what the critics said before they saw the rollout.
-        returns: discounted sums of the signals up to the episode's or the rollout's end, where the last value
-            stands for the rest.
-    """
-
-    advantages: Floats
-    targets: Floats
-    values: Floats
-    returns: Floats
-
-    def explained_variances(self) -> dict[str, float]:
-        """The critics' explained variance of fresh returns, 1 - Var(returns - values) / Var(returns).
-
-        1 is perfect, 0 is no better than a constant, NaN where all returns are equal. The last value in the
-        returns is the critics' own, which flatters them a little.
-        """
-        spread = self.returns.var(axis=0)
-        unexplained = (self.returns - self.values).var(axis=0)
-        shares = np.where(spread > 0.0, 1.0 - quotient(unexplained, spread), np.nan)
-        return {"explained_variance_reward": float(shares[0])} | indexed(
-            "explained_variance_cost", shares[1:]
-        )
-
-
-def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
-    """What to regress on at each row so that the mean squared error over the samples is minimal.
-
-    The mean squared error over samples is that about the mean target of each row, weighted by the
-    row's share of the samples, plus the targets' spread about those means, which no critic can lower.
-
-    Args:
-        batch: the samples.
-        targets: of all samples of the rollout, [N, C].
-
-    Returns:
-        The mean targets, [C, U], and the spread, [C].
-    """
-    sums = batch.per_observation(targets)
-    shares = batch.observation_weights.numpy(force=True).astype(np.float64)[:, None]
-    spread = np.mean(batch.own(targets) ** 2, axis=0) - np.sum(sums**2 / shares, axis=0)
-    return to_tensor((sums / shares).T.copy()), to_tensor(np.maximum(spread, 0.0))
 
 
 def fresh_agent(

@@ -3,8 +3,9 @@
 from pydantic import Field
 
 from recrl.agents.algorithms.trpo import step_up
-from recrl.agents.learning.actor_critic import fresh_agent, indexed
+from recrl.agents.learning.actor_critic import fresh_agent
 from recrl.agents.learning.advantages import SMALLEST_STD
+from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.registry import AgentEntry
 from recrl.agents.shared_options import TrustRegionConfig
 

@@ -27,7 +27,7 @@ from recrl.teachers.registry import TEACHERS
 OURS = "recrl"
 NAMED = 5  # trials in a sentence, at most
 FOLDERS = ("agents", "environments", "teachers")
-MODULES = ("trial/trial.py", "spec.py")  # of the orchestrator
+MODULES = ("trial/trial.py", "trial/runner.py", "spec.py")  # of the orchestrator
 SUFFIXES = (".py", ".xml", ".txt")  # of what results depend on
 KINDS = (
     ("task", "recrl.tasks", TASKS),

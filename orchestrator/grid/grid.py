@@ -22,8 +22,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,16 +35,15 @@ from recrl.environments.registry import make_vector, task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
 from recrl.orchestrator.grid.grid_file import (
     Entry,
-    Exclusion,
     GridFile,
     Limits,
-    Resources,
     Run,
     SweepName,
     TaskEntry,
 )
+from recrl.orchestrator.grid.grid_spec import GridSpec, TaskCell
 from recrl.orchestrator.located_yaml import Place, Problem, parse
-from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.spec import Choice
 from recrl.orchestrator.validation import nearest, sentences, shown
 from recrl.teachers.registry import teacher_config
 
@@ -58,72 +55,6 @@ DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.
 Model = TypeVar("Model", bound=BaseModel)
 # How a registry validates the options of something it knows by name, defaults filled in.
 OptionsOf = Callable[[str, Mapping[str, Any]], BaseModel]
-
-
-@dataclass(frozen=True)
-class TaskCell:
-    """A task with everything about it resolved.
-
-    Attributes:
-        task: the CMDP.
-        train_limits: d_t, [k].
-        deploy_limits: d_d, [k].
-        rollout_steps: T.
-    """
-
-    task: Choice
-    train_limits: CostLimits
-    deploy_limits: CostLimits
-    rollout_steps: int
-
-
-@dataclass(frozen=True)
-class GridSpec:
-    """A checked grid, every default filled in.
-
-    Attributes:
-        name: the sweep's name.
-        tasks: the CMDPs with their limits.
-        agents: the agents.
-        methods: the teachers.
-        seeds: at least one, all different.
-        run: how long and how wide every trial runs.
-        resources: what a trial occupies.
-        exclude: what to leave out of the product.
-        text: the file as it was given.
-    """
-
-    name: str
-    tasks: tuple[TaskCell, ...]
-    agents: tuple[Choice, ...]
-    methods: tuple[Choice, ...]
-    seeds: tuple[int, ...]
-    run: Run
-    resources: Resources
-    exclude: tuple[Exclusion, ...]
-    text: bytes
-
-    def trials(self) -> tuple[TrialSpec, ...]:
-        """The trials, in the order in which they are to start."""
-        cells = product(self.seeds, self.tasks, self.agents, self.methods)
-        specs = (self._trial(*cell) for cell in cells)
-        return tuple(spec for spec in specs if not any(rule.matches(spec) for rule in self.exclude))
-
-    def _trial(self, seed: int, cell: TaskCell, agent: Choice, method: Choice) -> TrialSpec:
-        deploy_steps = round(self.run.total_steps * self.run.deploy_fraction)
-        return TrialSpec(
-            task=cell.task,
-            agent=agent,
-            method=method,
-            train_limits=cell.train_limits,
-            deploy_limits=cell.deploy_limits,
-            train_steps=self.run.total_steps - deploy_steps,
-            deploy_steps=deploy_steps,
-            num_envs=self.run.num_envs,
-            rollout_steps=cell.rollout_steps,
-            evaluation_episodes=self.run.evaluation_episodes,
-            seed=seed,
-        )
 
 
 def read_grid(path: Path) -> GridSpec:

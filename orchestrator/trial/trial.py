@@ -14,17 +14,12 @@ evaluated.
 from __future__ import annotations
 
 import logging
-import os
 import time
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import TextIOWrapper
 from typing import Any, Self
 
 import numpy as np
-import torch
 
 from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
@@ -35,26 +30,13 @@ from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.errors import (
-    USERS_ERRORS,
-    LostLeaseError,
     RowError,
-    StorageError,
-    TeacherUnavailableError,
-    described,
 )
-from recrl.orchestrator.files.code_changes import code_of
-from recrl.orchestrator.files.provenance import collect as collect_provenance
-from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
-from recrl.orchestrator.redaction import shown
-from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.trial.heartbeat import Heartbeat
+from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.rollout_check import check_rollout
-from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, Teacher
 
-COMMIT_SECONDS = 20.0
-HEARTBEAT_SECONDS = 2.0
 LOGGED_UPDATES = 50
 """Of a trial, about so many are logged."""
 HARD_LANDING = 0.1
@@ -333,204 +315,6 @@ def policy_table(agent: Agent, environments: CMDPVectorEnv) -> list[dict[str, fl
         return []
     probabilities = agent.action_probabilities(environments.observations)
     return [{f"action_{j}": float(share) for j, share in enumerate(row)} for row in probabilities]
-
-
-def run_trial(
-    spec: TrialSpec,
-    writer: TrialWriter,
-    teacher: Teacher,
-    *,
-    should_stop: Callable[[], bool],
-    commit_seconds: float = COMMIT_SECONDS,
-) -> TrialState:
-    """Run a trial to its end, or until ``should_stop``, from wherever its files say it stands.
-
-    Args:
-        spec: the trial.
-        writer: the lease on its folder (``TrialStore.begin``).
-        teacher: who sets the limits; inline or a proxy of a remote one.
-        should_stop: asked after every update; once true, the trial is saved and left waiting.
-        commit_seconds: wall seconds between checkpoints; has no influence on results.
-
-    Returns:
-        COMPLETE, or WAITING if it was stopped.
-
-    Raises:
-        LostLeaseError: another attempt took the trial over.
-        StorageError: the disk is full or gone; the last commit stands.
-        Exception: whatever the task, the agent or the teacher raised, with a note of where; the last
-            commit stands.
-    """
-    life = _Life(writer)
-    with Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS) as heartbeat:  # to get ready may take minutes
-        trial = life.of(Trial(spec, writer, teacher))
-        committed = time.monotonic()
-        while not trial.learned and not should_stop():
-            with _located(f"in update {trial.update + 1}", writer):
-                trial.advance()
-            heartbeat.check()
-            if time.monotonic() - committed >= commit_seconds:
-                trial.save()
-                committed = time.monotonic()
-        if trial.learned:
-            with _located("in the evaluation", writer):
-                trial.evaluate()
-        trial.save()
-    if not trial.learned:
-        writer.close(TrialState.WAITING)
-        logger.info("stopped after update %d; it can be resumed", trial.update)
-        return TrialState.WAITING
-    writer.close(TrialState.COMPLETE)
-    logger.info("complete: %d updates, %d environment steps", trial.update, trial.env_steps)
-    return TrialState.COMPLETE
-
-
-class _Life:
-    """What a trial's heartbeat says: how far it is, and how fast over its last updates, however long."""
-
-    def __init__(self, writer: TrialWriter) -> None:
-        self._writer = writer
-        self._trial: Trial | None = None
-        self._speed = 0.0
-
-    def of(self, trial: Trial) -> Trial:
-        """The trial, now that it is made; until then the heartbeat says where it stood before."""
-        self._steps, self._since = trial.env_steps, time.monotonic()
-        self._trial = trial
-        return trial
-
-    def beat(self) -> None:
-        """Say it."""
-        if self._trial is None:
-            before = self._writer.record
-            self._writer.heartbeat(
-                update=before.update, env_steps=before.env_steps, steps_per_second=self._speed
-            )
-            return
-        now, done = time.monotonic(), self._trial.env_steps
-        if done > self._steps:
-            self._speed = (done - self._steps) / (now - self._since)
-            self._steps, self._since = done, now
-        self._writer.heartbeat(update=self._trial.update, env_steps=done, steps_per_second=self._speed)
-
-
-@contextmanager
-def _located(where: str, writer: TrialWriter) -> Iterator[None]:
-    """Note on whatever is raised where that was, and what is left of the trial."""
-    try:
-        yield
-    except USERS_ERRORS as error:
-        update = writer.store.saved_update
-        saved = (
-            f"the last good checkpoint is that of update {update}" if update else "no checkpoint before it"
-        )
-        error.add_note(f"{where}; {saved}")
-        raise
-
-
-def run_recorded(
-    spec: TrialSpec,
-    store: TrialStore,
-    *,
-    should_stop: Callable[[], bool],
-    teacher: Teacher | None = None,
-    commit_seconds: float = COMMIT_SECONDS,
-) -> TrialState:
-    """``run_trial``, with everything about the run recorded in the trial's folder.
-
-    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``, and nothing is
-    raised here: one trial's failure must not stop the others. A full disk is no failure of the trial's own:
-    it waits, and the same launch goes on from its last commit once there is room.
-
-    Returns:
-        How the trial stands now.
-
-    Raises:
-        TeacherUnavailableError: the teacher's process is gone; the trial waits to be resumed.
-    """
-    torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
-    provenance = {
-        **collect_provenance(),
-        "code": code_of(spec),
-    }  # waits for git, in silence: so before the trial begins
-    try:
-        writer = store.begin(spec)
-    except StorageError as error:
-        logger.warning("%s", error)
-        return TrialState.WAITING
-    with _log_to(store):
-        try:
-            writer.add_provenance(provenance)
-            return run_trial(
-                spec,
-                writer,
-                teacher or make_teacher(spec.teacher),
-                should_stop=should_stop,
-                commit_seconds=commit_seconds,
-            )
-        except LostLeaseError as error:
-            logger.warning("%s", error)
-        except TeacherUnavailableError:
-            _close(writer, TrialState.WAITING)
-            raise
-        except StorageError as error:
-            logger.error("%s", error)
-            return _close(writer, TrialState.WAITING, error=str(error))
-        except USERS_ERRORS as error:
-            logger.exception("failed after update %d", writer.record.update)
-            notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
-            text = shown(f"{described(error)}{notes}")
-            return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))
-        return store.record().status
-
-
-def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:
-    """End an attempt that broke off; what keeps its files from saying so must not hide why it did."""
-    try:
-        writer.close(status, error=error, traceback=traceback)
-    except (LostLeaseError, StorageError) as also:
-        logger.warning("%s", also)
-    return status
-
-
-@contextmanager
-def _log_to(store: TrialStore) -> Iterator[None]:
-    """Send the log of this process's trial to its folder."""
-    handler = _Log(store.log_path, encoding="utf-8", delay=True)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    root = logging.getLogger("recrl")
-    level = root.level
-    root.setLevel(logging.INFO)
-    root.addHandler(handler)
-    try:
-        yield
-    finally:
-        root.removeHandler(handler)
-        root.setLevel(level)
-        with suppress(OSError):
-            handler.close()
-
-
-class _Log(logging.FileHandler):
-    """A log that loses lines rather than end a trial: on a full disk nothing is said about the log.
-
-    A link in its place is not followed: it might lead to another file of the user's.
-    """
-
-    def _open(self) -> TextIOWrapper:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
-        return open(os.open(self.baseFilename, flags, 0o644), "a", encoding=self.encoding)
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The record as text, without secrets and control characters."""
-        return shown(super().format(record))
-
-    def emit(self, record: logging.LogRecord) -> None:
-        with suppress(OSError):
-            super().emit(record)
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
-        pass
 
 
 def _temperature(step: CurriculumStep) -> dict[str, float]:

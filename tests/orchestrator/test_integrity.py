@@ -27,7 +27,7 @@ from recrl.orchestrator.grid.plan import Work, make_plan
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
-from recrl.orchestrator.trial.trial import run_recorded
+from recrl.orchestrator.trial.runner import run_recorded
 
 GRID = """\
 name: small

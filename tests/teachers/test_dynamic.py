@@ -9,15 +9,8 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
-from recrl.teachers.dynamic import (
-    DynamicConfig,
-    decide,
-    has_converged,
-    is_precise,
-    keeps_limit,
-    next_limit,
-    steps_left,
-)
+from recrl.teachers.dynamic import decide, has_converged, is_precise, keeps_limit, next_limit, steps_left
+from recrl.teachers.dynamic_options import DynamicConfig
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 from recrl.teachers.windows import WindowStatistics

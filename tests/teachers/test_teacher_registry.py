@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.plugins import UnknownNameError
-from recrl.teachers.dynamic import PAPER, DynamicConfig
+from recrl.teachers.dynamic_options import PAPER, DynamicConfig
 from recrl.teachers.registry import TEACHERS, TeacherKind, make_teacher, teacher_config
 from recrl.teachers.static import NoConfig, step_teacher
 from recrl.teachers.teacher import TeacherSpec

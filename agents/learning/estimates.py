@@ -1,0 +1,66 @@
+"""What a rollout says about reward and costs: advantages, the critics' targets, and their explained variance.
+
+Notation: N samples, C = 1 + k signals, U distinct observations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.policy_rule import indexed
+from recrl.agents.learning.scales import quotient
+from recrl.environments.cmdp import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What a rollout says about the signals, all [N, C].
+
+    Attributes:
+        advantages: generalised advantage estimates.
+        targets: what the critics learn.
+        values: what the critics said before they saw the rollout.
+        returns: discounted sums of the signals up to the episode's or the rollout's end, where the last value
+            stands for the rest.
+    """
+
+    advantages: Floats
+    targets: Floats
+    values: Floats
+    returns: Floats
+
+    def explained_variances(self) -> dict[str, float]:
+        """The critics' explained variance of fresh returns, 1 - Var(returns - values) / Var(returns).
+
+        1 is perfect, 0 is no better than a constant, NaN where all returns are equal. The last value in the
+        returns is the critics' own, which flatters them a little.
+        """
+        spread = self.returns.var(axis=0)
+        unexplained = (self.returns - self.values).var(axis=0)
+        shares = np.where(spread > 0.0, 1.0 - quotient(unexplained, spread), np.nan)
+        return {"explained_variance_reward": float(shares[0])} | indexed(
+            "explained_variance_cost", shares[1:]
+        )
+
+
+def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
+    """What to regress on at each row so that the mean squared error over the samples is minimal.
+
+    The mean squared error over samples is that about the mean target of each row, weighted by the
+    row's share of the samples, plus the targets' spread about those means, which no critic can lower.
+
+    Args:
+        batch: the samples.
+        targets: of all samples of the rollout, [N, C].
+
+    Returns:
+        The mean targets, [C, U], and the spread, [C].
+    """
+    sums = batch.per_observation(targets)
+    shares = batch.observation_weights.numpy(force=True).astype(np.float64)[:, None]
+    spread = np.mean(batch.own(targets) ** 2, axis=0) - np.sum(sums**2 / shares, axis=0)
+    return to_tensor((sums / shares).T.copy()), to_tensor(np.maximum(spread, 0.0))

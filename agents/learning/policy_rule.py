@@ -1,0 +1,84 @@
+"""What an algorithm adds to an actor-critic: a rule that improves the policy, and what is measured of it.
+
+Notation: N samples, k costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from recrl.agents.experience import Experience
+from recrl.agents.learning.distributions import mean_divergence
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.learning.surrogates import surrogate
+
+
+class Stateful(Protocol):
+    """Something that is saved and restored with an agent."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All it has learnt and adapted: a tree of dicts, lists, JSON scalars and NumPy arrays."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        ...
+
+
+class PolicyRule(Protocol):
+    """How an agent's policy gets better: what tells the algorithms apart."""
+
+    @property
+    def parts(self) -> Mapping[str, Stateful]:
+        """What the rule keeps from one update to the next, by name."""
+        ...
+
+    def improve(
+        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+    ) -> dict[str, float]:
+        """Change the policy once.
+
+        Args:
+            policy: the one that collected the samples; changed in place.
+            experience: the samples, raw advantages, and how the constraints stand.
+            generator: the agent's own randomness.
+
+        Returns:
+            Metrics, the same keys every time: ``policy_steps``, ``multiplier_i``, and the rule's own.
+        """
+        ...
+
+
+def indexed(name: str, values: npt.NDArray[np.floating]) -> dict[str, float]:
+    """One metric a cost, [k]: ``name_0``, ``name_1``, ...; infinite values are NaN, as metrics must be."""
+    return {
+        f"{name}_{i}": float(value) if np.isfinite(value) else float("nan") for i, value in enumerate(values)
+    }
+
+
+def improve_and_measure(
+    rule: PolicyRule, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
+) -> dict[str, float]:
+    """Let a rule improve the policy; its metrics, and how far the policy has come.
+
+    Returns:
+        The rule's metrics; ``kl``, the mean KL from the old policy in nats; the mean ``entropy``; and
+        ``surrogate_reward`` and ``surrogate_cost_i``, the gains to first order in the advantages' unit.
+    """
+    metrics = rule.improve(policy, experience, generator)
+    batch, advantages = experience.batch, experience.advantages
+    new = policy.distribution(batch.unique_observations)
+    centred = batch.per_pair(advantages - advantages.mean(axis=0))
+    gains = surrogate(experience.ratios(new), centred).numpy(force=True)
+    return {
+        **metrics,
+        "kl": float(mean_divergence(experience.old, new, batch.observation_weights)),
+        "entropy": float(torch.dot(batch.observation_weights, new.entropy())),
+        "surrogate_reward": float(gains[0]),
+        **indexed("surrogate_cost", gains[1:]),
+    }
