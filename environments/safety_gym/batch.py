@@ -1,4 +1,4 @@
-"""Safety Gym's tasks: B worlds of one task, stepped together.
+"""Safety Gym's tasks: B environments of one task, stepped together.
 
 Observation: float32, the parts sorted by name (``SafetyTask.components``): the robot's sensors, and 16 bins
     of pseudo-lidar for every kind of object that can be seen. CarGoal2 has 72 numbers.
@@ -13,12 +13,11 @@ Termination: when there is no room for a new goal, or when the physics breaks do
     after 1,000 steps.
 Source: openai/safety-gym ``engine.py``; where safety-gymnasium 1.0.0 differs, this follows Safety Gym.
 
-Notation: B worlds, P objects that the lidar sees, k costs.
+Notation: B environments, P objects that the lidar sees, k costs.
 """
 
 from __future__ import annotations
 
-import copy
 from typing import Any, NamedTuple
 
 import mujoco
@@ -38,11 +37,10 @@ from recrl.environments.safety_gym.native.environment_step import (
 from recrl.environments.safety_gym.native.task_record import allocate, places_of_objects, task_record
 from recrl.environments.safety_gym.scene import make_scene, upright
 from recrl.environments.safety_gym.tasks import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
+from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
 from recrl.environments.simulation.mujoco_batch import Simulations
 
-Booleans = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
-Observations = npt.NDArray[np.float32]
 
 _NOBODY = np.zeros(0, np.intp)
 
@@ -58,7 +56,7 @@ class Outcome(NamedTuple):
         terminated: [B].
         truncated: [B].
         broken: the physics broke down in this step, [B]; None if it did so nowhere.
-        finished: worlds whose episode is over.
+        finished: environments whose episode is over.
     """
 
     rewards: Floats
@@ -71,14 +69,14 @@ class Outcome(NamedTuple):
     finished: npt.NDArray[np.intp]
 
 
-class SafetyWorlds:
-    """B worlds of one task. Whoever uses them restarts those that are over.
+class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
+    """B environments of one Safety Gym task; see ``EnvironmentBatch``.
 
     Args:
         task: which task.
         number: B, at least 1.
         horizon: steps after which an episode is truncated, at most 1,000.
-        num_threads: threads that step the worlds; results do not depend on it.
+        num_threads: threads of the physics; results do not depend on it.
 
     Attributes:
         task: as given.
@@ -86,11 +84,11 @@ class SafetyWorlds:
         horizon: as given.
         scene: the physics' model.
         simulations: the physics.
-        generators: one generator for each world.
+        generators: one generator for each environment.
         qpos, qvel: coordinates and velocities, live views, [B, ...].
         group: for each kind of object that the lidar sees, its slice of P.
 
-    The rest are live views of the worlds' records. Whoever writes there calls ``refresh``, and before it, if
+    The rest are live views of the records. After writing there call ``refresh``, and before it, if
     ``qpos`` or ``qvel`` were written, ``simulations.forward``.
         points: (x, y) of everything that the lidar sees, metres, [B, P, 2]; ``group`` tells which is which.
         steps: taken in this episode, [B].
@@ -111,14 +109,10 @@ class SafetyWorlds:
     def __init__(
         self, task: SafetyTask, number: int, *, horizon: int = HORIZON, num_threads: int = 1
     ) -> None:
-        self.task = task
-        self.number = number
-        self.horizon = horizon
-        self._num_threads = num_threads
+        super().__init__(task, number, horizon=horizon, num_threads=num_threads)
         self.scene = make_scene(task)
         model = self.scene.model
         self.simulations = Simulations(model, number, num_threads=num_threads)
-        self.generators: list[np.random.Generator] = []
         self.group = places_of_objects(task)
 
         state = mujoco.mjtState
@@ -131,17 +125,8 @@ class SafetyWorlds:
         self._view_records()
         self.embodied[:] = NOT_YET
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        state = self.state_dict() if self.generators else None
-        return _rebuilt, (self.task, self.number, self.horizon, self._num_threads, state)
-
-    def seed(self, seed: int | None) -> None:
-        """Give each world a generator; world i has the same one whatever B is."""
-        streams = np.random.SeedSequence(seed).spawn(self.number)
-        self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
-
     def restart(self, ids: npt.NDArray[np.intp]) -> None:
-        """Begin new episodes in some worlds."""
+        """Begin new episodes in some environments."""
         layouts = [sample_layout(self.task, self.generators[index]) for index in ids]
         self.simulations.reset(ids)
         for index, layout in zip(ids, layouts, strict=True):
@@ -152,13 +137,13 @@ class SafetyWorlds:
         self.embodied[ids] = NOT_YET
         self._renew_goals(ids)
 
-    def order(self, actions: npt.NDArray[Any]) -> bool:
-        """Say what to do in the next step; False if an action, [B, 2], is no number within [-1, 1]."""
+    def set_actions(self, actions: npt.NDArray[Any]) -> bool:
+        """Take the actions of the next step; False if an action, [B, 2], is no number within [-1, 1]."""
         self._action[...] = actions
         return acceptable(self._address)
 
     def advance(self) -> Outcome:
-        """Take one step in every world, as ordered."""
+        """Take one step in every environment, with the actions that were set."""
         self.simulations.apply(step, self._address)
         results, flags = self._memory.results.copy(), self._memory.flags.copy()
         rewards, costs, terms = results[0], results[1:2], results[2:]
@@ -185,7 +170,7 @@ class SafetyWorlds:
         return self._memory.observations.copy()
 
     def refresh(self, ids: npt.NDArray[np.intp] | None = None) -> None:
-        """Find everything in some worlds, or all, as the simulations and the records have it now."""
+        """Find everything in some environments, or all, as the simulations and the records have it now."""
         self.simulations.apply(review, self._address, ids)
 
     def perceive(self) -> None:
@@ -196,32 +181,22 @@ class SafetyWorlds:
         """Whether the robot touches each button, [B, buttons]."""
         return self.touching[:, self.scene.touchable["buttons"]].copy()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the future depends on: physics, layout, goals, counters, generators."""
+    def _own_state(self) -> dict[str, Any]:
+        """Physics, layout, goals and counters."""
         return {
             "physics": self.simulations.save(),
             "worlds": {name: self._memory.worlds[name].copy() for name in WORLD.names or ()},
             "observations": self.observations(),
-            "generators": [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators],
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        if len(state["generators"]) != self.number:
-            raise ValueError(
-                f"{self.task.name}: the saved state is of {len(state['generators'])} environments, "
-                f"these are {self.number}"
-            )
+    def _load_own_state(self, state: dict[str, Any]) -> None:
         self.simulations.load(state["physics"])
         for name in WORLD.names or ():
             self._memory.worlds[name] = state["worlds"][name]
         self._memory.observations[...] = state["observations"]
-        self.seed(0)
-        for generator, saved in zip(self.generators, state["generators"], strict=True):
-            generator.bit_generator.state = saved
 
     def _view_records(self) -> None:
-        """Name the parts of the worlds' records, without the room that this task does not need."""
+        """Name the parts of the environments' records, without the room that this task does not need."""
         records, task = self._memory.worlds, self.task
         self._action: Floats = records["action"]
         self.points: Floats = records["points"][:, : max(places.stop for places in self.group.values())]
@@ -240,7 +215,7 @@ class SafetyWorlds:
         self.touching: Booleans = records["touching"].view(np.bool_)[:, : self.scene.model.nbody]
 
     def _put_down(self, index: int, layout: dict[str, Floats]) -> None:
-        """Write one world's layout into its simulation, everything turned at random."""
+        """Write one environment's layout into its simulation, everything turned at random."""
         task, scene, generator = self.task, self.scene, self.generators[index]
         yaw = generator.uniform(0.0, 2.0 * np.pi)
         if task.robot == "Car":
@@ -263,7 +238,7 @@ class SafetyWorlds:
         self.gremlin_yaws[index] = generator.uniform(0.0, 2.0 * np.pi, task.gremlins.number)
 
     def _renew_goals(self, ids: npt.NDArray[np.intp]) -> Booleans:
-        """Choose new goals in some worlds; False where there is no room for one."""
+        """Choose new goals in some environments; False where there is no room for one."""
         found = np.array([self._renew_goal(index) for index in ids])
         self.refresh(ids)
         self.distances[ids] = self.measured[ids]
@@ -287,13 +262,3 @@ class SafetyWorlds:
             return False
         goal[:] = found
         return True
-
-
-def _rebuilt(
-    task: SafetyTask, number: int, horizon: int, num_threads: int, state: dict[str, Any] | None
-) -> SafetyWorlds:
-    """A copy of pickled worlds."""
-    worlds = SafetyWorlds(task, number, horizon=horizon, num_threads=num_threads)
-    if state is not None:
-        worlds.load_state_dict(state)
-    return worlds

@@ -1,13 +1,13 @@
-"""Are our worlds Safety Gym's? A check against recorded episodes of another implementation.
+"""Are our environments Safety Gym's? A check against recorded episodes of another implementation.
 
 A recording holds, for every step of an episode, the state of the physics, what was observed, the reward,
-the cost terms and the goal. Here our worlds are put into the recorded states, and say what they observe,
-earn and pay: equal but for rounding, or something is defined differently. How the physics moves between two
+the cost terms and the goal. Here our environments are put into the recorded states. What they then observe,
+earn and pay must be equal but for rounding, or something is defined differently. How the physics moves between two
 states is not compared: it is chaotic, and engines differ in the last digits.
 
 The recordings' format is described in ``tests/parity/README.md``.
 
-Notation: T steps in an episode, B worlds, one for each state of a chunk of an episode.
+Notation: T steps in an episode, B environments, one for each state of a chunk of an episode.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyWorlds
+from recrl.environments.safety_gym.batch import SafetyGymBatch
 from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.tasks import SAFETY_TASKS, SafetyTask
 
@@ -34,7 +34,7 @@ Integers = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far our worlds are from one recorded episode.
+    """How far our environments are from one recorded episode.
 
     Attributes:
         task: the task's name.
@@ -83,21 +83,21 @@ def _compare_episode(
     task: SafetyTask, meta: dict[str, Any], episode: dict[str, Any], policy: str
 ) -> Comparison:
     length = len(episode["reward"])
-    worlds = SafetyWorlds(task, min(CHUNK, length + 1))
+    batch = SafetyGymBatch(task, min(CHUNK, length + 1))
     seen, rewards, terms, met = [], [], [], []
-    for start in range(0, length + 1, worlds.number):
-        now = np.minimum(np.arange(start, start + worlds.number), length)
-        _put_into(worlds, meta, episode, at=now, pursuing=now)
-        worlds.acceleration[...] = _acceleration(task, meta, episode, now)
-        worlds.perceive()
-        seen.append(worlds.observations())
+    for start in range(0, length + 1, batch.number):
+        now = np.minimum(np.arange(start, start + batch.number), length)
+        _put_into(batch, meta, episode, at=now, pursuing=now)
+        batch.acceleration[...] = _acceleration(task, meta, episode, now)
+        batch.perceive()
+        seen.append(batch.observations())
         before = np.maximum(now - 1, 0)
-        _put_into(worlds, meta, episode, at=before, pursuing=before)
-        last = worlds.measured.copy()
-        _put_into(worlds, meta, episode, at=now, pursuing=before)
-        met.append(worlds.goal_met.copy())
-        rewards.append((last - worlds.measured).sum(axis=1) + met[-1])
-        terms.append(worlds.terms.copy())
+        _put_into(batch, meta, episode, at=before, pursuing=before)
+        last = batch.measured.copy()
+        _put_into(batch, meta, episode, at=now, pursuing=before)
+        met.append(batch.goal_met.copy())
+        rewards.append((last - batch.measured).sum(axis=1) + met[-1])
+        terms.append(batch.terms.copy())
     ours = [np.concatenate(parts)[: length + 1] for parts in (seen, rewards, terms, met)]
     mismatches, costly = _cost_mismatches(task, meta, episode, ours[2][1:])
     return Comparison(
@@ -113,41 +113,41 @@ def _compare_episode(
 
 
 def _put_into(
-    worlds: SafetyWorlds,
+    batch: SafetyGymBatch,
     meta: dict[str, Any],
     episode: dict[str, Any],
     *,
     at: Integers,
     pursuing: Integers,
 ) -> None:
-    """Put world b into the recorded state ``at[b]``, with the goal and button timer of ``pursuing[b]``."""
-    scene, task = worlds.scene, worlds.task
-    worlds.simulations.reset(np.arange(worlds.number))
+    """Put environment b into the state ``at[b]``, with the goal and button timer of ``pursuing[b]``."""
+    scene, task = batch.scene, batch.task
+    batch.simulations.reset(np.arange(batch.number))
     qpos, qvel = _robot_state(task, meta, episode, at)
-    worlds.qpos[:, : scene.robot_qpos], worlds.qvel[:, : scene.robot_qvel] = qpos, qvel
+    batch.qpos[:, : scene.robot_qpos], batch.qvel[:, : scene.robot_qvel] = qpos, qvel
     if "goal_pos" in episode:
-        goal = worlds.group["goal"].start
-        worlds.points[:, goal] = episode["goal_pos"][:2, pursuing].T
+        goal = batch.group["goal"].start
+        batch.points[:, goal] = episode["goal_pos"][:2, pursuing].T
     for index in range(task.vases.number):
         qpos, qvel = _body(meta, episode, f"vase{index}", at)
-        worlds.qpos[:, scene.vase_qpos[index] : scene.vase_qpos[index] + 7] = qpos
-        worlds.qvel[:, scene.vase_qvel[index] : scene.vase_qvel[index] + 6] = qvel
+        batch.qpos[:, scene.vase_qpos[index] : scene.vase_qpos[index] + 7] = qpos
+        batch.qvel[:, scene.vase_qvel[index] : scene.vase_qvel[index] + 6] = qvel
     if task.box.number:
         qpos, qvel = _body(meta, episode, "push_box", at)
-        worlds.qpos[:, scene.box_qpos :], worlds.qvel[:, scene.robot_qvel :] = qpos, qvel
+        batch.qpos[:, scene.box_qpos :], batch.qvel[:, scene.robot_qvel :] = qpos, qvel
     for kind, mocap in (("hazard", ()), ("button", scene.button_mocap), ("pillar", scene.pillar_mocap)):
         places = _static_places(meta, episode, kind)
-        if len(places) and f"{kind}s" in worlds.group:
-            worlds.points[:, worlds.group[f"{kind}s"]] = places
+        if len(places) and f"{kind}s" in batch.group:
+            batch.points[:, batch.group[f"{kind}s"]] = places
         if len(mocap):
-            worlds.mocap_pos[:, list(mocap), :2] = places
+            batch.mocap_pos[:, list(mocap), :2] = places
     if task.gremlins.number:
-        _put_gremlins(worlds, meta, episode, at)
+        _put_gremlins(batch, meta, episode, at)
     if task.goal == "Button":
-        worlds.goal_button[:] = episode["goal_button"][pursuing]
-        worlds.button_timer[:] = episode["buttons_timer"][pursuing]
-    worlds.simulations.forward(np.arange(worlds.number))
-    worlds.refresh()
+        batch.goal_button[:] = episode["goal_button"][pursuing]
+        batch.button_timer[:] = episode["buttons_timer"][pursuing]
+    batch.simulations.forward(np.arange(batch.number))
+    batch.refresh()
 
 
 def _robot_state(
@@ -201,21 +201,21 @@ def _body(meta: dict[str, Any], episode: dict[str, Any], name: str, at: Integers
     )
 
 
-def _put_gremlins(worlds: SafetyWorlds, meta: dict[str, Any], episode: dict[str, Any], at: Integers) -> None:
+def _put_gremlins(batch: SafetyGymBatch, meta: dict[str, Any], episode: dict[str, Any], at: Integers) -> None:
     """Make the gremlin nearest the robot the body; all are where they were recorded, even off course."""
-    scene = worlds.scene
-    names = [f"gremlin{index}obj" for index in range(worlds.task.gremlins.number)]
+    scene = batch.scene
+    names = [f"gremlin{index}obj" for index in range(batch.task.gremlins.number)]
     bodies = [_body(meta, episode, name, at) for name in names]
     coordinates, velocities = (np.stack(parts) for parts in zip(*bodies, strict=True))
-    robot = worlds.qpos[:, :2]
+    robot = batch.qpos[:, :2]
     nearest = np.square(coordinates[:, :, :2] - robot).sum(axis=2).argmin(axis=0)
-    everyone = np.arange(worlds.number)
+    everyone = np.arange(batch.number)
     qpos, qvel = scene.gremlin_qpos, scene.gremlin_qvel
-    worlds.qpos[:, qpos : qpos + 7] = coordinates[nearest, everyone]
-    worlds.qvel[:, qvel : qvel + 6] = velocities[nearest, everyone]
-    worlds.embodied[:], worlds.steps[:] = nearest, at
-    course = gremlin_course(worlds.task).positions[at, None, :2]
-    worlds.circles[...] = coordinates[:, :, :2].transpose(1, 0, 2) - course
+    batch.qpos[:, qpos : qpos + 7] = coordinates[nearest, everyone]
+    batch.qvel[:, qvel : qvel + 6] = velocities[nearest, everyone]
+    batch.embodied[:], batch.steps[:] = nearest, at
+    course = gremlin_course(batch.task).positions[at, None, :2]
+    batch.circles[...] = coordinates[:, :, :2].transpose(1, 0, 2) - course
 
 
 def _static_places(meta: dict[str, Any], episode: dict[str, Any], kind: str) -> Floats:

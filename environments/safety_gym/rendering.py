@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyWorlds
+from recrl.environments.safety_gym.batch import SafetyGymBatch
 from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.scene import rotation_matrices, scene_xml, upright
 from recrl.environments.safety_gym.tasks import GOAL_HEIGHT, LIDAR_BINS
@@ -57,10 +57,10 @@ _ROOM = """
 
 
 class SafetyRenderer:
-    """Draws single worlds of a task.
+    """Draws single environments of a batch.
 
     Args:
-        worlds: whose worlds are drawn.
+        batch: what is drawn.
         width: of a picture, pixels, at most 1,920.
         height: of a picture, pixels, at most 1,080.
 
@@ -68,9 +68,9 @@ class SafetyRenderer:
         RenderingUnavailableError: there is neither EGL nor OSMesa, or MUJOCO_GL names one that is missing.
     """
 
-    def __init__(self, worlds: SafetyWorlds, width: int = 480, height: int = 360) -> None:
-        self._worlds = worlds
-        self._model = _coloured_model(worlds)
+    def __init__(self, batch: SafetyGymBatch, width: int = 480, height: int = 360) -> None:
+        self._batch = batch
+        self._model = _coloured_model(batch)
         self._data = mujoco.MjData(self._model)
         self._context = make_context(width, height)
         self._drawing = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -84,8 +84,8 @@ class SafetyRenderer:
 
     def frame(self, index: int) -> Frame:
         """World ``index`` as it is now, [height, width, 3]."""
-        worlds = self._worlds
-        row = worlds.simulations.rows[index]
+        batch = self._batch
+        row = batch.simulations.rows[index]
         mujoco.mj_setState(self._model, self._data, row, mujoco.mjtState.mjSTATE_INTEGRATION.value)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -113,27 +113,27 @@ class SafetyRenderer:
         self._context.free()
 
     def _add_areas(self, index: int) -> None:
-        worlds, task = self._worlds, self._worlds.task
+        batch, task = self._batch, self._batch.task
         if task.target.number:
             size = task.target.size
-            for place in worlds.points[index, worlds.group["goal"]]:
+            for place in batch.points[index, batch.group["goal"]]:
                 self._add_cylinder((*place, GOAL_HEIGHT), size, size / 2, COLOURS["goal"])
         else:
-            button = worlds.points[index, worlds.group["goal"].start]
+            button = batch.points[index, batch.group["goal"].start]
             self._add_cylinder((*button, 0.01), 2 * task.buttons.size, 0.01, COLOURS["goal"])
-        if "hazards" in worlds.group:
-            for place in worlds.points[index, worlds.group["hazards"]]:
+        if "hazards" in batch.group:
+            for place in batch.points[index, batch.group["hazards"]]:
                 self._add_cylinder((*place, HAZARD_HEIGHT), task.hazards.size, 0.01, COLOURS["hazards"])
 
     def _add_gremlins(self, index: int) -> None:
         """The gremlins that are no bodies just now."""
-        worlds, task = self._worlds, self._worlds.task
+        batch, task = self._batch, self._batch.task
         if not task.gremlins.number:
             return
-        height = float(gremlin_course(task).positions[worlds.steps[index], 2])
-        for gremlin, place in enumerate(worlds.points[index, worlds.group["gremlins"]]):
-            if gremlin != worlds.embodied[index]:
-                turn = rotation_matrices(upright(worlds.gremlin_yaws[index, gremlin]))
+        height = float(gremlin_course(task).positions[batch.steps[index], 2])
+        for gremlin, place in enumerate(batch.points[index, batch.group["gremlins"]]):
+            if gremlin != batch.embodied[index]:
+                turn = rotation_matrices(upright(batch.gremlin_yaws[index, gremlin]))
                 self._add(
                     mujoco.mjtGeom.mjGEOM_BOX,
                     np.full(3, task.gremlins.size),
@@ -143,14 +143,14 @@ class SafetyRenderer:
                 )
 
     def _add_lidar(self, index: int) -> None:
-        worlds = self._worlds
-        observation = worlds.observations()[index]
+        batch = self._batch
+        observation = batch.observations()[index]
         body = self._data.body("robot")
         rotation = body.xmat.reshape(3, 3)
         angles = 2.0 * np.pi * (np.arange(LIDAR_BINS) + 0.5) / LIDAR_BINS
-        for ring, kind in enumerate(worlds.task.lidars):
+        for ring, kind in enumerate(batch.task.lidars):
             height = LIDAR_HEIGHT + LIDAR_RISE * ring
-            for angle, reading in zip(angles, observation[worlds.task.where(f"{kind}_lidar")], strict=True):
+            for angle, reading in zip(angles, observation[batch.task.where(f"{kind}_lidar")], strict=True):
                 place = (LIDAR_RADIUS * np.cos(angle), LIDAR_RADIUS * np.sin(angle), height)
                 self._add(
                     mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -181,9 +181,9 @@ class SafetyRenderer:
         scene.ngeom += 1
 
 
-def _coloured_model(worlds: SafetyWorlds) -> mujoco.MjModel:
+def _coloured_model(batch: SafetyGymBatch) -> mujoco.MjModel:
     """The task's model with colours and a floor to look at; its state is that of the plain one."""
-    xml = scene_xml(worlds.task).replace("<option", f"{_ROOM}<option", 1)
+    xml = scene_xml(batch.task).replace("<option", f"{_ROOM}<option", 1)
     model = mujoco.MjModel.from_xml_string(xml.replace('name="floor"', 'name="floor" material="tiled"', 1))
     for geom in range(model.ngeom):
         body = model.body(model.body_rootid[model.geom_bodyid[geom]]).name

@@ -1,4 +1,4 @@
-"""Continuous actions on their way to the worlds that take them: given, clipped or refused."""
+"""Check continuous actions, and clip or refuse those outside their bounds."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ import numpy as np
 import numpy.typing as npt
 
 
-class Orderable(Protocol):
-    """Worlds that are told what to do next."""
+class Actor(Protocol):
+    """Environments that take actions."""
 
-    def order(self, actions: npt.NDArray[Any]) -> bool:
-        """Take the actions; False if one is no number within the bounds."""
+    def set_actions(self, actions: npt.NDArray[Any]) -> bool:
+        """Take the actions of the next step; False if one is no number within the bounds."""
 
 
 def give_actions(
     name: str,
-    worlds: Orderable,
+    batch: Actor,
     actions: npt.NDArray[Any],
     *,
     shape: tuple[int, ...],
     bound: float,
     out_of_range: Literal["error", "clip"],
 ) -> None:
-    """Give worlds their actions.
+    """Set the actions of the next step.
 
     Args:
         name: the task's, for errors.
-        worlds: who acts.
-        actions: what to do.
+        batch: the environments.
+        actions: one for each environment, or for the only one.
         shape: that the actions must have.
         bound: actions are within plus or minus this.
         out_of_range: what happens to others that are finite.
@@ -42,7 +42,7 @@ def give_actions(
         raise ValueError(
             f"{name}: actions must be numbers of shape {shape}, got {actions.dtype} of shape {actions.shape}"
         )
-    if worlds.order(actions):
+    if batch.set_actions(actions):
         return
     if not np.isfinite(actions).all():
         raise ValueError(f"{name}: actions must be finite, got {actions.tolist()}")
@@ -51,4 +51,4 @@ def give_actions(
             f"{name}: actions must be in [{-bound:g}, {bound:g}], got {actions.tolist()} "
             "(option out_of_range: clip clips them)"
         )
-    worlds.order(np.clip(actions, -bound, bound))
+    batch.set_actions(np.clip(actions, -bound, bound))

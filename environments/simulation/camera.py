@@ -1,4 +1,4 @@
-"""Pictures of worlds, drawn once somebody looks.
+"""Frames of environments, rendered on demand.
 
 Off-screen drawing goes through EGL or, where that is missing, OSMesa; the environment variable ``MUJOCO_GL``
 may name one of them. Importing this module imports neither.
@@ -23,21 +23,21 @@ class RenderingUnavailableError(RuntimeError):
 
 
 class Renderer(Protocol):
-    """Draws single worlds of a task."""
+    """Renders single environments of a batch."""
 
     def frame(self, index: int) -> Frame:
-        """World ``index`` as it is now, [height, width, 3]."""
+        """Environment ``index`` as it is now, [height, width, 3]."""
 
     def close(self) -> None:
         """Free what the graphics driver holds."""
 
 
 class Camera:
-    """Draws worlds; copies of an environment get a camera of their own.
+    """Renders a batch; copies of an environment get a camera of their own.
 
     Args:
         render_mode: None or ``rgb_array``.
-        make_renderer: (worlds) -> what draws them, called when the first picture is wanted; a function of a
+        make_renderer: (batch) -> what renders it, called when the first frame is wanted; a function of a
             module.
     """
 
@@ -51,17 +51,17 @@ class Camera:
     def __reduce__(self) -> tuple[Any, ...]:
         return Camera, (self.render_mode, self._make_renderer)
 
-    def frames(self, worlds: Any) -> tuple[Frame, ...]:
-        """One picture [height, width, 3] of each world."""
+    def frames(self, batch: Any) -> tuple[Frame, ...]:
+        """One picture [height, width, 3] of each environment."""
         if self.render_mode is None:
             raise ValueError(
-                f"{worlds.task.name}: to render, make the environment with render_mode='rgb_array'"
+                f"{batch.task.name}: to render, make the environment with render_mode='rgb_array'"
             )
-        if not worlds.generators:
-            raise ValueError(f"{worlds.task.name}: call reset before the first picture")
+        if not batch.generators:
+            raise ValueError(f"{batch.task.name}: call reset before the first picture")
         if self._renderer is None:
-            self._renderer = self._make_renderer(worlds)
-        return tuple(self._renderer.frame(index) for index in range(worlds.number))
+            self._renderer = self._make_renderer(batch)
+        return tuple(self._renderer.frame(index) for index in range(batch.number))
 
     def close(self) -> None:
         """Free the graphics driver's memory."""

@@ -1,4 +1,4 @@
-"""Safety-Gymnasium's velocity tasks: B robots of one task, stepped together.
+"""Safety-Gymnasium's velocity tasks: B environments of one task, stepped together.
 
 Observation: float32. The robot's coordinates but the first one or two, which say where it is, then its
     velocities (Hopper, Walker2d: clipped to +-10). Humanoid, too: of each of 14 bodies the inertia (10
@@ -17,12 +17,11 @@ Source: Gymnasium's MuJoCo environments of version 4 with the thresholds of safe
 As in Gymnasium, positions and velocities of bodies (Ant's torso; Humanoid's centre of mass, inertias,
 velocities, forces) are those of the last moment at which MuJoCo computed them, up to one physics step old.
 
-Notation: B robots, nq coordinates, nv velocities.
+Notation: B environments, nq coordinates, nv velocities.
 """
 
 from __future__ import annotations
 
-import copy
 from typing import Any, NamedTuple
 
 import mujoco
@@ -30,12 +29,12 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.simulation.environment_batch import EnvironmentBatch, Observations
 from recrl.environments.simulation.mujoco_batch import Simulations
 from recrl.environments.velocity.model import make_model
 from recrl.environments.velocity.physics import advance, derive, physics_record
 from recrl.environments.velocity.tasks import HORIZON, Booleans, VelocityTask
 
-Observations = npt.NDArray[np.float32]
 TORSO = 1
 """The torso's body; body 0 is the floor."""
 
@@ -50,7 +49,7 @@ class Outcome(NamedTuple):
         terminated: [B].
         truncated: [B].
         broken: the physics broke down in this step, [B]; None if it did so nowhere.
-        finished: robots whose episode is over.
+        finished: environments whose episode is over.
     """
 
     rewards: Floats
@@ -62,8 +61,8 @@ class Outcome(NamedTuple):
     finished: npt.NDArray[np.intp]
 
 
-class VelocityWorlds:
-    """B robots of one task. Whoever uses them restarts those whose episode is over.
+class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
+    """B environments of one velocity task; see ``EnvironmentBatch``.
 
     Args:
         task: which task.
@@ -75,7 +74,7 @@ class VelocityWorlds:
         task, number, horizon: as given.
         model: the physics' model.
         simulations: the physics.
-        generators: one generator for each robot.
+        generators: one generator for each environment.
         seconds: of the robot's time in a step.
         bound: of the actions, which are within plus or minus this.
         observed: numbers in an observation.
@@ -89,10 +88,9 @@ class VelocityWorlds:
     def __init__(
         self, task: VelocityTask, number: int, *, horizon: int = HORIZON, num_threads: int = 1
     ) -> None:
-        self.task, self.number, self.horizon, self._num_threads = task, number, horizon, num_threads
+        super().__init__(task, number, horizon=horizon, num_threads=num_threads)
         self.model = model = make_model(task)
         self.simulations = Simulations(model, number, num_threads=num_threads)
-        self.generators: list[np.random.Generator] = []
         self.seconds = float(model.opt.timestep) * task.frame_skip
         self.bound = float(np.float32(model.actuator_ctrlrange[0, 1]))
         state = mujoco.mjtState
@@ -108,15 +106,6 @@ class VelocityWorlds:
         self.places = np.zeros((number, task.axes))
         self.steps = np.zeros(number, np.int64)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        state = self.state_dict() if self.generators else None
-        return _rebuilt, (self.task, self.number, self.horizon, self._num_threads, state)
-
-    def seed(self, seed: int | None) -> None:
-        """Give each robot a generator; robot i has the same one whatever B is."""
-        streams = np.random.SeedSequence(seed).spawn(self.number)
-        self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
-
     def restart(self, ids: npt.NDArray[np.intp]) -> None:
         """Begin new episodes of some robots."""
         if self.simulations.broken()[ids].any():
@@ -131,13 +120,13 @@ class VelocityWorlds:
         self.places[ids] = self.measured()[ids]
         self.steps[ids] = 0
 
-    def order(self, actions: npt.NDArray[Any]) -> bool:
-        """Say what to do in the next step; False if an action, [B, nu], is no number within the bounds."""
+    def set_actions(self, actions: npt.NDArray[Any]) -> bool:
+        """Take the actions of the next step; False if an action, [B, nu], is no number within the bounds."""
         self._actions[...] = actions
         return bool(np.abs(self._actions).max() <= self.bound)  # False with NaN
 
     def advance(self) -> Outcome:
-        """Take one step with every robot, as ordered."""
+        """Take one step with every robot, with the actions that were set."""
         self._controls[...] = self._actions
         self.simulations.apply(advance, self.address)
         places = self.measured()
@@ -184,28 +173,18 @@ class VelocityWorlds:
             start += part.shape[1]
         return seen
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the future depends on: physics, where the robots were measured, counters, generators."""
+    def _own_state(self) -> dict[str, Any]:
+        """Physics, where the robots were measured, and counters."""
         return {
             "physics": self.simulations.save(),
             "places": self.places.copy(),
             "steps": self.steps.copy(),
-            "generators": [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators],
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        if len(state["generators"]) != self.number:
-            raise ValueError(
-                f"{self.task.name}: the saved state is of {len(state['generators'])} environments, "
-                f"these are {self.number}"
-            )
+    def _load_own_state(self, state: dict[str, Any]) -> None:
         self.simulations.load(state["physics"])
         self.places = np.array(state["places"], np.float64)
         self.steps[...] = state["steps"]
-        self.seed(0)
-        for generator, saved in zip(self.generators, state["generators"], strict=True):
-            generator.bit_generator.state = saved
 
     def _place_at_random(self, index: int) -> None:
         task, generator, model = self.task, self.generators[index], self.model
@@ -249,13 +228,3 @@ class VelocityWorlds:
             names = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
             parts += [self.bodies[name].reshape(self.number, -1) for name in names]
         return parts
-
-
-def _rebuilt(
-    task: VelocityTask, number: int, horizon: int, num_threads: int, state: dict[str, Any] | None
-) -> VelocityWorlds:
-    """A copy of pickled robots."""
-    worlds = VelocityWorlds(task, number, horizon=horizon, num_threads=num_threads)
-    if state is not None:
-        worlds.load_state_dict(state)
-    return worlds

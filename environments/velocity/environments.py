@@ -14,22 +14,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-import gymnasium
 import numpy as np
-import numpy.typing as npt
-from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field
 
-from recrl.environments.cmdp import CMDPSpec, Floats
-from recrl.environments.simulation.actions import give_actions
-from recrl.environments.simulation.camera import Camera, Renderer
-from recrl.environments.vector import CMDPVectorEnv
-from recrl.environments.velocity.tasks import HORIZON, VELOCITY_TASKS, Booleans, VelocityTask
+from recrl.environments.simulation.camera import Renderer
+from recrl.environments.simulation.environments import Description, MujocoEnv, MujocoVectorEnv
+from recrl.environments.velocity.tasks import HORIZON, VELOCITY_TASKS, VelocityTask
 
 if TYPE_CHECKING:
-    from recrl.environments.velocity.batch import Observations, Outcome, VelocityWorlds
+    from recrl.environments.velocity.batch import Outcome, VelocityBatch
 
 COST_NAMES = ("cost",)
 
@@ -50,37 +43,10 @@ class VelocityOptions(BaseModel):
     )
 
 
-def _make_worlds(task: VelocityTask, number: int, options: VelocityOptions) -> VelocityWorlds:
-    """Worlds to be stepped; who only asks what there is to be set does not wait for MuJoCo and Numba."""
-    from recrl.environments.velocity.batch import VelocityWorlds  # noqa: PLC0415
-
-    return VelocityWorlds(task, number, horizon=options.horizon, num_threads=options.num_threads)
-
-
 def _find(task: str) -> VelocityTask:
     if task not in VELOCITY_TASKS:
         raise ValueError(f"task must be one of {', '.join(VELOCITY_TASKS)}, got {task!r}")
     return VELOCITY_TASKS[task]
-
-
-def _spaces(worlds: VelocityWorlds) -> tuple[Box, Box]:
-    """Of the observations and of the actions of one environment."""
-    bound = worlds.bound
-    return (
-        Box(-np.inf, np.inf, (worlds.observed,), np.float32),
-        Box(-bound, bound, (worlds.model.nu,), np.float32),
-    )
-
-
-def _order(
-    worlds: VelocityWorlds, actions: npt.NDArray[Any], shape: tuple[int, ...], options: VelocityOptions
-) -> None:
-    """Give the worlds their actions, or say in a sentence what is wrong with them."""
-    name = worlds.task.name
-    if not worlds.generators:
-        raise ValueError(f"{name}: call reset before the first step")
-    out_of_range = options.out_of_range
-    give_actions(name, worlds, actions, shape=shape, bound=worlds.bound, out_of_range=out_of_range)
 
 
 def _info(outcome: Outcome) -> dict[str, Any]:
@@ -90,18 +56,33 @@ def _info(outcome: Outcome) -> dict[str, Any]:
     return info
 
 
-def _renderer(worlds: VelocityWorlds) -> Renderer:
+def _renderer(batch: VelocityBatch) -> Renderer:
     from recrl.environments.velocity.rendering import VelocityRenderer  # noqa: PLC0415  # needs graphics
 
-    return VelocityRenderer(worlds)
+    return VelocityRenderer(batch)
 
 
-def _frames_per_second(worlds: VelocityWorlds) -> int:
-    """Steps in a second of the robot's time."""
-    return round(1.0 / worlds.seconds)
+def _made(task: str, number: int, options: VelocityOptions) -> tuple[Description, VelocityBatch]:
+    """A task's description and environments; only this waits for MuJoCo and Numba."""
+    from recrl.environments.velocity.batch import VelocityBatch  # noqa: PLC0415
+
+    batch = VelocityBatch(_find(task), number, horizon=options.horizon, num_threads=options.num_threads)
+    description = Description(
+        name=task,
+        observed=batch.observed,
+        action_size=batch.model.nu,
+        action_bound=batch.bound,
+        out_of_range=options.out_of_range,
+        cost_names=COST_NAMES,
+        horizon=options.horizon,
+        frames_per_second=round(1.0 / batch.seconds),
+        info=_info,
+        make_renderer=_renderer,
+    )
+    return description, batch
 
 
-class VelocityVectorEnv(CMDPVectorEnv):
+class VelocityVectorEnv(MujocoVectorEnv):
     """B environments of one velocity task, stepped together.
 
     Args:
@@ -109,137 +90,29 @@ class VelocityVectorEnv(CMDPVectorEnv):
         num_envs: B, at least 1.
         render_mode: None or ``rgb_array``.
         options: the fields of ``VelocityOptions``.
-
-    Attributes:
-        worlds: what is stepped.
     """
 
+    batch: VelocityBatch
+
     def __init__(self, task: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> None:
-        found = _find(task)
-        if num_envs < 1:
-            raise ValueError(f"{task}: num_envs must be at least 1, got {num_envs}")
         self.options = VelocityOptions(**options)
-        self.num_envs = num_envs
-        self.render_mode = render_mode
-        self._camera = Camera(render_mode, _renderer)
-        self.worlds = _make_worlds(found, num_envs, self.options)
-        self.metadata = {
-            **CMDPVectorEnv.metadata,
-            "autoreset_mode": AutoresetMode.SAME_STEP,
-            "render_modes": ["rgb_array"],
-            "render_fps": _frames_per_second(self.worlds),
-        }
-        self.single_observation_space, self.single_action_space = _spaces(self.worlds)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.cmdp = CMDPSpec(
-            task, self.single_observation_space, self.single_action_space, COST_NAMES, self.options.horizon
-        )
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
-        """Start B episodes; ``seed`` gives each environment a generator of its own."""
-        super().reset(seed=seed, options=options)
-        if seed is not None or not self.worlds.generators:
-            self.worlds.seed(seed)
-        self.worlds.restart(np.arange(self.num_envs))
-        return self.worlds.observations(), {}
-
-    def step(
-        self, actions: npt.NDArray[Any]
-    ) -> tuple[Observations, Floats, Booleans, Booleans, dict[str, Any]]:
-        """Take one step in every environment; see ``recrl.environments.vector`` for what is returned."""
-        worlds = self.worlds
-        _order(worlds, actions, self.action_space.shape or (), self.options)
-        outcome = worlds.advance()
-        observations = worlds.observations()
-        info = _info(outcome)
-        if len(outcome.finished):
-            info["final_obs"] = observations
-            worlds.restart(outcome.finished)
-            observations = worlds.observations()
-        return observations, outcome.rewards, outcome.terminated, outcome.truncated, info
-
-    def restart(self, index: npt.NDArray[np.intp]) -> Observations:
-        """Begin new episodes in some environments; see ``recrl.environments.vector``."""
-        if not self.worlds.generators:
-            raise ValueError(f"{self.cmdp.name}: call reset before restart")
-        self.worlds.restart(index)
-        return self.worlds.observations()
-
-    def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
-        """One RGB picture of each environment, [height, width, 3]."""
-        return self._camera.frames(self.worlds)
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Free what drawing needed."""
-        self._camera.close()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Physics, where the robots were measured, counters and generators."""
-        if not self.worlds.generators:
-            raise ValueError(f"{self.cmdp.name}: there is no state before reset")
-        return self.worlds.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self.worlds.load_state_dict(state)
+        super().__init__(*_made(task, num_envs, self.options), render_mode)
 
 
-class VelocityEnv(gymnasium.Env[Any, Any]):
+class VelocityEnv(MujocoEnv):
     """One environment of a velocity task.
 
     Args:
         task: for example ``SafetyAntVelocity``.
         render_mode: None or ``rgb_array``.
         options: the fields of ``VelocityOptions``.
-
-    Attributes:
-        cost_names: names of the k costs in ``info["cost"]``, an array [k].
-        worlds: what is stepped: a single robot.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    batch: VelocityBatch
 
     def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
         self.options = VelocityOptions(**options)
-        self.render_mode = render_mode
-        self._camera = Camera(render_mode, _renderer)
-        self.cost_names = COST_NAMES
-        self.worlds = _make_worlds(_find(task), 1, self.options)
-        self.metadata = {**self.metadata, "render_fps": _frames_per_second(self.worlds)}
-        self.observation_space, self.action_space = _spaces(self.worlds)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; the same seed gives the same episode as the first of a batch."""
-        super().reset(seed=seed, options=options)
-        if seed is not None or not self.worlds.generators:
-            self.worlds.seed(seed)
-        self.worlds.restart(np.arange(1))
-        return self.worlds.observations()[0], {}
-
-    def step(self, action: npt.NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Take one step."""
-        _order(self.worlds, action, self.action_space.shape or (), self.options)
-        outcome = self.worlds.advance()
-        return (
-            self.worlds.observations()[0],
-            float(outcome.rewards[0]),
-            bool(outcome.terminated[0]),
-            bool(outcome.truncated[0]),
-            {name: values[0] for name, values in _info(outcome).items()},
-        )
-
-    def render(self) -> npt.NDArray[np.uint8]:
-        """An RGB picture, [height, width, 3]."""
-        return self._camera.frames(self.worlds)[0]
-
-    def close(self) -> None:
-        """Free what drawing needed."""
-        self._camera.close()
+        super().__init__(*_made(task, 1, self.options), render_mode)
 
 
 def make_velocity(name: str, num_envs: int, options: VelocityOptions) -> VelocityVectorEnv:

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.velocity.batch import VelocityWorlds
+from recrl.environments.velocity.batch import VelocityBatch
 from recrl.environments.velocity.physics import derive, derive_with_forces
 from recrl.environments.velocity.tasks import VELOCITY_TASKS, VelocityTask
 
@@ -132,59 +132,59 @@ def _accelerations(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
 
 
 def _check_numbers(task: VelocityTask, meta: dict[str, Any]) -> None:
-    worlds = VelocityWorlds(task, 1)
-    ours = (task.threshold, task.frame_skip, worlds.model.opt.timestep, worlds.seconds, worlds.observed)
+    batch = VelocityBatch(task, 1)
+    ours = (task.threshold, task.frame_skip, batch.model.opt.timestep, batch.seconds, batch.observed)
     theirs = (*(meta[name] for name in ("threshold", "frame_skip", "timestep", "dt")), meta["obs"][0])
-    bounds = {-worlds.bound, worlds.bound}
+    bounds = {-batch.bound, batch.bound}
     if ours != theirs or {*meta["action_low"], *meta["action_high"]} != bounds:
         raise ValueError(f"{task.name}: the recording has {theirs}, we have {ours}, actions within {bounds}")
 
 
 def _compare_episode(task: VelocityTask, episode: dict[str, npt.NDArray[Any]]) -> VelocityComparison:
-    worlds = VelocityWorlds(task, len(episode["qpos"]))
-    places = _see_bodies(worlds, episode)
-    worlds.qpos[...], worlds.qvel[...] = episode["qpos"], episode["qvel"]
-    passed = np.vstack((np.zeros((1, task.axes)), np.diff(places, axis=0) / worlds.seconds))
+    batch = VelocityBatch(task, len(episode["qpos"]))
+    places = _see_bodies(batch, episode)
+    batch.qpos[...], batch.qvel[...] = episode["qpos"], episode["qvel"]
+    passed = np.vstack((np.zeros((1, task.axes)), np.diff(places, axis=0) / batch.seconds))
     actions = np.vstack((np.zeros_like(episode["action"][:1]), episode["action"]))
-    rewards, _, costs = worlds.judge(passed, actions)
+    rewards, _, costs = batch.judge(passed, actions)
     # In single precision, as ours are; contact forces are compared relatively.
     recorded = episode["obs"].astype(np.float32).astype(np.float64)
-    apart = np.abs(worlds.observations() - recorded) / np.maximum(1.0, np.abs(recorded))
-    bodies = worlds.model.nbody
-    forces, velocities = apart[:, -6 * bodies :], apart[:, -12 * bodies - worlds.model.nv : -6 * bodies]
-    others = apart[:, : -12 * bodies - worlds.model.nv] if task.observes_bodies else apart
+    apart = np.abs(batch.observations() - recorded) / np.maximum(1.0, np.abs(recorded))
+    bodies = batch.model.nbody
+    forces, velocities = apart[:, -6 * bodies :], apart[:, -12 * bodies - batch.model.nv : -6 * bodies]
+    others = apart[:, : -12 * bodies - batch.model.nv] if task.observes_bodies else apart
     decided = task.observes_bodies
     return VelocityComparison(
         task=task.name,
-        states=worlds.number,
+        states=batch.number,
         observation=float(others.max()),
-        velocity=velocities.max(axis=1) if decided else np.zeros(worlds.number),
-        force=forces.max(axis=1) if decided else np.zeros(worlds.number),
+        velocity=velocities.max(axis=1) if decided else np.zeros(batch.number),
+        force=forces.max(axis=1) if decided else np.zeros(batch.number),
         reward=float(np.abs(rewards[1:] - episode["reward"]).max()),
         costs=int((costs[1:] != episode["cost"]).sum()),
         costly=int((episode["cost"] > 0).sum()),
-        terminations=int((worlds.fallen()[1:] != episode["terminated"]).sum()),
+        terminations=int((batch.fallen()[1:] != episode["terminated"]).sum()),
     )
 
 
-def _see_bodies(worlds: VelocityWorlds, episode: dict[str, npt.NDArray[Any]]) -> Floats:
+def _see_bodies(batch: VelocityBatch, episode: dict[str, npt.NDArray[Any]]) -> Floats:
     """Let robot t know of its bodies what was known after step t - 1, and return where each was measured."""
-    state, task = mujoco.mjtState, worlds.task
-    worlds.qpos[...], worlds.qvel[...] = episode["qpos"], episode["qvel"]
-    if not worlds.bodies:
-        return worlds.measured()
-    worlds.simulations.apply(derive, worlds.address, [0])
-    data = mujoco.MjData(worlds.model)
+    state, task = mujoco.mjtState, batch.task
+    batch.qpos[...], batch.qvel[...] = episode["qpos"], episode["qvel"]
+    if not batch.bodies:
+        return batch.measured()
+    batch.simulations.apply(derive, batch.address, [0])
+    data = mujoco.MjData(batch.model)
     data.qpos[:], data.qvel[:] = episode["qpos"][0], episode["qvel"][0]
-    _accelerations(worlds.model, data)
-    controls = worlds.simulations.state(state.mjSTATE_CTRL, (worlds.model.nu,))
-    beginnings = worlds.simulations.state(state.mjSTATE_WARMSTART, (worlds.model.nv,))
+    _accelerations(batch.model, data)
+    controls = batch.simulations.state(state.mjSTATE_CTRL, (batch.model.nu,))
+    beginnings = batch.simulations.state(state.mjSTATE_WARMSTART, (batch.model.nv,))
     for step, action in enumerate(episode["action"]):
         data.qpos[:], data.qvel[:] = episode["qpos"][step], episode["qvel"][step]
         data.ctrl[:] = controls[step + 1] = action
-        worlds.qpos[step + 1], worlds.qvel[step + 1], beginnings[step + 1] = last_stage(
-            worlds.model, data, task.frame_skip
+        batch.qpos[step + 1], batch.qvel[step + 1], beginnings[step + 1] = last_stage(
+            batch.model, data, task.frame_skip
         )
     function = derive_with_forces if task.observes_bodies else derive
-    worlds.simulations.apply(function, worlds.address, np.arange(1, worlds.number))
-    return worlds.measured()
+    batch.simulations.apply(function, batch.address, np.arange(1, batch.number))
+    return batch.measured()

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from recrl.environments.simulation.camera import Frame, make_context
-from recrl.environments.velocity.batch import TORSO, VelocityWorlds
+from recrl.environments.velocity.batch import TORSO, VelocityBatch
 
 MAX_GEOMS = 1000
 CAMERA_ELEVATION, CAMERA_AZIMUTH = -20.0, 90.0
@@ -18,7 +18,7 @@ class VelocityRenderer:
     """Draws single robots of a task.
 
     Args:
-        worlds: whose robots are drawn.
+        batch: whose robots are drawn.
         width: of a picture, pixels.
         height: of a picture, pixels.
 
@@ -26,9 +26,9 @@ class VelocityRenderer:
         RenderingUnavailableError: there is neither EGL nor OSMesa, or MUJOCO_GL names one that is missing.
     """
 
-    def __init__(self, worlds: VelocityWorlds, width: int = 480, height: int = 360) -> None:
-        self._worlds = worlds
-        self._model = copy.copy(worlds.model)
+    def __init__(self, batch: VelocityBatch, width: int = 480, height: int = 360) -> None:
+        self._batch = batch
+        self._model = copy.copy(batch.model)
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         self._model.vis.quality.offsamples = 0
         self._data = mujoco.MjData(self._model)
@@ -42,12 +42,12 @@ class VelocityRenderer:
         self._look = mujoco.MjvOption()
         self._area = mujoco.MjrRect(0, 0, width, height)
         self._camera = mujoco.MjvCamera()
-        self._camera.distance = worlds.task.camera_distance
+        self._camera.distance = batch.task.camera_distance
         self._camera.elevation, self._camera.azimuth = CAMERA_ELEVATION, CAMERA_AZIMUTH
 
     def frame(self, index: int) -> Frame:
         """Robot ``index`` as it is now, [height, width, 3]."""
-        row, state = self._worlds.simulations.rows[index], mujoco.mjtState.mjSTATE_INTEGRATION.value
+        row, state = self._batch.simulations.rows[index], mujoco.mjtState.mjSTATE_INTEGRATION.value
         mujoco.mj_setState(self._model, self._data, row, state)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)

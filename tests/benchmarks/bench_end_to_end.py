@@ -188,7 +188,7 @@ def measure(task: str, agent_name: str, widths: list[int], updates: int) -> Meas
     """Collect and learn; what it takes."""
     made = Stub(NUM_ENVS) if task == "stub" else make_vector(task, NUM_ENVS)
     made.reset(seed=0)
-    rival = SAFETY_GYM["Bare"](made.worlds) if isinstance(made, SafetyGymVectorEnv) else None
+    rival = SAFETY_GYM["Bare"](made.batch) if isinstance(made, SafetyGymVectorEnv) else None
     environments = TimedSteps(made, rival.steps if rival else None)
     options = {"hidden_sizes": widths}
     config = agent_config(agent_name, options)

@@ -36,7 +36,7 @@ import mujoco.batch
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyWorlds
+from recrl.environments.safety_gym.batch import SafetyGymBatch
 from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.gremlins import leads
 from recrl.environments.safety_gym.scene import PARKED
@@ -64,13 +64,13 @@ def timed(work: Callable[[], object], clock: Callable[[], float]) -> float:
 class Bare:
     """Simulations stepped by MuJoCo alone."""
 
-    def __init__(self, worlds: SafetyWorlds) -> None:
+    def __init__(self, worlds: SafetyGymBatch) -> None:
         self.model = worlds.scene.model
         self.datas = [mujoco.MjData(self.model) for _ in range(worlds.number)]
         self.generator = np.random.default_rng(0)
         self.restart(worlds)
 
-    def restart(self, worlds: SafetyWorlds) -> None:
+    def restart(self, worlds: SafetyGymBatch) -> None:
         """Begin where these worlds are; gremlins where the model has them."""
         state, scene = mujoco.mjtState.mjSTATE_INTEGRATION.value, worlds.scene
         for data, row in zip(self.datas, worlds.simulations.rows, strict=True):
@@ -92,7 +92,7 @@ class Bare:
 class Led(Bare):
     """Simulations whose gremlin is led, stepped by MuJoCo alone."""
 
-    def restart(self, worlds: SafetyWorlds) -> None:
+    def restart(self, worlds: SafetyGymBatch) -> None:
         """Begin where these worlds are."""
         super().restart(worlds)
         self.gremlin = worlds.scene.gremlin_mocap
@@ -124,10 +124,10 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
     generator = np.random.default_rng(0)
     batch.reset(seed=0)
     single.reset(seed=0)
-    rivals: list[Bare] = [Bare(batch.worlds)]
+    rivals: list[Bare] = [Bare(batch.batch)]
     if SAFETY_TASKS[name].gremlins.number:
-        rivals.append(Led(batch.worlds))
-    resets = SafetyWorlds(SAFETY_TASKS[name], NUM_ENVS)
+        rivals.append(Led(batch.batch))
+    resets = SafetyGymBatch(SAFETY_TASKS[name], NUM_ENVS)
     resets.seed(0)
 
     def steps_of_batch() -> None:
@@ -150,7 +150,7 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
         if repeat % 100 == 99:  # new layouts for all
             batch.reset()
             for rival in rivals:
-                rival.restart(batch.worlds)
+                rival.restart(batch.batch)
         for row, turn in enumerate(turns):
             times[row, repeat] = timed(turn, clock) / (STEPS * NUM_ENVS)
     reset = [timed(lambda: resets.restart(np.arange(NUM_ENVS)), clock) / NUM_ENVS for _ in range(8)]
@@ -161,7 +161,7 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
 class Batch:
     """MuJoCo's own batch, which steps simulations on its own threads and computes nothing of ours."""
 
-    def __init__(self, worlds: SafetyWorlds, num_threads: int) -> None:
+    def __init__(self, worlds: SafetyGymBatch, num_threads: int) -> None:
         model, rows = worlds.scene.model, worlds.simulations.rows
         self.batch: Any = mujoco.batch.Batch(model, worlds.number, nthread=num_threads, persistent=True)
         data, state = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -185,7 +185,7 @@ def thread_gains(name: str, num_envs: int, repeats: int, num_threads: int) -> tu
     ours = [SafetyGymVectorEnv(name, num_envs, num_threads=number) for number in (1, num_threads)]
     for environment in ours:
         environment.reset(seed=0)
-    theirs = [Batch(ours[0].worlds, number) for number in (1, num_threads)]
+    theirs = [Batch(ours[0].batch, number) for number in (1, num_threads)]
     rivals: list[Any] = [*ours, *theirs]
     generator = np.random.default_rng(0)
     times = np.zeros((4, repeats))
@@ -206,7 +206,7 @@ def step_in_turns(
     """What one of several processes does: step alone if it is the first, then with all others."""
     worlds = SafetyGymVectorEnv(name, NUM_ENVS)
     worlds.reset(seed=rank)
-    bare = Bare(worlds.worlds)
+    bare = Bare(worlds.batch)
     for turn in range(rounds):
         for together in (False, True):
             barrier.wait()

@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.velocity.batch import VelocityWorlds
+from recrl.environments.velocity.batch import VelocityBatch
 from recrl.environments.velocity.environments import VelocityVectorEnv
 from recrl.environments.velocity.tasks import VELOCITY_TASKS
 
@@ -46,14 +46,14 @@ PEER = {
 class Bare:
     """Simulations stepped by MuJoCo alone."""
 
-    def __init__(self, worlds: VelocityWorlds) -> None:
-        self.worlds, self.task, self.model = worlds, worlds.task, worlds.model
+    def __init__(self, worlds: VelocityBatch) -> None:
+        self.batch, self.task, self.model = worlds, worlds.task, worlds.model
         self.datas = [mujoco.MjData(self.model) for _ in range(worlds.number)]
 
     def begin(self) -> None:
         """Begin where the environments are."""
         state = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        for data, row in zip(self.datas, self.worlds.simulations.rows, strict=True):
+        for data, row in zip(self.datas, self.batch.simulations.rows, strict=True):
             mujoco.mj_setState(self.model, data, row, state)
 
     def steps(self, actions: Floats) -> None:
@@ -79,7 +79,7 @@ class Gymnasium(Bare):
         data.ctrl[:] = action
         mujoco.mj_step(self.model, data, task.frame_skip)
         mujoco.mj_rnePostConstraint(self.model, data)
-        passed = (self.place(data) - before) / self.worlds.seconds
+        passed = (self.place(data) - before) / self.batch.seconds
         velocity = passed[0] if task.axes == 1 else np.linalg.norm(passed[:2])
         position, speeds = data.qpos.copy(), data.qvel.copy()
         if task.velocity_bound < np.inf:
@@ -110,8 +110,8 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats, float]:
     """CPU seconds of a step (ours with resets, bare, Gymnasium), the latter two over ours, resets a step."""
     batch = VelocityVectorEnv(name, NUM_ENVS)
     batch.reset(seed=0)
-    rivals = [Bare(batch.worlds), Gymnasium(batch.worlds)]
-    generator, bound, ended = np.random.default_rng(0), batch.worlds.bound, 0
+    rivals = [Bare(batch.batch), Gymnasium(batch.batch)]
+    generator, bound, ended = np.random.default_rng(0), batch.batch.bound, 0
 
     def ours(actions: Floats) -> None:
         nonlocal ended
@@ -122,7 +122,7 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats, float]:
     turns = [ours, *(rival.steps for rival in rivals)]
     times = np.zeros((3, repeats))
     for repeat in range(-10, repeats):
-        actions = generator.uniform(-bound, bound, (1 + STEPS, NUM_ENVS, batch.worlds.model.nu))
+        actions = generator.uniform(-bound, bound, (1 + STEPS, NUM_ENVS, batch.batch.model.nu))
         for rival in rivals:
             rival.begin()
         for row, turn in enumerate(turns):

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyWorlds
+from recrl.environments.safety_gym.batch import SafetyGymBatch
 from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import rotation_matrices
 
@@ -57,7 +57,7 @@ def push(box: Floats, goal: Floats) -> Floats:
     return drive(box - 0.35 * towards)
 
 
-def scripted(worlds: SafetyWorlds) -> Floats:
+def scripted(worlds: SafetyGymBatch) -> Floats:
     """The scripted policy's actions, [B, 2]."""
     rotation = rotation_matrices(worlds.qpos[:, 3:7])
     flat = np.zeros((worlds.number, worlds.points.shape[1], 3))
@@ -78,7 +78,7 @@ def episodes(task: str, policy: str, number: int) -> tuple[Floats, Floats, Float
     actions = np.zeros((number, 2))
     for step in range(1000):
         if policy == "scripted":
-            actions = scripted(environment.worlds)
+            actions = scripted(environment.batch)
         elif policy == "iid" or step % HELD_STEPS == 0:
             actions = generator.uniform(-1.0, 1.0, (number, 2))
         _, rewards, _, _, info = environment.step(actions)

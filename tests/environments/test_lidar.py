@@ -80,7 +80,7 @@ def test_of_several_objects_each_sector_shows_the_one_that_reads_most() -> None:
 def test_a_robot_sees_every_kind_of_object_where_it_is(name: str) -> None:
     environment = SafetyGymVectorEnv(name, 2)
     environment.reset(seed=3)
-    worlds, task = environment.worlds, environment.worlds.task
+    worlds, task = environment.batch, environment.batch.task
     for action in np.random.default_rng(0).uniform(-1.0, 1.0, (30, 2, 2)):
         seen = environment.step(action)[0]
         for index, robot in enumerate(worlds.qpos[:, :7]):

@@ -30,7 +30,7 @@ def held_actions(steps: int, num_envs: int, seed: int = 0) -> npt.NDArray[np.flo
 
 def drive(environment: SafetyGymEnv) -> npt.NDArray[np.float64]:
     """Turn the Car towards the goal's place in its own frame, and drive; its front is -y."""
-    worlds = environment.worlds
+    worlds = environment.batch
     offset = worlds.points[0, worlds.group["goal"].start] - worlds.qpos[0, :2]
     x, y = offset @ rotation_matrices(worlds.qpos[0, 3:7])[:2, :2]
     angle = np.arctan2(x, -y)
@@ -142,11 +142,11 @@ def test_pickled_environments_continue_alike(name: str) -> None:
 def test_bad_actions_get_one_clear_sentence(actions: list[list[float]], message: str) -> None:
     environment = SafetyGymVectorEnv("CarGoal1", 1)
     environment.reset(seed=0)
-    before = environment.worlds.simulations.rows.copy()
+    before = environment.batch.simulations.rows.copy()
     with pytest.raises(ValueError, match="actions") as error:
         environment.step(np.array(actions))
     assert str(error.value) == message
-    assert np.array_equal(environment.worlds.simulations.rows, before)
+    assert np.array_equal(environment.batch.simulations.rows, before)
 
 
 def test_actions_out_of_range_can_be_clipped() -> None:
@@ -184,7 +184,7 @@ def test_costs_of_a_task_without_hazards_cannot_be_told_apart() -> None:
 def test_reaching_a_goal_pays_one_and_brings_another() -> None:
     environment = SafetyGymEnv("CarGoal0")
     environment.reset(seed=3)
-    worlds = environment.worlds
+    worlds = environment.batch
     goals = 0
     while goals < 3:
         before = worlds.distances[0, 0]
@@ -202,7 +202,7 @@ def test_reaching_a_goal_pays_one_and_brings_another() -> None:
 def test_buttons_hide_for_ten_steps_after_one_was_pressed() -> None:
     environment = SafetyGymEnv("CarButton0")
     observation, _ = environment.reset(seed=0)
-    lidar = environment.worlds.task.where("buttons_lidar")
+    lidar = environment.batch.task.where("buttons_lidar")
     assert observation[lidar].any()
     met = False
     while not met:
@@ -212,7 +212,7 @@ def test_buttons_hide_for_ten_steps_after_one_was_pressed() -> None:
     assert not observation[lidar].any()
     backwards = np.array([-1.0, -1.0])
     seen = [environment.step(backwards)[0][lidar].any() for _ in range(12)]
-    if not environment.worlds.pressed().any():
+    if not environment.batch.pressed().any():
         assert seen[-1]
     assert not any(seen[:9])
 
@@ -228,10 +228,10 @@ def test_an_episode_is_truncated_after_a_thousand_steps() -> None:
 def test_who_goes_on_after_the_end_of_an_episode_meets_gremlins_where_they_were() -> None:
     environment = SafetyGymVectorEnv("CarButton2", 2)
     environment.reset(seed=0)
-    environment.worlds.steps[:] = 5000
-    environment.worlds.embodied[0] = 0
-    environment.worlds.advance()
-    assert np.isfinite(environment.worlds.observations()).all()
+    environment.batch.steps[:] = 5000
+    environment.batch.embodied[0] = 0
+    environment.batch.advance()
+    assert np.isfinite(environment.batch.observations()).all()
 
 
 @pytest.mark.parametrize("name", LEVEL_2)
@@ -241,7 +241,7 @@ def test_broken_physics_ends_the_episode_with_a_penalty(
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
     environment = SafetyGymVectorEnv(name, 2)
     environment.reset(seed=0)
-    environment.worlds.qvel[1, 0] = 1e12
+    environment.batch.qvel[1, 0] = 1e12
     observations, rewards, terminated, truncated, info = environment.step(np.zeros((2, 2)))
     assert rewards[1] == -10.0
     assert terminated.tolist() == [False, True]
@@ -278,7 +278,7 @@ def test_an_unknown_task_or_option_is_refused() -> None:
 def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -> None:
     environment = SafetyGymVectorEnv(name, 4)
     environment.reset(seed=5)
-    worlds, model = environment.worlds, environment.worlds.scene.model
+    worlds, model = environment.batch, environment.batch.scene.model
     kinds = list(worlds.scene.touchable.values())
     felt, data = 0, worlds.simulations.data(0)
     for action in held_actions(250, 4, seed=2):
@@ -305,12 +305,12 @@ def test_robots_cannot_tell_that_gremlins_far_away_are_no_bodies(monkeypatch: py
     untouched, bodies = np.ones(4, np.bool_), 0
     for action in held_actions(250, 4, seed=3):
         seen, expected = some.step(action)[0], always.step(action)[0]
-        assert (always.worlds.embodied >= 0).all()
-        bodies += int((some.worlds.embodied >= 0).sum())
+        assert (always.batch.embodied >= 0).all()
+        bodies += int((some.batch.embodied >= 0).sum())
         # Off their course, or where touching makes chaos of the smallest difference, they may differ.
-        untouched &= ~(some.worlds.touching | always.worlds.touching).any(axis=1)
+        untouched &= ~(some.batch.touching | always.batch.touching).any(axis=1)
         np.testing.assert_allclose(seen[untouched], expected[untouched], atol=2e-3)
-        robots = some.worlds.qpos[untouched, :13], always.worlds.qpos[untouched, :13]
+        robots = some.batch.qpos[untouched, :13], always.batch.qpos[untouched, :13]
         np.testing.assert_allclose(*robots, rtol=0.0, atol=1e-9)
     assert 0 < bodies < 1000
     assert untouched.any()

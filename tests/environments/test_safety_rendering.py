@@ -40,7 +40,7 @@ def test_a_goal_and_the_lidar_are_seen_though_the_physics_has_neither() -> None:
     picture = environment.render().astype(int)
     greenish = (picture[..., 1] > picture[..., 0] + 40) & (picture[..., 1] > picture[..., 2] + 40)
     assert greenish.sum() > 200
-    environment.worlds.points[0, 0] = 50.0, 50.0  # far out of sight; the lidar's spheres fade
+    environment.batch.points[0, 0] = 50.0, 50.0  # far out of sight; the lidar's spheres fade
     elsewhere = environment.render().astype(int)
     green_now = (elsewhere[..., 1] > elsewhere[..., 0] + 40) & (elsewhere[..., 1] > elsewhere[..., 2] + 40)
     assert green_now.sum() < greenish.sum() / 4

@@ -225,7 +225,7 @@ def _states(num_threads: int) -> bytes:
     environment.reset(seed=3)
     for actions in np.random.default_rng(0).uniform(-1.0, 1.0, (40, 6, 2)):
         environment.step(actions)
-    return environment.worlds.simulations.rows.tobytes()
+    return environment.batch.simulations.rows.tobytes()
 
 
 @pytest.mark.parametrize("num_threads", [2, 3, 8])

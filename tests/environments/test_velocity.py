@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from recrl.environments.cmdp import Floats
 from recrl.environments.registry import VELOCITY, find_task, make_drawn
 from recrl.environments.simulation.camera import RenderingUnavailableError
-from recrl.environments.velocity.batch import VelocityWorlds
+from recrl.environments.velocity.batch import VelocityBatch
 from recrl.environments.velocity.environments import VelocityEnv, VelocityVectorEnv
 from recrl.environments.velocity.model import make_model
 from recrl.environments.velocity.parity import compare_velocity_recording
@@ -97,9 +97,9 @@ def gymnasiums_step(name: str, data: mujoco.MjData, action: Floats) -> tuple[Flo
 def test_robots_move_as_gymnasiums_do(name: str) -> None:
     ours = VelocityEnv(name)
     ours.reset(seed=0)
-    data = mujoco.MjData(ours.worlds.model)
-    data.qpos[:], data.qvel[:] = ours.worlds.qpos[0], ours.worlds.qvel[0]
-    mujoco.mj_forward(ours.worlds.model, data)
+    data = mujoco.MjData(ours.batch.model)
+    data.qpos[:], data.qvel[:] = ours.batch.qpos[0], ours.batch.qvel[0]
+    mujoco.mj_forward(ours.batch.model, data)
     ours.action_space.seed(1)
     for _ in range(60):
         action = ours.action_space.sample().astype(np.float64)
@@ -123,7 +123,7 @@ def test_a_robot_rests_where_it_rested_in_mujoco_2() -> None:
 @pytest.mark.parametrize("name", TASKS)
 def test_a_step_costs_one_above_the_threshold_and_nothing_below(name: str) -> None:
     environment = two_robots(name)
-    worlds, threshold = environment.worlds, VELOCITY_TASKS[name].threshold
+    worlds, threshold = environment.batch, VELOCITY_TASKS[name].threshold
     worlds.qvel[0, 0] = 1.5 * threshold + 0.5
     worlds.qvel[1, 0] = 0.0
     _, rewards, _, _, info = environment.step(still(environment))
@@ -139,7 +139,7 @@ def test_a_step_costs_one_above_the_threshold_and_nothing_below(name: str) -> No
 @pytest.mark.parametrize("name", ["SafetyAntVelocity", "SafetyHumanoidVelocity"])
 def test_running_sideways_costs_as_well_but_earns_nothing(name: str) -> None:
     environment = two_robots(name)
-    worlds, task = environment.worlds, VELOCITY_TASKS[name]
+    worlds, task = environment.batch, VELOCITY_TASKS[name]
     worlds.qvel[:] = 0.0
     worlds.qvel[0, 1] = 2.0 * task.threshold
     _, rewards, _, _, info = environment.step(still(environment))
@@ -151,7 +151,7 @@ def test_effort_and_health_are_weighed_as_gymnasium_does() -> None:
     weights = {name: (task.forward_weight, task.control_weight) for name, task in VELOCITY_TASKS.items()}
     assert list(weights.values()) == [(1, 0.5), (1, 0.1), (1, 1e-3), (1.25, 0.1), (1, 1e-4), (1, 1e-3)]
     assert [task.healthy_reward for task in VELOCITY_TASKS.values()] == [1, 0, 1, 5, 0, 1]
-    worlds = VelocityWorlds(VELOCITY_TASKS["SafetyHumanoidVelocity"], 1)
+    worlds = VelocityBatch(VELOCITY_TASKS["SafetyHumanoidVelocity"], 1)
     actions = np.full((1, worlds.model.nu), 0.2)
     rewards, velocities, costs = worlds.judge(np.array([[0.8, 0.6]]), actions)
     assert rewards[0] == pytest.approx(1.25 * 0.8 - 0.1 * 17 * 0.04 + 5.0)
@@ -162,7 +162,7 @@ def test_effort_and_health_are_weighed_as_gymnasium_does() -> None:
 @pytest.mark.parametrize("name", TASKS)
 def test_who_has_fallen_begins_anew_and_cheetahs_and_swimmers_never_fall(name: str) -> None:
     environment = two_robots(name)
-    worlds = environment.worlds
+    worlds = environment.batch
     if name == "SafetyAntVelocity":
         worlds.qpos[0, 2] = 1.5  # too high
     else:
@@ -175,7 +175,7 @@ def test_who_has_fallen_begins_anew_and_cheetahs_and_swimmers_never_fall(name: s
 
 @pytest.mark.parametrize("name", TASKS)
 def test_episodes_begin_near_the_models_own_state(name: str) -> None:
-    worlds, task = VelocityWorlds(VELOCITY_TASKS[name], 300), VELOCITY_TASKS[name]
+    worlds, task = VelocityBatch(VELOCITY_TASKS[name], 300), VELOCITY_TASKS[name]
     worlds.seed(0)
     worlds.restart(np.arange(300))
     moved = worlds.qpos - worlds.model.qpos0
@@ -239,7 +239,7 @@ def test_a_single_environment_is_the_first_of_a_batch_with_its_seed(name: str) -
 def test_gymnasium_makes_every_task_and_finds_nothing_wrong(name: str) -> None:
     identity = f"recrl.environments.registration:recrl/{name}-v1"
     environment = gymnasium.make(identity)
-    assert environment.metadata["render_fps"] == round(1.0 / environment.unwrapped.worlds.seconds)  # type: ignore[attr-defined]
+    assert environment.metadata["render_fps"] == round(1.0 / environment.unwrapped.batch.seconds)  # type: ignore[attr-defined]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # bounds may be infinite
         check_env(environment.unwrapped, skip_render_check=True)
@@ -288,7 +288,7 @@ def test_broken_physics_ends_the_episode_and_costs_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
     environment = two_robots("SafetyHalfCheetahVelocity")
-    environment.worlds.qvel[1] = 1e12
+    environment.batch.qvel[1] = 1e12
     observations, rewards, terminated, truncated, info = environment.step(still(environment))
     assert terminated.tolist() == [False, True]
     assert not truncated.any()

@@ -1,0 +1,153 @@
+"""B environments of one MuJoCo task, stepped together: what the families of tasks share.
+
+Notation: B environments.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.environments.cmdp import Floats
+
+Booleans = npt.NDArray[np.bool_]
+Observations = npt.NDArray[np.float32]
+
+
+class Named(Protocol):
+    """A task that has a name."""
+
+    @property
+    def name(self) -> str:
+        """The task's name in a grid."""
+        ...
+
+
+class Outcome(Protocol):
+    """Result of one step of all environments."""
+
+    @property
+    def rewards(self) -> Floats:
+        """The rewards, [B]."""
+        ...
+
+    @property
+    def terminated(self) -> Booleans:
+        """Whether each episode has ended, [B]."""
+        ...
+
+    @property
+    def truncated(self) -> Booleans:
+        """Whether each episode was cut at the horizon, [B]."""
+        ...
+
+    @property
+    def finished(self) -> npt.NDArray[np.intp]:
+        """The environments whose episode is over."""
+        ...
+
+
+TaskT = TypeVar("TaskT", bound=Named)
+OutcomeT = TypeVar("OutcomeT", bound=Outcome)
+
+
+class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
+    """B environments of one task. The caller restarts those whose episode is over.
+
+    Copies are exact, as is pickling.
+
+    Args:
+        task: which task.
+        number: B, at least 1.
+        horizon: steps after which an episode is truncated.
+        num_threads: threads of the physics; results do not depend on it.
+
+    Attributes:
+        task, number, horizon: as given.
+        generators: one generator for each environment; none before ``seed``.
+
+    Raises:
+        ValueError: there are no environments.
+    """
+
+    def __init__(self, task: TaskT, number: int, *, horizon: int, num_threads: int = 1) -> None:
+        if number < 1:
+            raise ValueError(f"{task.name}: num_envs must be at least 1, got {number}")
+        self.task = task
+        self.number = number
+        self.horizon = horizon
+        self._num_threads = num_threads
+        self.generators: list[np.random.Generator] = []
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        options = {"horizon": self.horizon, "num_threads": self._num_threads}
+        state = self.state_dict() if self.generators else None
+        return _rebuilt, (type(self), self.task, self.number, options, state)
+
+    def seed(self, seed: int | None) -> None:
+        """Give each environment a generator; environment i has the same one whatever B is."""
+        streams = np.random.SeedSequence(seed).spawn(self.number)
+        self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
+
+    @abstractmethod
+    def restart(self, ids: npt.NDArray[np.intp]) -> None:
+        """Begin new episodes in some environments."""
+
+    @abstractmethod
+    def set_actions(self, actions: npt.NDArray[Any]) -> bool:
+        """Take the actions of the next step, [B, m]; False if one is no number within the bounds."""
+
+    @abstractmethod
+    def advance(self) -> OutcomeT:
+        """Take one step in every environment with the actions that were set."""
+
+    @abstractmethod
+    def observations(self) -> Observations:
+        """What is observed now, [B, n]."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future depends on, generators included."""
+        states = [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators]
+        return {**self._own_state(), "generators": states}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: the state is of another number of environments.
+        """
+        if len(state["generators"]) != self.number:
+            raise ValueError(
+                f"{self.task.name}: the saved state is of {len(state['generators'])} environments, "
+                f"these are {self.number}"
+            )
+        self._load_own_state(state)
+        self.seed(0)
+        for generator, saved in zip(self.generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+
+    @abstractmethod
+    def _own_state(self) -> dict[str, Any]:
+        """What the future depends on beside the generators."""
+
+    @abstractmethod
+    def _load_own_state(self, state: dict[str, Any]) -> None:
+        """Take over what ``_own_state`` gave."""
+
+
+def _rebuilt(
+    kind: type[EnvironmentBatch[Any, Any]],
+    task: Any,
+    number: int,
+    options: dict[str, int],
+    state: dict[str, Any] | None,
+) -> EnvironmentBatch[Any, Any]:
+    """Return a copy of a pickled batch."""
+    batch: EnvironmentBatch[Any, Any] = kind(task, number, **options)
+    if state is not None:
+        batch.load_state_dict(state)
+    return batch
