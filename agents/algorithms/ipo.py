@@ -37,7 +37,7 @@ from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.batch import LearningBatch, to_tensor
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.learning.policy_rule import indexed
+from recrl.agents.learning.policy_rule import indexed, no_steps
 from recrl.agents.learning.surrogates import (
     SignedAdvantages,
     clipped_surrogate,
@@ -107,7 +107,7 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
         """Climb the surrogate between the barriers, unless nothing is known about the constraints."""
         config, constraints = self._config, experience.constraints
         if not constraints.known:
-            return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
+            return no_steps(constraints)
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:

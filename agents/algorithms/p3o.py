@@ -27,7 +27,7 @@ from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.batch import LearningBatch, to_tensor
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.learning.policy_rule import indexed
+from recrl.agents.learning.policy_rule import indexed, no_steps
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
 from recrl.environments.cmdp import CMDPSpec, Floats
 
@@ -75,7 +75,7 @@ class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
         """Climb the penalised surrogate, unless nothing is known about the constraints."""
         config, constraints = self._config, experience.constraints
         if not constraints.known:
-            return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
+            return no_steps(constraints)
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:

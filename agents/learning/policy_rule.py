@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from recrl.agents.experience import Experience
+from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.distributions import mean_divergence
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import surrogate
@@ -59,6 +59,11 @@ def indexed(name: str, values: npt.NDArray[np.floating]) -> dict[str, float]:
     return {
         f"{name}_{i}": float(value) if np.isfinite(value) else float("nan") for i, value in enumerate(values)
     }
+
+
+def no_steps(constraints: Constraints) -> dict[str, float]:
+    """Metrics of a first-order update that leaves the policy, as nothing is known about the constraints."""
+    return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
 
 
 def improve_and_measure(

@@ -2,8 +2,8 @@
 
 A recording holds, for every step of an episode, the state of the physics, what was observed, the reward,
 the cost terms and the goal. Here our environments are put into the recorded states. What they then observe,
-earn and pay must be equal but for rounding, or something is defined differently. How the physics moves between two
-states is not compared: it is chaotic, and engines differ in the last digits.
+earn and pay must be equal but for rounding, or something is defined differently. How physics moves between
+two states is not compared: it is chaotic, and engines differ in the last digits.
 
 The recordings' format is described in ``tests/parity/README.md``.
 

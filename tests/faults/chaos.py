@@ -32,7 +32,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
@@ -293,20 +293,25 @@ def mirrored(store: SweepStore, uri: str) -> Iterator[str]:
                 yield f"{trial.spec.title}: {key} has {len(shown)} points, the files give {len(told)}"
 
 
-def check(chaos: Chaos) -> bool:
-    """Compare everything; whether it agrees."""
-    expected = chaos.undisturbed()
-    trials, wrong = chaos.store.trials(), 0
+def compared(store: SweepStore, expected: SweepStore, say: Callable[[str], None]) -> int:
+    """Compare all trials of two sweeps, and return how many things are wrong."""
+    trials, wrong = store.trials(), 0
     for trial in trials:
         for difference in differences(trial, expected.trial(trial.spec)):
-            chaos.say(f"WRONG {trial.spec.title}: {difference}")
+            say(f"WRONG {trial.spec.title}: {difference}")
             wrong += 1
     if [trial.spec for trial in trials] != [trial.spec for trial in expected.trials()] or not trials:
-        chaos.say("WRONG the sweeps have different trials")
+        say("WRONG the sweeps have different trials")
         wrong += 1
     episodes = sum(len(trial.episodes()) for trial in trials)
     attempts = sum(trial.record().attempt for trial in trials)
-    chaos.say(f"{len(trials)} trials in {attempts} attempts, {episodes} episodes compared byte for byte")
+    say(f"{len(trials)} trials in {attempts} attempts, {episodes} episodes compared byte for byte")
+    return wrong
+
+
+def check(chaos: Chaos) -> bool:
+    """Compare everything; whether it agrees."""
+    wrong = compared(chaos.store, chaos.undisturbed(), chaos.say)
     for difference in mirrored(chaos.store, chaos.uri):
         chaos.say(f"WRONG in MLflow: {difference}")
         wrong += 1

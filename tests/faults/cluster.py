@@ -43,7 +43,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialState
-from tests.faults.chaos import differences, mirrored
+from tests.faults.chaos import compared, mirrored
 
 ROOT = Path(__file__).resolve().parents[2]
 GRID = """\
@@ -583,18 +583,7 @@ def check(
     cluster: Cluster, store: SweepStore, expected: SweepStore, others: Sequence[SweepStore], uri: str
 ) -> int:
     """Compare everything; how many things are wrong."""
-    wrong = 0
-    trials = store.trials()
-    for trial in trials:
-        for difference in differences(trial, expected.trial(trial.spec)):
-            cluster.say(f"WRONG {trial.spec.title}: {difference}")
-            wrong += 1
-    if [trial.spec for trial in trials] != [trial.spec for trial in expected.trials()] or not trials:
-        cluster.say("WRONG the sweeps have different trials")
-        wrong += 1
-    episodes = sum(len(trial.episodes()) for trial in trials)
-    attempts = sum(trial.record().attempt for trial in trials)
-    cluster.say(f"{len(trials)} trials in {attempts} attempts, {episodes} episodes compared byte for byte")
+    wrong = compared(store, expected, cluster.say)
     for sweep in (store, *others):
         problems = list(mirrored(sweep, uri))
         cluster.say(
