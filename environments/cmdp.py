@@ -179,6 +179,8 @@ class CurriculumStep:
     start_limits: CostLimits | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.limits, CostLimits):  # a curriculum of a user's may give plain numbers
+            object.__setattr__(self, "limits", CostLimits(tuple(self.limits)))
         if not 0.0 <= self.policy_noise <= 1.0:
             raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
         coefficient = self.entropy_coefficient

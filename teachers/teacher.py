@@ -101,6 +101,36 @@ class Teacher(Protocol):
         ...
 
 
+def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[CurriculumStep, TeacherState]:
+    """Return what a curriculum answered.
+
+    Args:
+        answer: of ``Teacher.start`` or ``Teacher.step``; a user's may be anything.
+        curriculum: its label, for the error.
+        num_costs: k.
+
+    Raises:
+        TypeError: it is not a pair of a CurriculumStep and a mapping.
+        ValueError: its limits are not one for each cost.
+    """
+    match answer:
+        case (CurriculumStep() as step, Mapping() as state):
+            if len(step.limits) != num_costs:
+                raise ValueError(
+                    f"curriculum {curriculum}: a step must have one limit per cost, {num_costs}, "
+                    f"got {len(step.limits)}"
+                )
+            return step, state
+    got = (
+        ", ".join(type(one).__name__ for one in answer)
+        if isinstance(answer, tuple)
+        else type(answer).__name__
+    )
+    raise TypeError(
+        f"curriculum {curriculum}: must return a CurriculumStep and its state, a mapping, got {got}"
+    )
+
+
 # What follows is shared by the teachers of this package. Their states hold at least ``update``, the last
 # update seen (0 before the first), and the keys of ``CurriculumStep.to_json``, so that a repeated question is
 # answered from the state alone.

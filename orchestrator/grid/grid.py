@@ -30,7 +30,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from recrl.agents.registry import agent_config
 from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError, trusted_attribute
 from recrl.environments.registry import make_vector, task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
 from recrl.orchestrator.grid.grid_file import (
@@ -231,8 +231,23 @@ class _Check:
         except USERS_ERRORS as error:
             self._add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
         else:
+            self._check_network((*place, "options", "network"), options)
             return options
         return None
+
+    def _check_network(self, place: Place, options: Mapping[str, Any]) -> None:
+        """Check that an agent's own network can be imported, where import paths are followed."""
+        path = options.get("network")
+        if place[0] != "agents" or not isinstance(path, str):
+            return
+        try:
+            trusted_attribute(path)
+        except UnknownNameError as error:
+            self._add(place, str(error))
+        except UntrustedNameError as error:
+            self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
+        except USERS_ERRORS as error:
+            self._add(place, f"{path!r} cannot be imported: {described(error)}")
 
     def _check_differs(self, place: Place, choice: Choice, earlier: Mapping[int, Choice]) -> None:
         """Check that no earlier entry has the same label, or is the same under another label."""

@@ -178,7 +178,7 @@ def run_recorded(
             logger.error("%s", error)
             return _close(writer, TrialState.WAITING, error=str(error))
         except USERS_ERRORS as error:
-            logger.exception("failed after update %d", writer.record.update)
+            logger.exception("failed; the files go to update %d", writer.record.update)
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")
             return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))

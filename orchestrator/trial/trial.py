@@ -35,7 +35,7 @@ from recrl.orchestrator.errors import (
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.rollout_check import check_rollout
-from recrl.teachers.teacher import ProgressReport, Teacher
+from recrl.teachers.teacher import ProgressReport, Teacher, TeacherState, checked_answer
 
 LOGGED_UPDATES = 50
 """Of a trial, about so many are logged."""
@@ -91,7 +91,7 @@ class Trial:
         tree = writer.restore()
         if tree is None:
             self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
-            self._step, self._teacher_state = teacher.start()
+            self._step, self._teacher_state = self._checked(teacher.start())
             self.update = self.env_steps = self._episodes = 0
             logger.info("started: %s", spec.title)
         else:
@@ -197,7 +197,7 @@ class Trial:
             return
         before = self._step
         report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
-        self._step, self._teacher_state = self._teacher.step(self._teacher_state, report)
+        self._step, self._teacher_state = self._checked(self._teacher.step(self._teacher_state, report))
         if self._step.start_limits is not None and self._step.start_limits != before.start_limits:
             limits = self._step.start_limits.to_json()
             self._event("start limits measured", limits=limits)
@@ -212,6 +212,9 @@ class Trial:
                 f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "
                 "not support; choose another of the two"
             )
+
+    def _checked(self, answer: object) -> tuple[CurriculumStep, TeacherState]:
+        return checked_answer(answer, self.spec.method.label, self._cmdp.num_costs)
 
     def _warn_of_hard_landing(self) -> None:
         """Record an event if deployment begins with limits that the agent was never near."""

@@ -250,3 +250,21 @@ def test_one_figure_that_cannot_be_drawn_costs_no_other_and_is_named(
         (foreign / "drawn" / "report.md").read_text().splitlines()
     )
     assert (foreign / "drawn" / "learning-curves_ppo-lag.pdf").exists()
+
+
+NETWORK = "name: n\ntasks: [{name: two-state, deploy_limits: 2}]\nmethods: [none]\nseeds: 1\nrun: {total_steps: 6_400}\n"
+
+
+def test_a_network_of_the_users_own_is_listed_and_not_imported(
+    foreign: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    agent = 'agents: [{name: ppo-lag, options: {network: "spy:TASK"}}]\n'
+    (foreign / "n.yaml").write_text(NETWORK + agent)
+    assert main(["validate", "n.yaml"]) == ExitCode.OK
+    sentence = f"n.yaml: agents.0.options.network (spy:TASK) was not called, {REFUSED}"
+    assert capsys.readouterr().out.startswith(sentence)
+    assert not (foreign / "RUN").exists()
+    (foreign / "n.yaml").write_text(NETWORK + agent.replace("spy:TASK", "spy:TASKS"))
+    assert main(["validate", "n.yaml", "--trust"]) == ExitCode.WRONG_INPUT
+    told = capsys.readouterr().err
+    assert told.startswith("n.yaml:6: agents.0.options.network: cannot import 'spy:TASKS'")

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.teachers.registry import TEACHERS, make_teacher
-from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
+from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState, checked_answer
 
 # Every teacher under its defaults, and the dynamic one also where its settings lead elsewhere.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
@@ -265,3 +265,26 @@ def test_a_cost_that_is_never_constrained_stays_so(name: str, options: dict[str,
     for step, _ in played(TeacherSpec(name, options, *limits, TRAIN_STEPS), reports):
         assert step.limits[0] == math.inf
         assert step.start_limits is not None
+
+
+STATE: dict[str, Any] = {"update": 0}
+
+
+@pytest.mark.parametrize(
+    ("answer", "sentence"),
+    [
+        (1.5, "curriculum mine: must return a CurriculumStep and its state, a mapping, got float"),
+        ((CostLimits((1.0,)), STATE), "a CurriculumStep and its state, a mapping, got CostLimits, dict"),
+        ((CurriculumStep(CostLimits((1.0,))), None), "a mapping, got CurriculumStep, NoneType"),
+        ((CurriculumStep(CostLimits((1.0, 2.0))), STATE), "a step must have one limit per cost, 1, got 2"),
+    ],
+)
+def test_what_is_wrong_with_a_curriculums_answer_is_said(answer: object, sentence: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=sentence):
+        checked_answer(answer, "mine", 1)
+
+
+def test_plain_numbers_are_limits_too() -> None:
+    step = CurriculumStep((2.0, 1))  # type: ignore[arg-type]
+    assert step.limits == CostLimits((2.0, 1.0))
+    assert checked_answer((step, STATE), "mine", 2) == (step, STATE)
