@@ -252,7 +252,13 @@ def test_one_figure_that_cannot_be_drawn_costs_no_other_and_is_named(
     assert (foreign / "drawn" / "learning-curves_ppo-lag.pdf").exists()
 
 
-NETWORK = "name: n\ntasks: [{name: two-state, deploy_limits: 2}]\nmethods: [none]\nseeds: 1\nrun: {total_steps: 6_400}\n"
+NETWORK = """\
+name: n
+tasks: [{name: two-state, deploy_limits: 2}]
+methods: [none]
+seeds: 1
+run: {total_steps: 6_400}
+"""
 
 
 def test_a_network_of_the_users_own_is_listed_and_not_imported(
