@@ -108,12 +108,25 @@ class EntropyRewarded(Protocol):
     learns_rewarded_entropy: ClassVar[bool]
 
 
-class Agent(Policy, Protocol):
-    """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
+class FinalPolicy(Policy, Protocol):
+    """A policy that is evaluated: stochastic as it was trained, or by its mode."""
 
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         ...
+
+
+@runtime_checkable
+class Averaging(Protocol):
+    """An agent whose final policy is another than the one that collects experience; agents may be it."""
+
+    def final_policy(self) -> FinalPolicy:
+        """Return the policy that would be deployed now."""
+        ...
+
+
+class Agent(FinalPolicy, Protocol):
+    """A constrained learner: CPO, PPO-Lagrangian, or a user's own."""
 
     def update(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
         """Learn from one rollout under the limits of a curriculum's step.
@@ -149,3 +162,8 @@ class Agent(Policy, Protocol):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         ...
+
+
+def final_policy(agent: Agent) -> FinalPolicy:
+    """Return the policy that would be deployed now: the agent's own, where it does not average."""
+    return agent.final_policy() if isinstance(agent, Averaging) else agent

@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from recrl.agents.agent import Agent
+from recrl.agents.agent import FinalPolicy
 from recrl.agents.collection import Collector, FinishedEpisode
 from recrl.agents.spaces import environment_actions
 from recrl.environments.cmdp import Floats
@@ -37,19 +37,19 @@ class FrozenPolicy(StrEnum):
 
 @dataclass(frozen=True)
 class _Actor:
-    """The part of an agent that a collector uses."""
+    """What a collector uses of a final policy."""
 
-    agent: Agent
+    actor: FinalPolicy
     policy: FrozenPolicy
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         if self.policy is FrozenPolicy.DETERMINISTIC:
-            return self.agent.act_greedily(observations)
-        return self.agent.act(observations, generator)
+            return self.actor.act_greedily(observations)
+        return self.actor.act(observations, generator)
 
 
 def evaluate(
-    agent: Agent,
+    actor: FinalPolicy,
     environments: CMDPVectorEnv,
     policy: FrozenPolicy,
     *,
@@ -59,7 +59,7 @@ def evaluate(
     """Run a frozen policy for a number of whole episodes.
 
     Args:
-        agent: whose policy acts; it is not changed.
+        actor: chooses the actions.
         environments: B fresh environments; they are reset here.
         policy: stochastic or deterministic.
         num_episodes: at least 0; each environment runs its equal share, the first ones one more.
@@ -82,7 +82,7 @@ def evaluate(
     while any(len(episodes) < share for episodes, share in zip(done, shares, strict=True)):
         if steps >= MAX_STEPS:
             raise RuntimeError(f"evaluation: no episode ended within {MAX_STEPS} steps")
-        _, finished = collector.collect(_Actor(agent, policy), generator)
+        _, finished = collector.collect(_Actor(actor, policy), generator)
         steps += CHUNK_STEPS
         for episode in finished:
             if len(done[episode.environment]) < shares[episode.environment]:
@@ -108,7 +108,7 @@ class Shot:
 
 
 def film(
-    agent: Agent,
+    actor: FinalPolicy,
     environment: gymnasium.Env[Any, Any],
     policy: FrozenPolicy,
     *,
@@ -119,7 +119,7 @@ def film(
     """Look at a frozen policy for an episode: before the first step, and as it goes on.
 
     Args:
-        agent: whose policy acts; it is not changed.
+        actor: chooses the actions.
         environment: one that draws itself and reports ``info["cost"]``, as ``registry.make_drawn`` gives it.
         policy: stochastic or deterministic.
         num_costs: k.
@@ -135,7 +135,7 @@ def film(
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
-    actor = _Actor(agent, policy)
+    actor = _Actor(actor, policy)
     # Some simulators take signed seeds only.
     observation, _ = environment.reset(seed=int(environment_seed.generate_state(1)[0] >> 1))
     episode_return, costs = 0.0, np.zeros(num_costs)

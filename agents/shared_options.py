@@ -31,6 +31,7 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "value_scale": "none",
     "encoder": "none",
     "constraint_window": 1,
+    "policy_average": 0.0,
     "noise_form": "match-mixture",
 }
 
@@ -139,6 +140,12 @@ class ActorCriticConfig(BaseModel):
     )
     target_kl: Positive = Field(
         default=0.01, description="Size of the trust region, mean KL in nats an update (paper)."
+    )
+    policy_average: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
+        default=0.9,
+        description="The final policy, which is evaluated and exported, is an exponential moving average of "
+        "the policies after each update: the share of it that an update keeps (ours); 0 for the last policy "
+        "(paper). Training is the same.",
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",

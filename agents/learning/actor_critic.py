@@ -32,6 +32,7 @@ from recrl.agents.learning.advantages import generalised_advantages, next_values
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.estimates import Estimates, row_targets
+from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
 from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
@@ -50,6 +51,7 @@ class ActorCritic:
         config: the settings that agents share.
         encoder: of the observations that policy and critics see.
         policy: of the encoded observations and the task's actions.
+        average: of the policies after the updates.
         critics: of the reward and the k costs.
         rule: improves the policy.
         generator: of the minibatches.
@@ -64,6 +66,7 @@ class ActorCritic:
         *,
         encoder: Encoder,
         policy: StochasticPolicy,
+        average: PolicyAverage,
         critics: Critics,
         rule: PolicyRule,
         generator: np.random.Generator,
@@ -72,6 +75,8 @@ class ActorCritic:
         self._config = config
         self._encoder = encoder
         self._policy = policy
+        self._average = average
+        self._behaviour = NetworkPolicy(encoder, policy)
         self._critics = critics
         self._critic_optimiser = Adam(critics.parameters, config.critic_learning_rate)
         self._value_scale = RunningScale(1 + cmdp.num_costs)
@@ -83,6 +88,7 @@ class ActorCritic:
         )
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,
+            "average": self._average,
             "critic_optimiser": self._critic_optimiser,
             "value_scale": self._value_scale,
             "recent_episodes": self._recent,
@@ -92,19 +98,23 @@ class ActorCritic:
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
-        return self._policy.sample(self._encoder(observations), generator)
+        return self._behaviour.act(observations, generator)
 
     def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
         """What ``act`` inverts at B observations [B, n], float64 [B, A]; for Discrete actions only."""
-        return self._policy.cumulative_masses(self._encoder(observations))
+        return self._behaviour.cumulative_masses(observations)
 
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
-        return self._policy.mode(self._encoder(observations))
+        return self._behaviour.act_greedily(observations)
 
     def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
         """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
-        return self._policy.probabilities(self._encoder(observations))
+        return self._behaviour.action_probabilities(observations)
+
+    def final_policy(self) -> NetworkPolicy:
+        """Return the average of the policies after the last updates, see ``policy_average``."""
+        return NetworkPolicy(self._encoder, self._average.network())
 
     def update(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
         """Improve the policy by the rule, then fit the critics to the rollout.
@@ -117,6 +127,7 @@ class ActorCritic:
         self._policy.publish()
         require_finite("policy parameters", self._policy.parameters.to_numpy())
         require_finite("critic parameters", self._critics.parameters.to_numpy())
+        self._average.add(self._policy.parameters.to_numpy())
         return metrics
 
     def _learn(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
@@ -300,12 +311,15 @@ def fresh_agent(
     )
     policy = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
     critics = Critics(encoder.size, cmdp.num_costs, form, generator)
+    averaged = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
+    averaged.parameters.load(policy.parameters.to_numpy())
     order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))
     return ActorCritic(
         cmdp,
         config,
         encoder=encoder,
         policy=policy,
+        average=PolicyAverage(averaged, config.policy_average),
         critics=critics,
         rule=make_rule(policy),
         generator=np.random.default_rng(order),

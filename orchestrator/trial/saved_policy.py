@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.agents.agent import Agent
+from recrl.agents.agent import FinalPolicy, final_policy
 from recrl.agents.evaluation import FrozenPolicy, Shot, film
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec
@@ -47,7 +47,7 @@ class FrozenTrial:
     Attributes:
         store: the trial's folder.
         spec: what the trial is.
-        agent: the agent; nobody updates it.
+        policy: the final policy as it was after these updates.
         cmdp: what its task fixes.
         update: policy updates it has learnt for.
         env_steps: environment steps it has learnt from.
@@ -55,7 +55,7 @@ class FrozenTrial:
 
     store: TrialStore
     spec: TrialSpec
-    agent: Agent
+    policy: FinalPolicy
     cmdp: CMDPSpec
     update: int
     env_steps: int
@@ -78,7 +78,7 @@ class FrozenTrial:
             seed = TrialSeeds.of(spec).agent
             agent = make_agent(spec.agent.name, cmdp, spec.agent.options, seed)
             agent.load_state_dict(tree["agent"])
-            return cls(store, spec, agent, cmdp, tree["update"], tree["env_steps"])
+            return cls(store, spec, final_policy(agent), cmdp, tree["update"], tree["env_steps"])
         except UntrustedNameError as error:
             raise RecrlError(f"{spec.title}: {error}; if you trust it, add --trust") from error
         except USERS_ERRORS as error:
@@ -99,7 +99,7 @@ class FrozenTrial:
         """
         try:
             rows = evaluation_rows(
-                self.agent, self.spec, policies, num_episodes=num_episodes, seed=self._seed_sequence(seed)
+                self.policy, self.spec, policies, num_episodes=num_episodes, seed=self._seed_sequence(seed)
             )
         except USERS_ERRORS as error:
             raise RecrlError(f"{self.spec.title}: cannot be evaluated: {described(error)}") from error
@@ -132,7 +132,7 @@ class FrozenTrial:
         speed = float(environment.metadata.get("render_fps") or DEFAULT_PICTURES_PER_SECOND)
         every = stride(video_format, pictures_per_second=speed, longest=self.cmdp.horizon)
         shots = film(
-            self.agent,
+            self.policy,
             environment,
             policy,
             num_costs=self.cmdp.num_costs,

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded
+from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded, FinalPolicy, final_policy
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
@@ -156,9 +156,9 @@ class Trial:
         Environments and generators are fresh and seeded from the trial's seed: nothing of training is
         touched, and every method of a seed is evaluated on the same environment stream.
         """
-        spec = self.spec
+        spec, policy = self.spec, final_policy(self._agent)
         rows = evaluation_rows(
-            self._agent,
+            policy,
             spec,
             tuple(FrozenPolicy),
             num_episodes=spec.evaluation_episodes,
@@ -166,7 +166,7 @@ class Trial:
         )
         if rows:
             self._writer.write_evaluation(rows)
-        if table := policy_table(self._agent, self._environments):
+        if table := policy_table(policy, self._environments):
             self._writer.write_policy(table)
 
     def _number(
@@ -276,7 +276,7 @@ class Trial:
 
 
 def evaluation_rows(
-    agent: Agent,
+    actor: FinalPolicy,
     spec: TrialSpec,
     policies: Sequence[FrozenPolicy],
     *,
@@ -286,7 +286,7 @@ def evaluation_rows(
     """Evaluate a frozen policy on fresh environments of a trial; a row of ``evaluation.csv`` an episode.
 
     Args:
-        agent: whose policy acts; it is not changed.
+        actor: chooses the actions.
         spec: the trial.
         policies: how it chooses; each is evaluated on the same environment stream.
         num_episodes: of each, at least 0.
@@ -295,7 +295,7 @@ def evaluation_rows(
     rows = []
     for policy in policies:
         environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
-        episodes = evaluate(agent, environments, policy, num_episodes=num_episodes, seed=seed)
+        episodes = evaluate(actor, environments, policy, num_episodes=num_episodes, seed=seed)
         rows += [
             {
                 "policy": policy,
@@ -309,14 +309,14 @@ def evaluation_rows(
     return rows
 
 
-def policy_table(agent: Agent, environments: CMDPVectorEnv) -> list[dict[str, float]]:
+def policy_table(policy: FinalPolicy, environments: CMDPVectorEnv) -> list[dict[str, float]]:
     """pi(a | s), a row a state, ``action_j`` the probability of action j.
 
-    Empty where there is no such table: the task is not finite, or the agent does not tell.
+    Empty where there is no such table: the task is not finite, or the policy does not tell.
     """
-    if not isinstance(environments, FiniteVectorEnv) or not isinstance(agent, DiscretePolicy):
+    if not isinstance(environments, FiniteVectorEnv) or not isinstance(policy, DiscretePolicy):
         return []
-    probabilities = agent.action_probabilities(environments.observations)
+    probabilities = policy.action_probabilities(environments.observations)
     return [{f"action_{j}": float(share) for j, share in enumerate(row)} for row in probabilities]
 
 

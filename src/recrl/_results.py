@@ -15,7 +15,7 @@ from recrl.environments.plugins import refuse_import_paths
 from recrl.orchestrator.errors import RecrlError
 
 if TYPE_CHECKING:
-    from recrl.agents.agent import Agent
+    from recrl.agents.agent import FinalPolicy
     from recrl.analysis.data.sweep_data import Sweep
     from recrl.environments.cmdp import CMDPSpec
     from recrl.orchestrator.files.trial_store import TrialStore
@@ -96,7 +96,7 @@ def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:
 
     trial.require_whole()
     frozen = FrozenTrial.thaw(trial)
-    return Policy(frozen.agent, frozen.cmdp, frozen.spec, frozen.update, np.random.default_rng(seed))
+    return Policy(frozen.policy, frozen.cmdp, frozen.spec, frozen.update, np.random.default_rng(seed))
 
 
 @contextmanager
@@ -116,14 +116,14 @@ class Policy:
     """A trained policy pi(a | s) that does not learn.
 
     Attributes:
-        agent: the agent whose policy it is.
+        final: chooses the actions.
         cmdp: what the task fixes: ``observation_space``, ``action_space``, ``cost_names``, ``horizon``.
         spec: the trial that trained it.
         update: policy updates that it has learnt for.
         generator: where ``act`` draws its random numbers.
     """
 
-    agent: Agent
+    final: FinalPolicy
     cmdp: CMDPSpec
     spec: TrialSpec
     update: int
@@ -154,7 +154,7 @@ class Policy:
                 f"got {rows.shape}"
             )
         batch = np.atleast_2d(rows)
-        chosen = self.agent.act_greedily(batch) if deterministic else self.agent.act(batch, self.generator)
+        chosen = self.final.act_greedily(batch) if deterministic else self.final.act(batch, self.generator)
         actions = environment_actions(self.cmdp.action_space, chosen)
         if rows.ndim == 2:
             return actions

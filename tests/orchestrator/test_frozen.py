@@ -145,7 +145,7 @@ def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
     options = RIVER.task.options
     shots = list(
         film(
-            frozen.agent,
+            frozen.policy,
             make_drawn("rivergrid-1a", options=options),
             FrozenPolicy.DETERMINISTIC,
             num_costs=1,
@@ -154,13 +154,13 @@ def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
     )
     environments = make_vector("rivergrid-1a", 1, options=options)
     seed = np.random.SeedSequence(0)
-    (episode,) = evaluate(frozen.agent, environments, FrozenPolicy.DETERMINISTIC, num_episodes=1, seed=seed)
+    (episode,) = evaluate(frozen.policy, environments, FrozenPolicy.DETERMINISTIC, num_episodes=1, seed=seed)
     assert [shot.step for shot in shots] == list(range(episode.length + 1))
     assert shots[-1].episode_return == pytest.approx(episode.episode_return)
     assert tuple(shots[-1].costs) == episode.costs
     assert shots[0].picture.shape == (288, 288, 3)
     drawn = make_drawn("rivergrid-1a", options=options)
-    seldom = film(frozen.agent, drawn, FrozenPolicy.DETERMINISTIC, num_costs=1, seed=seed, every=5)
+    seldom = film(frozen.policy, drawn, FrozenPolicy.DETERMINISTIC, num_costs=1, seed=seed, every=5)
     assert [shot.step for shot in seldom] == sorted({*range(0, episode.length + 1, 5), episode.length})
 
 

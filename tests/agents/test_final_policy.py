@@ -1,0 +1,79 @@
+"""The final policy: a weighted mean of the policies after each update."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recrl.agents.agent import Averaging, final_policy
+from recrl.agents.collection import Collector, episode_costs
+from recrl.agents.learning.actor_critic import ActorCritic
+from recrl.agents.registry import AGENTS, make_agent
+from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.registry import make_vector
+
+UPDATES = 4
+STEP = CurriculumStep(CostLimits((5.0,)))
+
+
+def learnt(
+    name: str, task: str, options: dict[str, float], updates: int
+) -> tuple[ActorCritic, list[np.ndarray]]:
+    """An agent after some updates, and the policy's parameters after each."""
+    environments = make_vector(task, 4, options={"horizon": 10} if task == "two-state" else {})
+    agent = make_agent(name, environments.cmdp, options, np.random.SeedSequence(1))
+    assert isinstance(agent, ActorCritic)
+    collector = Collector(environments, num_steps=20)
+    collector.reset(seed=0)
+    generator = np.random.default_rng(0)
+    policies = []
+    for _ in range(updates):
+        rollout, finished = collector.collect(agent, generator)
+        agent.update(rollout, episode_costs(finished, 1), STEP)
+        policies.append(agent.state_dict()["policy"])
+    return agent, policies
+
+
+@pytest.mark.parametrize("decay", [0.5, 0.9])
+def test_the_mean_has_geometric_weights(decay: float) -> None:
+    agent, policies = learnt("ppo-lag", "two-state", {"policy_average": decay}, UPDATES)
+    weights = decay ** np.arange(UPDATES - 1, -1, -1.0)
+    expected = (weights / weights.sum()) @ np.array(policies, np.float64)
+    np.testing.assert_allclose(agent.state_dict()["average"]["mean"], expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_without_averaging_the_final_policy_is_the_last(name: str) -> None:
+    agent, _ = learnt(name, "two-state", {"policy_average": 0.0}, UPDATES)
+    observations = np.eye(2, dtype=np.float32)[:, : agent._encoder.size]
+    assert isinstance(agent, Averaging)
+    assert np.array_equal(final_policy(agent).act_greedily(observations), agent.act_greedily(observations))
+    assert np.array_equal(
+        agent.final_policy().action_probabilities(observations), agent.action_probabilities(observations)
+    )
+
+
+def test_the_final_policy_acts_by_the_mean() -> None:
+    agent, _ = learnt("ppo-lag", "continuous-bandit", {}, UPDATES)
+    other, _ = learnt("ppo-lag", "continuous-bandit", {}, 1)
+    state = agent.state_dict()
+    other.load_state_dict({**state, "policy": state["average"]["mean"]})
+    observations = np.random.default_rng(0).standard_normal((5, agent._encoder.size)).astype(np.float32)
+    assert np.array_equal(agent.final_policy().act_greedily(observations), other.act_greedily(observations))
+    assert not np.array_equal(
+        agent.final_policy().act_greedily(observations), agent.act_greedily(observations)
+    )
+
+
+def test_averaging_does_not_change_training() -> None:
+    _, with_average = learnt("ppo-lag", "two-state", {"policy_average": 0.9}, UPDATES)
+    _, without = learnt("ppo-lag", "two-state", {"policy_average": 0.0}, UPDATES)
+    assert np.array_equal(with_average, without)
+
+
+def test_before_the_first_update_the_final_policy_is_the_first() -> None:
+    agent, _ = learnt("ppo-lag", "two-state", {}, 0)
+    observations = np.eye(2, dtype=np.float32)[:, : agent._encoder.size]
+    assert np.array_equal(
+        agent.final_policy().action_probabilities(observations), agent.action_probabilities(observations)
+    )
