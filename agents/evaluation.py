@@ -135,14 +135,14 @@ def film(
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
-    actor = _Actor(actor, policy)
+    chooser = _Actor(actor, policy)
     # Some simulators take signed seeds only.
     observation, _ = environment.reset(seed=int(environment_seed.generate_state(1)[0] >> 1))
     episode_return, costs = 0.0, np.zeros(num_costs)
     yield Shot(_picture(environment), 0, episode_return, costs)
     for step in range(1, MAX_FILMED_STEPS + 1):
         flat = gymnasium.spaces.flatten(environment.observation_space, observation)
-        chosen = actor.act(np.asarray(flat, np.float32)[None], generator)
+        chosen = chooser.act(np.asarray(flat, np.float32)[None], generator)
         action = environment_actions(environment.action_space, chosen)[0]
         observation, reward, terminated, truncated, info = environment.step(action)
         episode_return += float(reward)
