@@ -27,8 +27,8 @@ import numpy.typing as npt
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.native.environment_step import (
+    ENVIRONMENT,
     NOT_YET,
-    WORLD,
     acceptable,
     perceive,
     review,
@@ -185,19 +185,19 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         """Physics, layout, goals and counters."""
         return {
             "physics": self.simulations.save(),
-            "worlds": {name: self._memory.worlds[name].copy() for name in WORLD.names or ()},
+            "worlds": {name: self._memory.environments[name].copy() for name in ENVIRONMENT.names or ()},
             "observations": self.observations(),
         }
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
         self.simulations.load(state["physics"])
-        for name in WORLD.names or ():
-            self._memory.worlds[name] = state["worlds"][name]
+        for name in ENVIRONMENT.names or ():
+            self._memory.environments[name] = state["worlds"][name]
         self._memory.observations[...] = state["observations"]
 
     def _view_records(self) -> None:
         """Name the parts of the environments' records, without the room that this task does not need."""
-        records, task = self._memory.worlds, self.task
+        records, task = self._memory.environments, self.task
         self._action: Floats = records["action"]
         self.points: Floats = records["points"][:, : max(places.stop for places in self.group.values())]
         distances = 2 if task.goal == "Push" else 1

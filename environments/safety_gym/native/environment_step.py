@@ -5,7 +5,7 @@ robot then sees, feels, earns and pays. Nothing here looks at another world, so 
 many there are nor on the threads. Resets and new goals, which are drawn at random, are not made here
 (``recrl.environments.safety_gym.batch``).
 
-What a world is made of is one record ``WORLD``; what all worlds of a task share is one record ``TASK``. These
+One record ``ENVIRONMENT`` holds an environment, one record ``TASK`` what all environments of a task share. These
 have room for every task.
 
 Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
@@ -50,7 +50,7 @@ NOT_YET = -2
 
 TASK = np.dtype(
     [
-        ("worlds", np.int64),  # address of the worlds' records
+        ("environments", np.int64),  # address of the worlds' records
         ("number", np.int64),
         ("outcomes", np.int64),  # address of what the last step brought, [B] OUTCOMEs
         ("observations", np.int64),  # address of [B, observed]
@@ -124,7 +124,7 @@ TASK = np.dtype(
     align=True,
 )
 
-WORLD = np.dtype(
+ENVIRONMENT = np.dtype(
     [
         ("action", np.float64, (2,)),
         ("steps", np.int64),
@@ -154,7 +154,7 @@ OUTCOME = np.dtype(
 )
 
 _tasks = array_at(TASK)
-_worlds = array_at(WORLD)
+_environments = array_at(ENVIRONMENT)
 _outcomes = array_at(OUTCOME)
 _doubles = array_at(np.float64)
 _integers = array_at(np.int32)
@@ -231,22 +231,22 @@ def add_to_lidar(x: float, y: float, lidar_range: float, bins: Any) -> None:
 
 
 @compiled
-def look(task: Any, world: Any, data: int) -> None:
+def look(task: Any, environment: Any, data: int) -> None:
     """Find where everything is and what the robot touches; MuJoCo has computed everything at this state."""
     qpos = field(data, task.qpos, task.nq)
     for vase in range(task.stop[VASES] - task.start[VASES]):
         address = task.vase_qpos + 7 * vase
-        world.points[task.start[VASES] + vase, 0] = qpos[address]
-        world.points[task.start[VASES] + vase, 1] = qpos[address + 1]
+        environment.points[task.start[VASES] + vase, 0] = qpos[address]
+        environment.points[task.start[VASES] + vase, 1] = qpos[address + 1]
     for box in range(task.start[BOX], task.stop[BOX]):
-        world.points[box, 0], world.points[box, 1] = qpos[task.box_qpos], qpos[task.box_qpos + 1]
+        environment.points[box, 0], environment.points[box, 1] = qpos[task.box_qpos], qpos[task.box_qpos + 1]
     if task.start[GREMLINS] < task.stop[GREMLINS]:
-        place_gremlins(task, world, qpos)
+        place_gremlins(task, environment, qpos)
     qacc = field(data, task.qacc, task.nv)
-    world.acceleration[0], world.acceleration[1] = qacc[0], qacc[1]
-    world.acceleration[2] = qacc[2] if task.is_car else 0.0
+    environment.acceleration[0], environment.acceleration[1] = qacc[0], qacc[1]
+    environment.acceleration[2] = qacc[2] if task.is_car else 0.0
     for body in range(task.nbody):
-        world.touching[body] = 0
+        environment.touching[body] = 0
     size = task.contact_size // 4
     contacts = _integers(data + task.ncon, 1)[0]
     geoms = _integers(_addresses(data + task.contact, 1)[0], contacts * size)
@@ -254,82 +254,82 @@ def look(task: Any, world: Any, data: int) -> None:
         place = contact * size + task.contact_geom // 4
         one, other = task.root[geoms[place]], task.root[geoms[place + 1]]
         if one == task.robot:
-            world.touching[other] = 1
+            environment.touching[other] = 1
         elif other == task.robot:
-            world.touching[one] = 1
-    world.touching[0] = 0  # the floor
-    world.touching[task.robot] = 0
-    world.broken = False
+            environment.touching[one] = 1
+    environment.touching[0] = 0  # the floor
+    environment.touching[task.robot] = 0
+    environment.broken = False
     for warning in task.warnings:
         if _integers(data + warning, 1)[0] > 0:
-            world.broken = True
+            environment.broken = True
 
 
 @compiled
-def course_step(task: Any, world: Any) -> int:
+def course_step(task: Any, environment: Any) -> int:
     """The t of f(t); somebody may go on after the end of an episode."""
-    at: int = min(world.steps, task.course_steps - 1)
+    at: int = min(environment.steps, task.course_steps - 1)
     return at
 
 
 @compiled
-def place_gremlins(task: Any, world: Any, qpos: Any) -> None:
+def place_gremlins(task: Any, environment: Any, qpos: Any) -> None:
     """Gremlins are f(t) away from the middle of their circle; the one that is a body is where that is."""
-    course, at = _doubles(task.course_positions, 3 * task.course_steps), 3 * course_step(task, world)
+    course, at = _doubles(task.course_positions, 3 * task.course_steps), 3 * course_step(task, environment)
     for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
-        point = world.points[task.start[GREMLINS] + gremlin]
-        if gremlin == world.embodied:
+        point = environment.points[task.start[GREMLINS] + gremlin]
+        if gremlin == environment.embodied:
             point[0], point[1] = qpos[task.gremlin_qpos], qpos[task.gremlin_qpos + 1]
         else:
-            point[0] = world.circles[gremlin, 0] + course[at]
-            point[1] = world.circles[gremlin, 1] + course[at + 1]
+            point[0] = environment.circles[gremlin, 0] + course[at]
+            point[1] = environment.circles[gremlin, 1] + course[at + 1]
 
 
 @compiled
-def measure(task: Any, world: Any, data: int) -> None:
+def measure(task: Any, environment: Any, data: int) -> None:
     """The distances that the reward is made of, metres.
 
     Goal and Button: from the robot to the goal, seen from above. Push: from the robot to the box and from the
     box to the goal, in space.
     """
     robot = robot_place(task, data)
-    goal = world.points[task.start[GOAL]]
+    goal = environment.points[task.start[GOAL]]
     if not task.is_push:
-        world.measured[0] = math.hypot(goal[0] - robot[0], goal[1] - robot[1])
+        environment.measured[0] = math.hypot(goal[0] - robot[0], goal[1] - robot[1])
         return
     box = field(data, task.qpos, task.nq)[task.box_qpos : task.box_qpos + 3]
     to_box = math.hypot(box[0] - robot[0], box[1] - robot[1])
     to_goal = math.hypot(goal[0] - box[0], goal[1] - box[1])
-    world.measured[0] = math.hypot(to_box, box[2] - robot[2])
-    world.measured[1] = math.hypot(to_goal, box[2] - task.goal_height)
+    environment.measured[0] = math.hypot(to_box, box[2] - robot[2])
+    environment.measured[1] = math.hypot(to_goal, box[2] - task.goal_height)
 
 
 @compiled
-def touches(task: Any, world: Any, kind: int) -> bool:
+def touches(task: Any, environment: Any, kind: int) -> bool:
     """Whether the robot touches any object of a kind."""
     for body in range(task.first_body[kind], task.last_body[kind]):  # noqa: SIM110  # not for Numba
-        if world.touching[body]:
+        if environment.touching[body]:
             return True
     return False
 
 
 @compiled
-def presses_wrongly(task: Any, world: Any) -> bool:
+def presses_wrongly(task: Any, environment: Any) -> bool:
     """Whether the robot touches a button that is not the goal, while buttons are felt."""
-    if world.button_timer > 0:
+    if environment.button_timer > 0:
         return False
     for button in range(task.last_body[BUTTONS] - task.first_body[BUTTONS]):
-        if button != world.goal_button and world.touching[task.first_body[BUTTONS] + button]:
+        if button != environment.goal_button and environment.touching[task.first_body[BUTTONS] + button]:
             return True
     return False
 
 
 @compiled
-def over_a_hazard(task: Any, world: Any, data: int) -> bool:
+def over_a_hazard(task: Any, environment: Any, data: int) -> bool:
     """Whether the robot's middle is less than a hazard's size from its middle, seen from above."""
     robot = robot_place(task, data)
     for hazard in range(task.start[HAZARDS], task.stop[HAZARDS]):
-        place = world.points[hazard]
+        place = environment.points[hazard]
         if math.hypot(place[0] - robot[0], place[1] - robot[1]) < task.hazard_size:
             return True
     return False
@@ -348,32 +348,32 @@ def moves_a_vase(task: Any, data: int) -> bool:
 
 
 @compiled
-def judge(task: Any, world: Any, data: int) -> None:
+def judge(task: Any, environment: Any, data: int) -> None:
     """The distances, the cost terms, and whether the goal is reached."""
-    measure(task, world, data)
+    measure(task, environment, data)
     for column in range(task.num_terms):
         term = task.terms[column]  # the order is that of TERMS
         if term == 0:
-            costs = over_a_hazard(task, world, data)
+            costs = over_a_hazard(task, environment, data)
         elif term == 1:
-            costs = touches(task, world, VASES)
+            costs = touches(task, environment, VASES)
         elif term == 2:
             costs = moves_a_vase(task, data)
         elif term == 3:
-            costs = touches(task, world, PILLARS)
+            costs = touches(task, environment, PILLARS)
         elif term == 4:
-            costs = presses_wrongly(task, world)
+            costs = presses_wrongly(task, environment)
         else:
-            costs = touches(task, world, GREMLINS)
-        world.terms[column] = 1.0 if costs else 0.0
+            costs = touches(task, environment, GREMLINS)
+        environment.terms[column] = 1.0 if costs else 0.0
     if task.is_button:
-        world.goal_met = world.touching[task.first_body[BUTTONS] + world.goal_button]
+        environment.goal_met = environment.touching[task.first_body[BUTTONS] + environment.goal_button]
     else:
-        world.goal_met = world.measured[1 if task.is_push else 0] <= task.goal_size
+        environment.goal_met = environment.measured[1 if task.is_push else 0] <= task.goal_size
 
 
 @compiled
-def observe(task: Any, world: Any, data: int, index: int) -> None:
+def observe(task: Any, environment: Any, data: int, index: int) -> None:
     """Everything that the robot perceives, by its lidar and by its sensors."""
     seen = _floats(task.observations + 4 * task.observed * index, task.observed)
     size = task.lidar_bins
@@ -384,17 +384,17 @@ def observe(task: Any, world: Any, data: int, index: int) -> None:
         bins = seen[task.lidar[kind] : task.lidar[kind] + size]
         for sector in range(size):
             bins[sector] = 0.0
-        if kind == BUTTONS and world.button_timer > 0:
+        if kind == BUTTONS and environment.button_timer > 0:
             continue
         for place in range(task.start[kind], task.stop[kind]):
-            point = world.points[place]
+            point = environment.points[place]
             x, y, _ = turned(rotation, point[0] - robot[0], point[1] - robot[1], -robot[2])
             add_to_lidar(x, y, task.lidar_range, bins)
-    feel(task, world, data, seen)
+    feel(task, environment, data, seen)
 
 
 @compiled
-def feel(task: Any, world: Any, data: int, seen: Any) -> None:
+def feel(task: Any, environment: Any, data: int, seen: Any) -> None:
     """Write what the sensors read into an observation.
 
     Accelerometer R^T (a + (0, 0, g)), velocimeter R^T v, magnetometer R^T m; gyro and the rear ball's spin
@@ -403,7 +403,7 @@ def feel(task: Any, world: Any, data: int, seen: Any) -> None:
     rotation, qvel, acceleration = (
         robot_rotation(task, data),
         field(data, task.qvel, task.nv),
-        world.acceleration,
+        environment.acceleration,
     )
     upwards = acceleration[2] + task.gravity
     _write(seen, task.sensors[ACCELEROMETER], turned(rotation, acceleration[0], acceleration[1], upwards))
@@ -426,12 +426,12 @@ def _write(seen: Any, place: int, numbers: tuple[float, float, float]) -> None:
 
 
 @compiled
-def nearest_gremlin(task: Any, world: Any, data: int) -> int:
+def nearest_gremlin(task: Any, environment: Any, data: int) -> int:
     """The gremlin that the robot may meet next, or NO_GREMLIN."""
     robot = robot_place(task, data)
     nearest, least = NO_GREMLIN, math.inf
     for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
-        place = world.points[task.start[GREMLINS] + gremlin]
+        place = environment.points[task.start[GREMLINS] + gremlin]
         apart = math.hypot(place[0] - robot[0], place[1] - robot[1])
         if apart < least:
             nearest, least = gremlin, apart
@@ -439,14 +439,14 @@ def nearest_gremlin(task: Any, world: Any, data: int) -> int:
 
 
 @compiled
-def replaceable(task: Any, world: Any, data: int) -> bool:
+def replaceable(task: Any, environment: Any, data: int) -> bool:
     """Whether the gremlin that is a body, if one is, could as well be none."""
-    if world.embodied < 0:
+    if environment.embodied < 0:
         return True
-    if world.touching[task.first_body[GREMLINS]]:
+    if environment.touching[task.first_body[GREMLINS]]:
         return False
-    course = _doubles(task.course_positions, 3 * task.course_steps)[3 * course_step(task, world) :]
-    circle = world.circles[world.embodied]
+    course = _doubles(task.course_positions, 3 * task.course_steps)[3 * course_step(task, environment) :]
+    circle = environment.circles[environment.embodied]
     place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
     x, y = place[0] - course[0] - circle[0], place[1] - course[1] - circle[1]
     z = place[2] - course[2]
@@ -455,9 +455,9 @@ def replaceable(task: Any, world: Any, data: int) -> bool:
 
 
 @compiled
-def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
+def embody(task: Any, environment: Any, data: int, gremlin: int) -> None:
     """Make this gremlin the body, or none: the body then hovers, untied, where nothing is."""
-    world.embodied = gremlin
+    environment.embodied = gremlin
     place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
     velocity = field(data, task.qvel, task.nv)[task.gremlin_qvel :]
     lift = field(data, task.qfrc_applied, task.nv)[task.gremlin_qvel :]
@@ -472,14 +472,14 @@ def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
     lift[2] = 0.0
     positions = _doubles(task.course_positions, 3 * task.course_steps)
     velocities = _doubles(task.course_velocities, 6 * task.course_steps)
-    at = course_step(task, world)
+    at = course_step(task, environment)
     for axis in range(3):
         place[axis] = positions[3 * at + axis]
     for axis in range(6):
         velocity[axis] = velocities[6 * at + axis]
-    place[0] += world.circles[gremlin, 0]
-    place[1] += world.circles[gremlin, 1]
-    half = world.gremlin_yaws[gremlin] / 2.0
+    place[0] += environment.circles[gremlin, 0]
+    place[1] += environment.circles[gremlin, 1]
+    half = environment.gremlin_yaws[gremlin] / 2.0
     lead = field(data, task.mocap_quat, 4 * task.nmocap)[4 * task.gremlin_lead :]
     for quaternion in (place[3:], lead):
         quaternion[0], quaternion[3] = math.cos(half), math.sin(half)
@@ -487,23 +487,23 @@ def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
 
 
 @compiled
-def lead_gremlin(task: Any, world: Any, data: int, substep: int) -> None:
+def lead_gremlin(task: Any, environment: Any, data: int, substep: int) -> None:
     """Move what the body is tied to: 0.35 (sin t, cos t) from the middle of its circle."""
     lead = field(data, task.mocap_pos, 3 * task.nmocap)[3 * task.gremlin_lead :]
-    time = task.timestep * (world.steps * task.substeps + substep)
-    lead[0] = world.circles[world.embodied, 0] + task.gremlin_travel * math.sin(time)
-    lead[1] = world.circles[world.embodied, 1] + task.gremlin_travel * math.cos(time)
+    time = task.timestep * (environment.steps * task.substeps + substep)
+    lead[0] = environment.circles[environment.embodied, 0] + task.gremlin_travel * math.sin(time)
+    lead[1] = environment.circles[environment.embodied, 1] + task.gremlin_travel * math.cos(time)
 
 
 @compiled
-def act(task: Any, world: Any, data: int) -> bool:
+def act(task: Any, environment: Any, data: int) -> bool:
     """Set the controls; False if anything else was set, too."""
     control = field(data, task.ctrl, 2)
-    control[0], control[1] = world.action[0], world.action[1]
+    control[0], control[1] = environment.action[0], environment.action[1]
     if task.start[GREMLINS] < task.stop[GREMLINS]:
-        wanted = nearest_gremlin(task, world, data)
-        if wanted != world.embodied and replaceable(task, world, data):
-            embody(task, world, data, wanted)
+        wanted = nearest_gremlin(task, environment, data)
+        if wanted != environment.embodied and replaceable(task, environment, data):
+            embody(task, environment, data, wanted)
             return False
     return True
 
@@ -518,46 +518,46 @@ def same(one: Any, other: Any) -> bool:
 
 
 @compiled
-def report(task: Any, world: Any, index: int) -> None:
+def report(task: Any, environment: Any, index: int) -> None:
     """Write what this step brought; the reward is the progress in metres, within bounds."""
     outcome = _outcomes(task.outcomes, task.number)[index]
-    progress = world.distances[0] - world.measured[0]
+    progress = environment.distances[0] - environment.measured[0]
     if task.is_push:
-        progress += world.distances[1] - world.measured[1]
+        progress += environment.distances[1] - environment.measured[1]
     cost = 0.0
     for column in range(task.num_terms):
-        outcome.numbers[2 + column] = world.terms[column]
-        cost = max(cost, world.terms[column])
+        outcome.numbers[2 + column] = environment.terms[column]
+        cost = max(cost, environment.terms[column])
     outcome.numbers[0] = min(max(progress, -task.reward_bound), task.reward_bound)
     outcome.numbers[1] = cost
-    outcome.flags[0] = world.goal_met
-    outcome.flags[1] = world.broken
-    outcome.flags[2] = world.broken  # what else ends an episode is not known here
-    outcome.flags[3] = world.steps >= task.horizon
+    outcome.flags[0] = environment.goal_met
+    outcome.flags[1] = environment.broken
+    outcome.flags[2] = environment.broken  # what else ends an episode is not known here
+    outcome.flags[3] = environment.steps >= task.horizon
 
 
 @compiled
-def begin(task: Any, world: Any, model: int, data: int, index: int) -> bool:
+def begin(task: Any, environment: Any, model: int, data: int, index: int) -> bool:
     """Do as the action says; whether everything else is as the last step left it."""
     left = task.rows + 8 * task.row * 2 * index
     found = left + 8 * task.row
     mj_getState(model, data, found, task.row_fields)
     untouched = same(_doubles(left, task.row), _doubles(found, task.row))
-    return act(task, world, data) and untouched
+    return act(task, environment, data) and untouched
 
 
 @compiled
-def simulate(task: Any, world: Any, model: int, data: int, index: int) -> None:
+def simulate(task: Any, environment: Any, model: int, data: int, index: int) -> None:
     """A step's physics steps.
 
     Where the last step left off, MuJoCo has computed already what follows from coordinates and velocities:
     the first physics step then does not compute it again, which changes nothing.
     """
-    untouched = begin(task, world, model, data, index)
-    leads = world.embodied >= 0
+    untouched = begin(task, environment, model, data, index)
+    leads = environment.embodied >= 0
     for substep in range(task.substeps):
         if leads:
-            lead_gremlin(task, world, data, substep)
+            lead_gremlin(task, environment, data, substep)
         if substep == 0 and untouched and not leads:
             mj_step2(model, data)
         else:
@@ -565,52 +565,52 @@ def simulate(task: Any, world: Any, model: int, data: int, index: int) -> None:
 
 
 @compiled
-def end(task: Any, world: Any, model: int, data: int, index: int) -> None:
+def end(task: Any, environment: Any, model: int, data: int, index: int) -> None:
     """Compute everything that follows from the state after the physics steps, and what the step brought."""
     mj_forward(model, data)
     mj_getState(model, data, task.rows + 8 * task.row * 2 * index, task.row_fields)
-    world.steps += 1
-    look(task, world, data)
-    judge(task, world, data)
-    report(task, world, index)
+    environment.steps += 1
+    look(task, environment, data)
+    judge(task, environment, data)
+    report(task, environment, index)
     for part in range(2):
-        world.distances[part] = world.measured[part]
-    world.button_timer = max(world.button_timer - 1, 0)
-    observe(task, world, data, index)
+        environment.distances[part] = environment.measured[part]
+    environment.button_timer = max(environment.button_timer - 1, 0)
+    observe(task, environment, data, index)
 
 
 @compiled_for_batch
 def step(model: int, data: int, index: int, argument: int) -> None:
     """One environment step of one world; the action is in its record."""
     task = _tasks(argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[index]
-    simulate(task, world, model, data, index)
-    end(task, world, model, data, index)
+    environment = _environments(task.environments, task.number)[index]
+    simulate(task, environment, model, data, index)
+    end(task, environment, model, data, index)
 
 
 @compiled_for_batch
 def review(_: int, data: int, index: int, argument: int) -> None:
     """Find what is to be found in one world as it is: after a reset, or with a new goal."""
     task = _tasks(argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[index]
-    look(task, world, data)
-    judge(task, world, data)
-    observe(task, world, data, index)
+    environment = _environments(task.environments, task.number)[index]
+    look(task, environment, data)
+    judge(task, environment, data)
+    observe(task, environment, data, index)
 
 
 @compiled_for_batch
 def perceive(_: int, data: int, index: int, argument: int) -> None:
     """Observe one world, whose objects and accelerations are as somebody has written them."""
     task = _tasks(argument, 1)[0]
-    observe(task, _worlds(task.worlds, task.number)[index], data, index)
+    observe(task, _environments(task.environments, task.number)[index], data, index)
 
 
 @compiled_for_python
 def acceptable(argument: int) -> bool:
     """Whether every action is within [-1, 1], and a number."""
     task = _tasks(argument, 1)[0]
-    for world in _worlds(task.worlds, task.number):
-        for action in world.action:
+    for environment in _environments(task.environments, task.number):
+        for action in environment.action:
             if not -1.0 <= action <= 1.0:
                 return False
     return True

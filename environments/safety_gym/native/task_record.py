@@ -17,6 +17,7 @@ from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
 from recrl.environments.safety_gym.layout import keepouts
 from recrl.environments.safety_gym.native.environment_step import (
+    ENVIRONMENT,
     KINDS,
     MAX_BODIES,
     MAX_GEOMS,
@@ -25,7 +26,6 @@ from recrl.environments.safety_gym.native.environment_step import (
     SENSORS,
     TASK,
     TERMS,
-    WORLD,
 )
 from recrl.environments.safety_gym.scene import Scene
 from recrl.environments.safety_gym.tasks import (
@@ -73,7 +73,7 @@ class Memory:
     """Where compiled code reads and writes.
 
     Attributes:
-        worlds: records ``WORLD``, [B].
+        environments: records ``ENVIRONMENT``, [B].
         outcomes: records ``OUTCOME``, [B].
         results: of them rewards, costs and the indicators of each cost term, [2 + terms, B].
         flags: of them ``FLAGS``, [len(FLAGS), B].
@@ -82,7 +82,7 @@ class Memory:
         course: how gremlins move, if there are any.
     """
 
-    worlds: npt.NDArray[Any]
+    environments: npt.NDArray[Any]
     outcomes: npt.NDArray[Any]
     results: Floats
     flags: npt.NDArray[np.bool_]
@@ -96,7 +96,7 @@ def allocate(scene: Scene, number: int) -> Memory:
     row = mujoco.mj_stateSize(scene.model, ROW)
     outcomes = np.zeros(number, OUTCOME)
     return Memory(
-        worlds=np.zeros(number, WORLD),
+        environments=np.zeros(number, ENVIRONMENT),
         outcomes=outcomes,
         results=outcomes["numbers"].T[: 2 + len(scene.task.cost_terms)],
         flags=outcomes["flags"].view(np.bool_).T,
@@ -110,9 +110,9 @@ def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
     """The record ``TASK`` of a scene, an array [1]; it is of use as long as the memory lives."""
     record = np.zeros(1, TASK)
     one = record[0]
-    for name in ("worlds", "outcomes", "observations", "rows"):
+    for name in ("environments", "outcomes", "observations", "rows"):
         one[name] = getattr(memory, name).ctypes.data
-    one["number"], one["row"], one["row_fields"] = len(memory.worlds), memory.rows.shape[2], ROW
+    one["number"], one["row"], one["row_fields"] = len(memory.environments), memory.rows.shape[2], ROW
     one["horizon"] = horizon
     _describe_memory(one)
     _describe_model(one, scene)
