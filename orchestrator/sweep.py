@@ -23,10 +23,10 @@ from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.provenance import collect
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.grid.plan import Plan, Work, make_plan, select
+from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan, select
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.sweep_progress import Standing, SweepProgress, TrialProgress, progress
+from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
 
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
 MIRROR_SECONDS = 120.0
@@ -67,7 +67,7 @@ class SweepResult:
     @property
     def failed(self) -> tuple[TrialProgress, ...]:
         """The trials that stand as failed, also from earlier launches."""
-        return self.progress.standing(Standing.FAILED)
+        return self.progress.with_status(DisplayStatus.FAILED)
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def launch(settings: LaunchSettings, *, stop: threading.Event) -> SweepResult:
         _leave_none_running(specs, store)  # of a launch that died
         plan = _plan(settings, specs)
         settings.watch(plan)
-        for trial in plan.doing(Work.RERUN):
+        for trial in plan.with_action(PlannedAction.RERUN):
             store.trial(trial.spec).set_all_aside()
         return _run(settings, plan, stop)
 

@@ -31,7 +31,7 @@ from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.sweep import LaunchSettings, Mirror, SweepResult, launch, stopping_on_signals
-from recrl.orchestrator.sweep_progress import Standing, SweepProgress, progress
+from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, progress
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_mirror
 from recrl.orchestrator.tracking.mlflow_sync import last_report
@@ -75,7 +75,7 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
 
     def finish(after: SweepProgress) -> None:
         shown.close()
-        if not stop.is_set() and after.counts[Standing.COMPLETE]:
+        if not stop.is_set() and after.counts[DisplayStatus.COMPLETE]:
             read.append(sweep_data.load(store))
             if request.figures:
                 _draw_at_end(read[0], store, console)
@@ -177,12 +177,12 @@ def _film(
 ) -> None:
     """Film the complete trials that the grid wants filmed and that have no video yet."""
     seeds = {"none": (), "first-seed": grid.seeds[:1], "all": grid.seeds}[grid.run.videos]
-    complete = [trial.spec for trial in after.standing(Standing.COMPLETE) if trial.spec.seed in seeds]
+    complete = [trial.spec for trial in after.with_status(DisplayStatus.COMPLETE) if trial.spec.seed in seeds]
     unseen = [store.trial(spec) for spec in complete if not any(store.trial(spec).videos_folder.glob("*"))]
     if not unseen:
         return
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
-    from recrl.orchestrator.trial.saved_policy import FrozenTrial  # noqa: PLC0415  (imports torch)
+    from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415  (imports torch)
     from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
 
     say(console, f"Videos     {short(store.trials_folder)}/*/{unseen[0].videos_folder.name}")
@@ -190,7 +190,7 @@ def _film(
         if stop.is_set():
             return
         try:
-            FrozenTrial.thaw(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+            SavedTrial.load(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
         except RecrlError as error:  # a picture is no reason to call a finished sweep broken
             say(console, f"           no video: {error}")
 
@@ -224,7 +224,7 @@ def _say_result(result: SweepResult, store: SweepStore, request: LaunchRequest, 
     if result.stopped:
         say(console, f"Stopped; nothing is lost. Go on with: {again}")
         return ExitCode.STOPPED
-    if damaged := result.progress.standing(Standing.DAMAGED):
+    if damaged := result.progress.with_status(DisplayStatus.DAMAGED):
         them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
         rerun = again if request.rerun_damaged else f"{again} --rerun-damaged"
         say(console, f"{them} left alone; what is damaged is moved aside and run again with: {rerun}")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import RedactedStream
-from recrl.orchestrator.sweep_progress import Standing, standing_of
+from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.client import ENVIRONMENT
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker
@@ -112,7 +112,7 @@ def _pass(tracker: Tracker, *, live: bool) -> SyncReport:
 
 def _any_runs(store: SweepStore) -> bool:
     records = (trial.record() for trial in store.trials())
-    return any(standing_of(record, now=time.time()) is Standing.RUNNING for record in records)
+    return any(display_status(record, now=time.time()) is DisplayStatus.RUNNING for record in records)
 
 
 def _is_over(parent: int, seconds: float) -> bool:

@@ -92,11 +92,11 @@ def load_policy(trial: str | Path, *, seed: int | None = 0, trust: bool = False)
 
 def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:
     """The policy in a trial's files."""
-    from recrl.orchestrator.trial.saved_policy import FrozenTrial  # noqa: PLC0415
+    from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415
 
     trial.require_whole()
-    frozen = FrozenTrial.thaw(trial)
-    return Policy(frozen.agent, frozen.cmdp, frozen.spec, frozen.update, np.random.default_rng(seed))
+    saved = SavedTrial.load(trial)
+    return Policy(saved.agent, saved.cmdp, saved.spec, saved.update, np.random.default_rng(seed))
 
 
 @contextmanager

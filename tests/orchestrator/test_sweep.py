@@ -15,7 +15,7 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.grid.plan import Plan, Work
+from recrl.orchestrator.grid.plan import Plan, PlannedAction
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch, stopping_on_signals
@@ -124,7 +124,7 @@ def test_the_folder_says_what_was_launched(store: SweepStore) -> None:
     result = _launch(store)
     assert store.grid_path.read_text() == GRID
     assert tuple(store.specs()) == _grid().trials()
-    assert result.plan.counts[Work.NEW] == 2
+    assert result.plan.counts[PlannedAction.NEW] == 2
     text = store.info_path.read_text()
     assert '"name": "small"' in text and '"created": ' in text
 
@@ -169,7 +169,7 @@ def test_what_a_dead_launch_left_running_is_resumed(store: SweepStore) -> None:
     left = store.trial(spec).begin(spec)
     result = _launch(store)
     assert result.progress.is_complete
-    assert [trial.work for trial in result.plan.trials] == [Work.RESUME, Work.NEW]
+    assert [trial.action for trial in result.plan.trials] == [PlannedAction.RESUME, PlannedAction.NEW]
     with pytest.raises(RecrlError, match="another attempt runs this trial now"):
         left.heartbeat(update=1, env_steps=1, steps_per_second=1.0)
 
