@@ -30,16 +30,16 @@ from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
-from recrl.orchestrator.sweep import LaunchSettings, Mirror, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep import BackgroundSync, LaunchSettings, SweepResult, launch, stopping_on_signals
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, progress
 from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep
 
-MIRROR_INTERVAL_SECONDS = 5.0
+SYNC_INTERVAL_SECONDS = 5.0
 
 logger = logging.getLogger("recrl.sweep")
 
@@ -94,15 +94,15 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
             retry_failed=request.retry_failed,
             rerun_damaged=request.rerun_damaged,
             rerun_changed=request.rerun_changed,
-            start_mirror=_mirror_to(uri) if uri else None,
+            start_sync=_sync_to(uri) if uri else None,
             watch=watch,
             finish=finish,
         )
         result = launch(settings, stop=stop)
-    kept = f", a mirror of {place.address}" if place.address else ""
+    kept = f", a local copy of {place.address}" if place.address else ""
     say(console, f"Results    {short(store.folder)}{kept}")
     if uri:
-        _say_mirrored(result, store, uri, request, console)
+        _say_synced(result, store, uri, request, console)
     for sweep in read:
         _say_results(sweep, console)
     report = store.figures_folder / "report.html"
@@ -140,8 +140,8 @@ def _executor(grid: GridSpec, place: SweepPlace, request: LaunchRequest) -> Exec
     )
 
 
-def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
-    return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
+def _sync_to(uri: str) -> Callable[[SweepStore], BackgroundSync]:
+    return lambda store: start_sync(store, uri, interval_seconds=SYNC_INTERVAL_SECONDS)
 
 
 def _say_starting(request: LaunchRequest, console: Console) -> None:
@@ -195,7 +195,7 @@ def _film(
             say(console, f"           no video: {error}")
 
 
-def _say_mirrored(
+def _say_synced(
     result: SweepResult, store: SweepStore, uri: str, request: LaunchRequest, console: Console
 ) -> None:
     """Say where MLflow's view is and how to open it, and whether it is up to date."""
@@ -207,7 +207,7 @@ def _say_mirrored(
     where = redacted(uri) if request.tracking_uri else short(store.mlflow_database)
     say(console, f"MLflow     {where}")
     say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
-    if not result.mirrored:  # a mirror that came to no end leaves the report of an earlier pass
+    if not result.synced:  # a mirror that came to no end leaves the report of an earlier pass
         report = last_report(store, uri)
         problem = f" ({report.problem})" if report and report.problem else ""
         again = shlex.join(["recrl-sweep", "sync", *place])

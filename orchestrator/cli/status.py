@@ -110,7 +110,7 @@ def run_logs(request: LogsRequest, console: Console) -> ExitCode:
         if request.follow:
             if not store.is_locked():
                 place = sweep_place(store, request.storage)
-                following.enter_context(place.mirrored(threading.Event()))
+                following.enter_context(place.kept_up_to_date(threading.Event()))
             _wait_for_start(store, text, console)
         for line in display.lines_of(_trial(store, text), follow=request.follow):
             say(console, line)

@@ -12,7 +12,7 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.points import Summary, charts_page, note
-from recrl.orchestrator.tracking.positions import Position, mirror_folder, read_position
+from recrl.orchestrator.tracking.positions import Position, read_position, sync_folder
 from recrl.orchestrator.tracking.run_states import sweep_status
 from recrl.orchestrator.tracking.runs import SweepRuns
 
@@ -41,7 +41,7 @@ class SweepSync:
         self._store = store
         self._runs = runs
         self._summaries = summaries
-        folder = mirror_folder(store, uri)
+        folder = sync_folder(store, uri)
         self._path = folder / "sweep.json"
         known = read_position(self._path)
         self._position = known if known and known.run_id == runs.parent_id else Position(runs.parent_id)

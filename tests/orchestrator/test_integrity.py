@@ -377,7 +377,7 @@ def test_a_bad_file_of_the_sweep_is_a_sentence_and_a_launch_writes_it_anew(
     assert main(["check"]) == ExitCode.OK
 
 
-def test_a_mirrors_address_that_is_damaged_is_a_sentence(
+def test_a_local_copys_address_that_is_damaged_is_a_sentence(
     store: SweepStore, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store.storage_path.write_text("{}")

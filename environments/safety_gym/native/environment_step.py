@@ -5,8 +5,8 @@ robot then sees, feels, earns and pays. Nothing here looks at another world, so 
 many there are nor on the threads. Resets and new goals, which are drawn at random, are not made here
 (``recrl.environments.safety_gym.batch``).
 
-One record ``ENVIRONMENT`` holds an environment, one record ``TASK`` what all environments of a task share. These
-have room for every task.
+A record ``ENVIRONMENT`` holds the state of one environment. The record ``TASK`` holds what all environments of a
+task share. Their sizes fit every task.
 
 Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
 
