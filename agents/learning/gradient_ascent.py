@@ -72,8 +72,8 @@ def with_prices(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -
     """
 
     def objective(_: Distribution, ratios: Tensor) -> Tensor:
-        value, price = surrogate_objective(ratios)
-        return value / (1.0 + price)
+        value, weight = surrogate_objective(ratios)
+        return value / (1.0 + weight)
 
     return objective
 

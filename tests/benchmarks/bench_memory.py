@@ -1,4 +1,4 @@
-"""Whether memory stays flat over a long trial: of the worker, the driver, the teacher service and the MLflow sync.
+"""Memory over a long trial: of the worker, the driver, the teacher service and the MLflow sync.
 
     OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_memory [--task river-grid] [--updates 3000]
 

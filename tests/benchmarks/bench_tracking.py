@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_tracking.py [--trials 20] [--updates 300]
 
-The MLflow sync process is run over a made-up, finished sweep and its CPU seconds are counted, so a busy machine
-matters little. The aim: below 5% of the CPU time of the trials themselves.
+The MLflow sync process is run over a made-up, finished sweep. Its CPU seconds are counted, so a busy
+machine matters little. The aim: below 5% of the CPU time of the trials themselves.
 """
 
 from __future__ import annotations

@@ -344,5 +344,5 @@ def test_a_picture_needs_a_mode_and_a_reset() -> None:
         ValueError, match="SafetyAntVelocity: to render, make the environment with render_mode="
     ):
         two_robots("SafetyAntVelocity").render()
-    with pytest.raises(ValueError, match="SafetyAntVelocity: call reset before the first picture"):
+    with pytest.raises(ValueError, match="SafetyAntVelocity: call reset before the first frame"):
         VelocityEnv("SafetyAntVelocity", render_mode="rgb_array").render()

@@ -574,10 +574,10 @@ def wait_until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None
 def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[..., SweepStore]) -> None:
     store = write(seeds=4)
     uri = tracking_uri(store, None)
-    sync = start_sync(store, uri, interval_seconds=3600.0)
+    background = start_sync(store, uri, interval_seconds=3600.0)
     wait_until(lambda: any(store.sync_folder.glob("*/trial-*.json")))
-    sync.process.kill()
-    assert not sync.stop(timeout=60.0)
+    background.process.kill()
+    assert not background.stop(timeout=60.0)
     assert sync(store, uri).is_up_to_date
     shown = everything(store)
     for trial in store.trials():
@@ -589,10 +589,10 @@ def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[...
 def test_a_sync_that_is_stopped_shows_everything_first(write: Callable[..., SweepStore]) -> None:
     store = write(unfinished=(DYNAMIC,))
     uri = tracking_uri(store, None)
-    sync = start_sync(store, uri, interval_seconds=3600.0)
+    background = start_sync(store, uri, interval_seconds=3600.0)
     wait_until(lambda: mlflow_sync.last_report(store, uri) is not None)
     trial_titled(store, DYNAMIC).set_status(TrialState.WAITING)
-    assert sync.stop(timeout=60.0)
+    assert background.stop(timeout=60.0)
     assert {name: run.info.status for name, run in runs(store).items()} == {
         "made-up": "KILLED",
         NONE: "FINISHED",

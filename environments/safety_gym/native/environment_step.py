@@ -1,14 +1,14 @@
-"""One environment step of one world of a Safety Gym task, compiled to machine code.
+"""One step of one environment of a Safety Gym task, compiled to machine code.
 
-``step`` is called for each world, on whatever thread of MuJoCo's: the action, ten physics steps, what the
-robot then sees, feels, earns and pays. Nothing here looks at another world, so results depend neither on how
-many there are nor on the threads. Resets and new goals, which are drawn at random, are not made here
+``step`` is called for each environment, on any of MuJoCo's threads: it sets the action, takes ten physics
+steps and computes observation, reward and cost. It reads no other environment, so results depend neither on
+their number nor on the threads. Resets and new goals are sampled elsewhere
 (``recrl.environments.safety_gym.batch``).
 
-A record ``ENVIRONMENT`` holds the state of one environment. The record ``TASK`` holds what all environments of a
-task share. Their sizes fit every task.
+A record ``ENVIRONMENT`` holds the state of one environment. The record ``TASK`` holds what all environments
+of a task share. Their sizes fit every task.
 
-Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
+Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world frame.
 
 Source: openai/safety-gym ``engine.py``.
 """
@@ -37,27 +37,27 @@ GOAL, BOX, BUTTONS, HAZARDS, VASES, PILLARS, GREMLINS = range(7)
 TERMS = ("hazards", "vases_contact", "vases_velocity", "pillars", "buttons", "gremlins")
 """All cost terms, in the order in which they are computed."""
 SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer", "ballquat_rear", "ballangvel_rear")
-"""What a robot may feel, in the order of ``TASK``'s field of it."""
+"""Sensors of a robot, in the order of the field ``TASK["sensor"]``."""
 ACCELEROMETER, VELOCIMETER, GYRO, MAGNETOMETER, BALL, SPIN = range(6)
 FLAGS = ("goal_met", "broken", "terminated", "truncated")
-"""What a step brings besides rewards, costs and the indicators of the cost terms."""
+"""Results of a step besides rewards, costs and the indicators of the cost terms."""
 MAX_POINTS, MAX_BODIES, MAX_GEOMS, MAX_GREMLINS, MAX_TERMS = 24, 24, 64, 6, 3
-"""Room for P objects, for bodies and shapes of a model, and so on."""
+"""Maximum sizes: P objects, bodies and shapes of a model, and so on."""
 NO_GREMLIN = -1
-"""No gremlin is a body: it hovers, untied, where nothing is."""
+"""No gremlin is a body: it hovers untied at a place without objects."""
 NOT_YET = -2
-"""A new episode: no gremlin was made a body, and the body is where the model has it."""
+"""A new episode: no gremlin was made a body yet, and the body has its initial pose."""
 
 TASK = np.dtype(
     [
-        ("environments", np.int64),  # address of the worlds' records
+        ("environments", np.int64),  # address of the records of the environments
         ("number", np.int64),
-        ("outcomes", np.int64),  # address of what the last step brought, [B] OUTCOMEs
+        ("outcomes", np.int64),  # address of the results of the last step, [B] OUTCOMEs
         ("observations", np.int64),  # address of [B, observed]
-        ("rows", np.int64),  # address of [B, 2, row]: the state that the last step left, and room for another
+        ("rows", np.int64),  # address of [B, 2, row]: the state after the last step, and room for another
         ("row", np.int64),  # numbers in a state
         ("row_fields", np.int32),  # mjtState
-        # Fields of mjData and mjContact: where in the structure.
+        # Offsets of fields in mjData and mjContact.
         ("qpos", np.int64),
         ("qvel", np.int64),
         ("qacc", np.int64),
@@ -72,7 +72,7 @@ TASK = np.dtype(
         ("contact", np.int64),
         ("contact_size", np.int64),
         ("contact_geom", np.int64),
-        ("warnings", np.int64, (3,)),  # numbers of bad positions, velocities, accelerations
+        ("warnings", np.int64, (3,)),  # counts of bad positions, velocities, accelerations
         # The model.
         ("nq", np.int64),
         ("nv", np.int64),
@@ -83,18 +83,18 @@ TASK = np.dtype(
         ("robot", np.int64),  # its body
         ("is_car", np.bool_),
         ("root", np.int64, (MAX_GEOMS,)),  # the outermost body that each shape is part of
-        ("vase_qpos", np.int64),  # the vases' coordinates and velocities follow on one another
+        ("vase_qpos", np.int64),  # the vases' coordinates and velocities are contiguous
         ("vase_qvel", np.int64),
         ("box_qpos", np.int64),
         # The task.
-        ("start", np.int64, (len(KINDS),)),  # each kind's places among P
+        ("start", np.int64, (len(KINDS),)),  # each kind's range among P
         ("stop", np.int64, (len(KINDS),)),
-        ("first_body", np.int64, (len(KINDS),)),  # bodies of each kind, if it matters who touches them
+        ("first_body", np.int64, (len(KINDS),)),  # bodies of each kind, if contacts with them matter
         ("last_body", np.int64, (len(KINDS),)),
-        ("lidar", np.int64, (len(KINDS),)),  # where in an observation each kind is seen, -1: nowhere
-        ("sensors", np.int64, (len(SENSORS),)),  # where in an observation they are, -1: nowhere
-        ("observed", np.int64),  # numbers in an observation
-        ("terms", np.int64, (MAX_TERMS,)),  # what costs: indices of TERMS
+        ("lidar", np.int64, (len(KINDS),)),  # offset of each kind in an observation, -1 for none
+        ("sensors", np.int64, (len(SENSORS),)),  # their offsets in an observation, -1 for none
+        ("observed", np.int64),  # size of an observation
+        ("terms", np.int64, (MAX_TERMS,)),  # cost terms: indices of TERMS
         ("num_terms", np.int64),
         ("horizon", np.int64),
         ("is_push", np.bool_),
@@ -111,7 +111,7 @@ TASK = np.dtype(
         # Gremlins: see recrl.environments.safety_gym.gremlins.
         ("gremlin_qpos", np.int64),
         ("gremlin_qvel", np.int64),
-        ("gremlin_lead", np.int64),  # what leads the body, a mocap body
+        ("gremlin_lead", np.int64),  # the mocap body that the gremlin is tied to
         ("gremlin_weight", np.float64),  # newtons
         ("gremlin_travel", np.float64),
         ("gremlin_alert", np.float64),  # metres
@@ -129,15 +129,15 @@ ENVIRONMENT = np.dtype(
         ("action", np.float64, (2,)),
         ("steps", np.int64),
         ("points", np.float64, (MAX_POINTS, 2)),  # (x, y) of what the lidar sees, metres
-        ("distances", np.float64, (2,)),  # those that the reward compares with, metres
+        ("distances", np.float64, (2,)),  # distances before the step, for the reward, metres
         ("goal_button", np.int64),
         ("button_timer", np.int64),
         ("circles", np.float64, (MAX_GREMLINS, 2)),
         ("gremlin_yaws", np.float64, (MAX_GREMLINS,)),
         ("embodied", np.int64),
-        ("acceleration", np.float64, (3,)),  # of the robot, in the world's frame, m/s^2
-        ("touching", np.uint8, (MAX_BODIES,)),  # 0 or 1; Numba knows no arrays of truth values in records
-        ("measured", np.float64, (2,)),  # as distances, now
+        ("acceleration", np.float64, (3,)),  # of the robot, in the world frame, m/s^2
+        ("touching", np.uint8, (MAX_BODIES,)),  # 0 or 1; Numba has no boolean arrays in records
+        ("measured", np.float64, (2,)),  # as distances, after the step
         ("terms", np.float64, (MAX_TERMS,)),
         ("goal_met", np.bool_),
         ("broken", np.bool_),
@@ -183,7 +183,7 @@ def robot_rotation(task: Any, data: int) -> Any:
 
 @compiled
 def turned(rotation: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """R^T (x, y, z): a vector of the world in the robot's frame; R is given by rows, [9]."""
+    """R^T (x, y, z): a vector of the world frame in the robot's frame; R is given by rows, [9]."""
     return (
         rotation[0] * x + rotation[3] * y + rotation[6] * z,
         rotation[1] * x + rotation[4] * y + rotation[7] * z,
@@ -202,11 +202,11 @@ def write_rotation(quaternion: Any, out: Any) -> None:
 
 @compiled
 def add_to_lidar(x: float, y: float, lidar_range: float, bins: Any) -> None:
-    """Let one object be seen by the pseudo-lidar: bin b shows the most that any object has there.
+    """Add one object to the pseudo-lidar: each bin holds the maximum over objects.
 
-    The circle around the robot is divided into sectors. An object at distance d reads max(0, 1 - d / range)
-    in its own sector; in the next one that times how far through its own sector it is, and in the one before
-    that times the rest ("aliasing").
+    The circle around the robot is divided into sectors. An object at distance d reads r = max(0, 1 - d /
+    range) in its own sector. With u in [0, 1) its relative angle there, it reads u r in the next
+    sector and (1 - u) r in the one before ("aliasing").
 
     Args:
         x: the object's place in the robot's frame, metres.
@@ -232,7 +232,7 @@ def add_to_lidar(x: float, y: float, lidar_range: float, bins: Any) -> None:
 
 @compiled
 def look(task: Any, environment: Any, data: int) -> None:
-    """Find where everything is and what the robot touches; MuJoCo has computed everything at this state."""
+    """Update the objects' positions and the robot's contacts; ``mj_forward`` was called before."""
     qpos = field(data, task.qpos, task.nq)
     for vase in range(task.stop[VASES] - task.start[VASES]):
         address = task.vase_qpos + 7 * vase
@@ -267,14 +267,14 @@ def look(task: Any, environment: Any, data: int) -> None:
 
 @compiled
 def course_step(task: Any, environment: Any) -> int:
-    """The t of f(t); somebody may go on after the end of an episode."""
+    """Return the index into f(t); a caller may go on after the end of an episode."""
     at: int = min(environment.steps, task.course_steps - 1)
     return at
 
 
 @compiled
 def place_gremlins(task: Any, environment: Any, qpos: Any) -> None:
-    """Gremlins are f(t) away from the middle of their circle; the one that is a body is where that is."""
+    """Place the gremlins at f(t) from the centre of their circles; the simulated one is where its body is."""
     course, at = _doubles(task.course_positions, 3 * task.course_steps), 3 * course_step(task, environment)
     for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
         point = environment.points[task.start[GREMLINS] + gremlin]
@@ -287,10 +287,10 @@ def place_gremlins(task: Any, environment: Any, qpos: Any) -> None:
 
 @compiled
 def measure(task: Any, environment: Any, data: int) -> None:
-    """The distances that the reward is made of, metres.
+    """Compute the distances of the reward, metres.
 
-    Goal and Button: from the robot to the goal, seen from above. Push: from the robot to the box and from the
-    box to the goal, in space.
+    Goal and Button: from the robot to the goal, horizontally. Push: from the robot to the box and from the
+    box to the goal, in three dimensions.
     """
     robot = robot_place(task, data)
     goal = environment.points[task.start[GOAL]]
@@ -315,7 +315,7 @@ def touches(task: Any, environment: Any, kind: int) -> bool:
 
 @compiled
 def presses_wrongly(task: Any, environment: Any) -> bool:
-    """Whether the robot touches a button that is not the goal, while buttons are felt."""
+    """Whether the robot touches a wrong button while buttons are active."""
     if environment.button_timer > 0:
         return False
     for button in range(task.last_body[BUTTONS] - task.first_body[BUTTONS]):
@@ -326,7 +326,7 @@ def presses_wrongly(task: Any, environment: Any) -> bool:
 
 @compiled
 def over_a_hazard(task: Any, environment: Any, data: int) -> bool:
-    """Whether the robot's middle is less than a hazard's size from its middle, seen from above."""
+    """Whether the horizontal distance between the robot and a hazard's centre is below the hazard's size."""
     robot = robot_place(task, data)
     for hazard in range(task.start[HAZARDS], task.stop[HAZARDS]):
         place = environment.points[hazard]
@@ -337,7 +337,7 @@ def over_a_hazard(task: Any, environment: Any, data: int) -> bool:
 
 @compiled
 def moves_a_vase(task: Any, data: int) -> bool:
-    """Whether any vase moves; what sleeps has no velocity."""
+    """Whether any vase moves; a sleeping vase has no velocity."""
     qvel = field(data, task.qvel, task.nv)
     for vase in range(task.stop[VASES] - task.start[VASES]):
         address = task.vase_qvel + 6 * vase
@@ -349,7 +349,7 @@ def moves_a_vase(task: Any, data: int) -> bool:
 
 @compiled
 def judge(task: Any, environment: Any, data: int) -> None:
-    """The distances, the cost terms, and whether the goal is reached."""
+    """Compute the distances, the cost terms, and whether the goal is reached."""
     measure(task, environment, data)
     for column in range(task.num_terms):
         term = task.terms[column]  # the order is that of TERMS
@@ -374,7 +374,7 @@ def judge(task: Any, environment: Any, data: int) -> None:
 
 @compiled
 def observe(task: Any, environment: Any, data: int, index: int) -> None:
-    """Everything that the robot perceives, by its lidar and by its sensors."""
+    """Write the whole observation: lidar and sensors."""
     seen = _floats(task.observations + 4 * task.observed * index, task.observed)
     size = task.lidar_bins
     rotation, robot = robot_rotation(task, data), robot_place(task, data)
@@ -395,7 +395,7 @@ def observe(task: Any, environment: Any, data: int, index: int) -> None:
 
 @compiled
 def feel(task: Any, environment: Any, data: int, seen: Any) -> None:
-    """Write what the sensors read into an observation.
+    """Write the sensors' readings into an observation.
 
     Accelerometer R^T (a + (0, 0, g)), velocimeter R^T v, magnetometer R^T m; gyro and the rear ball's spin
     are angular velocities in the robot's frame, as MuJoCo has them; the ball's rotation is a matrix.
@@ -427,7 +427,7 @@ def _write(seen: Any, place: int, numbers: tuple[float, float, float]) -> None:
 
 @compiled
 def nearest_gremlin(task: Any, environment: Any, data: int) -> int:
-    """The gremlin that the robot may meet next, or NO_GREMLIN."""
+    """Return the gremlin that the robot may meet next, or NO_GREMLIN."""
     robot = robot_place(task, data)
     nearest, least = NO_GREMLIN, math.inf
     for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
@@ -440,7 +440,7 @@ def nearest_gremlin(task: Any, environment: Any, data: int) -> int:
 
 @compiled
 def replaceable(task: Any, environment: Any, data: int) -> bool:
-    """Whether the gremlin that is a body, if one is, could as well be none."""
+    """Whether the simulated gremlin, if any, may be released: it is untouched and on its course."""
     if environment.embodied < 0:
         return True
     if environment.touching[task.first_body[GREMLINS]]:
@@ -456,7 +456,7 @@ def replaceable(task: Any, environment: Any, data: int) -> bool:
 
 @compiled
 def embody(task: Any, environment: Any, data: int, gremlin: int) -> None:
-    """Make this gremlin the body, or none: the body then hovers, untied, where nothing is."""
+    """Make this gremlin the body. With NO_GREMLIN the body hovers untied at a place without objects."""
     environment.embodied = gremlin
     place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
     velocity = field(data, task.qvel, task.nv)[task.gremlin_qvel :]
@@ -488,7 +488,7 @@ def embody(task: Any, environment: Any, data: int, gremlin: int) -> None:
 
 @compiled
 def lead_gremlin(task: Any, environment: Any, data: int, substep: int) -> None:
-    """Move what the body is tied to: 0.35 (sin t, cos t) from the middle of its circle."""
+    """Move the mocap body that leads the gremlin: 0.35 (sin t, cos t) from the centre of its circle."""
     lead = field(data, task.mocap_pos, 3 * task.nmocap)[3 * task.gremlin_lead :]
     time = task.timestep * (environment.steps * task.substeps + substep)
     lead[0] = environment.circles[environment.embodied, 0] + task.gremlin_travel * math.sin(time)
@@ -497,7 +497,7 @@ def lead_gremlin(task: Any, environment: Any, data: int, substep: int) -> None:
 
 @compiled
 def act(task: Any, environment: Any, data: int) -> bool:
-    """Set the controls; False if anything else was set, too."""
+    """Set the controls; return False if anything else was changed, too."""
     control = field(data, task.ctrl, 2)
     control[0], control[1] = environment.action[0], environment.action[1]
     if task.start[GREMLINS] < task.stop[GREMLINS]:
@@ -519,7 +519,7 @@ def same(one: Any, other: Any) -> bool:
 
 @compiled
 def report(task: Any, environment: Any, index: int) -> None:
-    """Write what this step brought; the reward is the progress in metres, within bounds."""
+    """Write the results of this step; the reward is the progress in metres, within bounds."""
     outcome = _outcomes(task.outcomes, task.number)[index]
     progress = environment.distances[0] - environment.measured[0]
     if task.is_push:
@@ -532,13 +532,13 @@ def report(task: Any, environment: Any, index: int) -> None:
     outcome.numbers[1] = cost
     outcome.flags[0] = environment.goal_met
     outcome.flags[1] = environment.broken
-    outcome.flags[2] = environment.broken  # what else ends an episode is not known here
+    outcome.flags[2] = environment.broken  # other reasons to terminate are not known here
     outcome.flags[3] = environment.steps >= task.horizon
 
 
 @compiled
 def begin(task: Any, environment: Any, model: int, data: int, index: int) -> bool:
-    """Do as the action says; whether everything else is as the last step left it."""
+    """Set the action; return whether everything else is as the last step left it."""
     left = task.rows + 8 * task.row * 2 * index
     found = left + 8 * task.row
     mj_getState(model, data, found, task.row_fields)
@@ -548,10 +548,10 @@ def begin(task: Any, environment: Any, model: int, data: int, index: int) -> boo
 
 @compiled
 def simulate(task: Any, environment: Any, model: int, data: int, index: int) -> None:
-    """A step's physics steps.
+    """Take the physics steps of one environment step.
 
-    Where the last step left off, MuJoCo has computed already what follows from coordinates and velocities:
-    the first physics step then does not compute it again, which changes nothing.
+    After the last step MuJoCo has already computed what follows from coordinates and velocities. If nothing
+    changed since, the first physics step does not compute it again; the result is the same.
     """
     untouched = begin(task, environment, model, data, index)
     leads = environment.embodied >= 0
@@ -566,7 +566,7 @@ def simulate(task: Any, environment: Any, model: int, data: int, index: int) -> 
 
 @compiled
 def end(task: Any, environment: Any, model: int, data: int, index: int) -> None:
-    """Compute everything that follows from the state after the physics steps, and what the step brought."""
+    """Compute everything that follows from the new state, and the results of the step."""
     mj_forward(model, data)
     mj_getState(model, data, task.rows + 8 * task.row * 2 * index, task.row_fields)
     environment.steps += 1
@@ -581,7 +581,7 @@ def end(task: Any, environment: Any, model: int, data: int, index: int) -> None:
 
 @compiled_for_batch
 def step(model: int, data: int, index: int, argument: int) -> None:
-    """One environment step of one world; the action is in its record."""
+    """Take one step of one environment; the action is in its record."""
     task = _tasks(argument, 1)[0]
     environment = _environments(task.environments, task.number)[index]
     simulate(task, environment, model, data, index)
@@ -590,7 +590,7 @@ def step(model: int, data: int, index: int, argument: int) -> None:
 
 @compiled_for_batch
 def review(_: int, data: int, index: int, argument: int) -> None:
-    """Find what is to be found in one world as it is: after a reset, or with a new goal."""
+    """Compute observation, distances and costs of one environment, after a reset or with a new goal."""
     task = _tasks(argument, 1)[0]
     environment = _environments(task.environments, task.number)[index]
     look(task, environment, data)
@@ -600,14 +600,14 @@ def review(_: int, data: int, index: int, argument: int) -> None:
 
 @compiled_for_batch
 def perceive(_: int, data: int, index: int, argument: int) -> None:
-    """Observe one world, whose objects and accelerations are as somebody has written them."""
+    """Compute the observation of one environment; objects and accelerations stay as recorded."""
     task = _tasks(argument, 1)[0]
     observe(task, _environments(task.environments, task.number)[index], data, index)
 
 
 @compiled_for_python
 def acceptable(argument: int) -> bool:
-    """Whether every action is within [-1, 1], and a number."""
+    """Whether every action is a number within [-1, 1]."""
     task = _tasks(argument, 1)[0]
     for environment in _environments(task.environments, task.number):
         for action in environment.action:
