@@ -3,7 +3,7 @@
 A map is a rectangle of characters, enclosed by walls:
 
     ``#`` wall, ``.`` dry ground, ``~`` river, ``%`` mud, ``G`` goal (at least one),
-    ``>`` ``v`` ``<`` ``^`` the start (exactly one, on dry ground) and its heading.
+    ``>`` ``v`` ``<`` ``^`` the start and its heading (exactly one, on dry ground).
 
 A cell is (x, y), the column and the row, both from 0 at the top left. Error messages count lines and columns
 from 1, like an editor.
