@@ -1,8 +1,8 @@
-"""The seam between a trial and its agent, and what crosses it.
+"""Interface between a trial and its agent.
 
-An agent is any CRL algorithm. **What a curriculum asks for is an argument of ``update``, never agent state**:
-the cost limits are a vector [k], may be infinite, and change between updates. NumPy crosses the seam, tensors
-do not.
+An agent is any CRL algorithm. **The output of a curriculum is an argument of ``update``, never agent state**.
+The cost limits are a vector [k], may be infinite, and change between updates. Arguments and results are NumPy
+arrays, not tensors.
 
 Notation: T steps, B environments, k costs, E episodes finished in the rollout, M of its steps truncated.
 """
@@ -24,8 +24,8 @@ class Rollout:
     """T steps of B environments, collected under one policy.
 
     Attributes:
-        observations: what the policy saw, float32 [T, B, n].
-        actions: what it did: int64 [T, B] (categorical) or float32 [T, B, m] (Gaussian, before clipping).
+        observations: float32 [T, B, n].
+        actions: int64 [T, B] (categorical) or float32 [T, B, m] (Gaussian, before clipping).
         rewards: float64 [T, B].
         costs: float64 [T, B, k].
         terminated: the step ended an episode for good (value afterwards is 0), bool [T, B].
@@ -33,8 +33,8 @@ class Rollout:
             [T, B]; never true where ``terminated`` is.
         final_observations: the true last observations of the truncated steps, in row-major order of
             ``truncated``, float32 [M, n].
-        last_observations: what the policy would see next, float32 [B, n]; bootstraps the episodes that
-            the end of the rollout cuts.
+        last_observations: the observations after the rollout, float32 [B, n]; they bootstrap the unfinished
+            episodes.
         carried_costs: undiscounted costs so far of the episodes that were under way when the rollout began,
             float64 [B, k].
         carried_lengths: steps so far of those episodes, int64 [B].
@@ -52,7 +52,7 @@ class Rollout:
     carried_lengths: npt.NDArray[np.int64]
 
     def finished_lengths(self) -> npt.NDArray[np.int64]:
-        """Steps of the E episodes that ended in the rollout, those before it included, [E], by (t, b)."""
+        """Lengths of the E episodes that ended in the rollout, earlier steps included, [E], by (t, b)."""
         ended = self.terminated | self.truncated
         lengths = np.empty(ended.shape, np.int64)
         so_far = self.carried_lengths.copy()
@@ -64,7 +64,7 @@ class Rollout:
 
 
 class Policy(Protocol):
-    """Whatever chooses actions: all that collecting experience needs to know of an agent."""
+    """A policy that can collect experience: the only part of an agent that a collector needs."""
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
@@ -73,7 +73,7 @@ class Policy(Protocol):
 
 @runtime_checkable
 class DiscretePolicy(Protocol):
-    """A policy that can say how probable each of a finite number of actions is; agents may have it."""
+    """A policy with action probabilities, for a finite number of actions; optional for agents."""
 
     def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
         """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
@@ -82,27 +82,27 @@ class DiscretePolicy(Protocol):
 
 @runtime_checkable
 class InvertedPolicy(Policy, Protocol):
-    """A policy that draws one of A actions by inversion and shows its masses; agents may have it.
+    """A policy that samples one of A actions by inversion; optional for agents.
 
-    With it, experience of a finite CMDP is collected from a table of the policy, not observation by
-    observation, and is the same.
+    With it, a finite CMDP is stepped from a table of the policy, not observation by observation. The results
+    are equal.
     """
 
     def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """At each of B observations [B, n] the actions' probabilities summed up, in any unit, float64 [B, A].
+        """Return cumulative, unnormalised action probabilities at B observations [B, n], float64 [B, A].
 
-        ``act`` draws B numbers u by ``generator.random(B)`` and takes the first action a whose cumulative
-        mass exceeds u times the whole.
+        ``act`` draws B numbers u by ``generator.random(B)``. It takes the first action whose cumulative mass
+        exceeds u times the total.
         """
         ...
 
 
 @runtime_checkable
 class EntropyRewarded(Protocol):
-    """An agent whose ``update`` obeys ``CurriculumStep.entropy_coefficient``; agents may be it.
+    """An agent whose ``update`` uses ``CurriculumStep.entropy_coefficient``; optional for agents.
 
     Attributes:
-        learns_rewarded_entropy: any value; that the attribute is there says so.
+        learns_rewarded_entropy: a marker; its value is not used.
     """
 
     learns_rewarded_entropy: ClassVar[bool]
@@ -112,7 +112,7 @@ class FinalPolicy(Policy, Protocol):
     """A policy that is evaluated: stochastic as it was trained, or by its mode."""
 
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
-        """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        """Return the policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         ...
 
 
@@ -133,13 +133,13 @@ class Agent(FinalPolicy, Protocol):
 
         Args:
             rollout: T x B steps collected with the current policy.
-            episode_costs: undiscounted costs of the episodes that finished in it, [E, k]; E may be 0,
-                and then nothing is known about the constraints: what depends on them waits.
-            step: what the curriculum asks for this update. Its limits may be infinite. Its policy noise is in
-                the policy already (``add_noise``). ``EntropyRewarded`` agents obey its entropy coefficient.
+            episode_costs: undiscounted costs of the episodes that finished in it, [E, k]. With E = 0 nothing
+                is known about the constraints, and steps that depend on them are skipped.
+            step: the curriculum's output for this update. Its limits may be infinite. Its policy noise has
+                already been added (``add_noise``). ``EntropyRewarded`` agents use its entropy coefficient.
 
         Returns:
-            Metrics, finite or NaN; every update of an agent returns the same keys.
+            Metrics, finite or NaN; the keys are the same in every update.
         """
         ...
 
@@ -151,12 +151,12 @@ class Agent(FinalPolicy, Protocol):
             observations: states at which the policy's randomness is measured, [N, n].
 
         Returns:
-            What was done, as metrics; the same keys every time.
+            Metrics of the change; the keys are always the same.
         """
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """All learnt and adaptive state: a tree of dicts, lists, JSON scalars and NumPy arrays."""
+        """Return all learnt and adaptive state: a tree of dicts, lists, JSON scalars and NumPy arrays."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

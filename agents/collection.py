@@ -1,13 +1,13 @@
-"""Collecting experience: T steps of B environments under one policy.
+"""Collect experience: T steps of B environments under one policy.
 
-Knows no algorithm and no limits. Between two calls it keeps the current observations and the sums of the
-episodes under way, so episodes go on across rollouts; ``state_dict`` holds both and a resumed collector
-continues exactly. The environments' own state and the generator's are the caller's to save.
+Independent of algorithms and limits. Between two calls it keeps the current observations and the sums of the
+running episodes, so episodes go on across rollouts. ``state_dict`` holds both, and a resumed collector
+continues exactly. The caller saves the states of environments and generator.
 
-Where an episode is longer than a rollout, environments that all begin together also end together: most
-rollouts would finish no episode, and each would see one part of an episode only. With ``staggered`` the first
-episodes are cut short at evenly spread lengths, each at the end of a rollout, so that from then on every
-rollout finishes its share of the episodes. A cut episode is learnt from but is not a finished episode.
+If episodes are longer than a rollout, environments that begin together also end together. Most rollouts would
+finish no episode, and each would contain only one part of an episode. With ``staggered`` the first episodes
+are cut at evenly spread lengths, each at the end of a rollout. From then on every rollout finishes its share
+of the episodes. The agent learns from a cut episode, but it does not count as finished.
 
 Notation: T steps, B environments, k costs, n observation components, E finished episodes, M truncated steps.
 """
@@ -47,13 +47,13 @@ class FinishedEpisode:
 
 
 class Collector:
-    """Steps a batch of environments with a policy.
+    """Collector that steps a batch of environments with a policy.
 
     Args:
         environments: B environments of one task.
         num_steps: T, steps a rollout takes in each environment, at least 1.
-        staggered: spread the environments over an episode's steps at the start, where the task has a horizon
-            of more than T steps.
+        staggered: spread the environments over an episode's steps at the start, if the task's horizon exceeds
+            T steps.
     """
 
     def __init__(self, environments: CMDPVectorEnv, *, num_steps: int, staggered: bool = False) -> None:
@@ -83,7 +83,7 @@ class Collector:
         """Take T steps in each environment.
 
         Args:
-            policy: what acts.
+            policy: selects the actions.
             generator: the policy's randomness.
 
         Returns:
@@ -100,7 +100,7 @@ class Collector:
             isinstance(environments, FiniteVectorEnv)
             and environments.follows_tables
             and isinstance(policy, InvertedPolicy)
-            # With more states than samples, the table is more work than the rollout.
+            # With more states than samples, the table would take longer than the rollout.
             and environments.finite_cmdp().num_states <= self._num_steps * environments.num_envs
         ):
             rollout = self._collect_by_table(environments, policy, generator)
@@ -111,7 +111,7 @@ class Collector:
         return rollout, self._finished(rollout)
 
     def _stagger(self) -> None:
-        """Cut the first episodes of the environments whose turn it is: group j of J before rollout j."""
+        """Cut the first episodes of one group of environments: group j of J before rollout j."""
         stage, num_envs = self._rollouts, self._environments.num_envs
         if not 0 < stage < self._stages:
             return
@@ -123,7 +123,7 @@ class Collector:
             self._forget(turn)
 
     def _forget(self, index: slice | npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> None:
-        """Start the sums of some environments' episodes from 0."""
+        """Reset the sums of some environments' episodes to 0."""
         self._lengths[index] = 0
         self._returns[index] = 0.0
         self._costs[index] = 0.0
@@ -131,7 +131,7 @@ class Collector:
     def _collect_by_observation(
         self, current: npt.NDArray[np.float32], policy: Policy, generator: np.random.Generator
     ) -> Rollout:
-        """Ask the policy at each observation [B, n], beginning with the current ones."""
+        """Call the policy at each observation [B, n], beginning with the current ones."""
         environments, cmdp = self._environments, self._environments.cmdp
         shape = (self._num_steps, environments.num_envs)
         observations = np.empty((*shape, observation_size(cmdp.observation_space)), dtype=np.float32)
@@ -173,7 +173,7 @@ class Collector:
     def _collect_by_table(
         self, environments: FiniteVectorEnv, policy: InvertedPolicy, generator: np.random.Generator
     ) -> Rollout:
-        """Ask the policy once for every state; equal to the other way, and many times as fast."""
+        """Call the policy once for every state; the results are the same, and it is many times as fast."""
         observations = environments.observations
         draws = generator.random((self._num_steps, environments.num_envs))
         steps = environments.follow(policy.cumulative_masses(observations), draws)
@@ -191,7 +191,7 @@ class Collector:
         )
 
     def _finished(self, rollout: Rollout) -> tuple[FinishedEpisode, ...]:
-        """The episodes that ended in the rollout, and the sums of those under way brought up to date."""
+        """Return the episodes that ended in the rollout, and update the sums of the running ones."""
         ended = rollout.terminated | rollout.truncated
         lengths = np.empty(ended.shape, np.int64)
         returns, costs = np.empty_like(rollout.rewards), np.empty_like(rollout.costs)
@@ -210,7 +210,7 @@ class Collector:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The current observations and the sums of the episodes under way."""
+        """Return the current observations and the sums of the running episodes."""
         if self._observations is None:
             raise RuntimeError("a collector has no state before it is reset")
         return {
@@ -225,7 +225,7 @@ class Collector:
         """Continue exactly where ``state_dict`` was taken.
 
         Raises:
-            ValueError: the state is of another number of environments or costs.
+            ValueError: the state has another number of environments or costs.
         """
         if state["costs"].shape != self._costs.shape:
             raise ValueError(
@@ -240,5 +240,5 @@ class Collector:
 
 
 def episode_costs(episodes: tuple[FinishedEpisode, ...], num_costs: int) -> npt.NDArray[np.float64]:
-    """The costs of finished episodes as ``Agent.update`` takes them, [E, k]; E may be 0."""
+    """Return the costs of finished episodes for ``Agent.update``, [E, k]; E may be 0."""
     return np.array([episode.costs for episode in episodes], dtype=np.float64).reshape(-1, num_costs)

@@ -1,19 +1,19 @@
-"""What an agent's networks see of an observation: its numbers, and features that they would not learn.
+"""Encoding of observations for an agent's networks: proximity features and normalisation.
 
-Proximity. A lidar number v says how near the closest object of a kind is in one direction: it is at the
-distance (1 - v) r, r the lidar's range, and v = 0 where nothing is in range. Safety Gym's range is 3 m and
-its hazards have a radius of 0.2 m, so all that matters for the cost happens in the last 7% of v, in any of 16
-directions. A perceptron that is fitted to raw values predicts nothing of the cost to come. So for each lidar
-number and each length scale l the networks also see
+Proximity. A lidar number v belongs to one direction: the closest object of a kind is at the distance (1 - v)
+r, r the lidar's range; v = 0 if nothing is in range. Safety Gym's range is 3 m and its hazards have a radius
+of 0.2 m, so only the last 7% of v, in any of 16 directions, affect the cost. A perceptron that is fitted to
+raw values does not predict future cost. So for each lidar number and each length scale l the networks also
+receive
 
     exp(-(1 - v) r / l)    for v > 0,    0 for v = 0.
 
-Which numbers are a lidar, and its range, is what the task declares (``CMDPSpec.components``); without such a
-declaration, or with ``encoder: none``, networks see observations as they are.
+The task declares which numbers are a lidar, and its range (``CMDPSpec.components``). Without this, or with
+``encoder: none``, there are no such features.
 
 Normalisation. With ``normalise_observations`` each number is standardised by its mean and standard deviation
-over all observations of training so far, and clipped. The statistics are updated after each policy update,
-so that a rollout is learnt from as it was acted on; a policy that does not learn keeps them.
+over all observations of training so far, and clipped. The statistics are updated after each policy update, so
+that acting and learning on a rollout use the same ones. Evaluation does not change them.
 
 Notation: N observations, n numbers in each, L lidar numbers, S length scales.
 """
@@ -35,7 +35,7 @@ Rows = npt.NDArray[np.float32]
 CLIP = 10.0
 """Standard deviations beyond which a normalised number is clipped."""
 SMALLEST_VARIANCE = 1e-8
-"""Added to variances, so that a number that never changes becomes 0."""
+"""Added to variances, so that a constant number becomes 0."""
 
 
 class RunningMoments:
@@ -60,7 +60,7 @@ class RunningMoments:
         self._count = total
 
     def standardised(self, observations: Rows) -> Rows:
-        """Observations [N, n] minus the mean, over the standard deviation, clipped to +-10."""
+        """Return (observations [N, n] - mean) / standard deviation, clipped to +-10."""
         if self._count == 0:
             return observations
         spread = np.sqrt(self._scatter / self._count + SMALLEST_VARIANCE)
@@ -68,7 +68,7 @@ class RunningMoments:
         return clipped.astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
-        """The count, the means and the sums of squared deviations."""
+        """Return the count, the means and the sums of squared deviations."""
         return {"count": self._count, "mean": self._mean.copy(), "scatter": self._scatter.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -79,16 +79,16 @@ class RunningMoments:
 
 
 class Encoder:
-    """Turns observations into what the networks see; the module's docstring says how.
+    """Encoder of observations for the networks; see the module's docstring.
 
     Args:
         num_observations: n.
-        components: the parts of an observation as the task declares them; none if it does not.
+        components: the declared slices of an observation; empty if the task declares none.
         scales: length scales l of the proximity features in metres, each above 0; none for no features.
         normalise: whether to standardise observations by running statistics.
 
     Attributes:
-        size: numbers that the networks see, n + S L.
+        size: number of inputs of the networks, n + S L.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Encoder:
             self._moments.add(observations)
 
     def state_dict(self) -> dict[str, Any]:
-        """The running statistics; empty without normalisation."""
+        """Return the running statistics; empty without normalisation."""
         return {} if self._moments is None else self._moments.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -132,7 +132,7 @@ class Encoder:
 
 
 def lidar_numbers(components: Sequence[ObservationComponent]) -> tuple[npt.NDArray[np.intp], Floats]:
-    """The places of all lidar numbers in an observation, [L], and the range of each in metres, [L].
+    """Return the indices of all lidar numbers in an observation, [L], and their ranges in metres, [L].
 
     >>> parts = (ObservationComponent("speed", 2), ObservationComponent("walls", 2, lidar_range=3.0))
     >>> [values.tolist() for values in lidar_numbers(parts)]
@@ -146,16 +146,16 @@ def lidar_numbers(components: Sequence[ObservationComponent]) -> tuple[npt.NDArr
 
 
 class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """The proximity features as a Gymnasium wrapper, for agents of other libraries.
+    """Gymnasium wrapper with the proximity features, for agents of other libraries.
 
     Args:
-        environment: its observations are vectors, and its ``observation_components`` say which of their
-            numbers are a lidar, as those of ``recrl.environments.safety_gym.environments`` do.
-        components: the parts of an observation, for an environment that does not declare them.
+        environment: its observations are vectors, and its ``observation_components`` declare the lidars, as
+            in ``recrl.environments.safety_gym.environments``.
+        components: the slices of an observation, for an environment that does not declare them.
         scales: length scales in metres.
 
     Raises:
-        ValueError: nothing is declared to be a lidar.
+        ValueError: no lidar is declared.
     """
 
     def __init__(

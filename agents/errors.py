@@ -1,4 +1,4 @@
-"""What can go wrong in an agent, named after the user's question."""
+"""Errors of agents."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 
 class DivergedError(ArithmeticError):
-    """Learning broke down: a loss, an advantage or a parameter is no longer a finite number."""
+    """Learning diverged: a loss, an advantage or a parameter is not a finite number."""
 
 
 class NetworkError(ValueError):
-    """A user's network that cannot be what the agent needs."""
+    """A user's network that does not meet the requirements."""
 
 
 class UnsupportedSpaceError(ValueError):
@@ -21,7 +21,7 @@ class UnsupportedSpaceError(ValueError):
 
 
 def require_finite(what: str, values: float | npt.NDArray[np.floating]) -> None:
-    """Stop at the first non-finite number, and say where it is.
+    """Raise an error if a number is not finite.
 
     Args:
         what: plural name of the values for the message, for example ``policy parameters``.

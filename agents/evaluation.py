@@ -1,7 +1,7 @@
-"""Frozen-policy evaluation: what a policy earns and costs when it no longer learns, and how it looks.
+"""Evaluation and filming of a policy without learning.
 
-Episodes are counted per environment, not in the order in which they end: taking the first that end would
-favour short ones, and on RiverGrid short means good.
+Episodes are counted per environment, not in the order in which they end. The first ones to end would be
+biased to short episodes, which on RiverGrid are good ones.
 
 Notation: B environments, k costs, n observation components.
 """
@@ -29,7 +29,7 @@ MAX_FILMED_STEPS = 10_000
 
 
 class FrozenPolicy(StrEnum):
-    """How a frozen policy chooses: as it was trained, or by its mode."""
+    """How an evaluated policy acts: stochastically as in training, or by its mode."""
 
     STOCHASTIC = "stochastic"
     DETERMINISTIC = "deterministic"
@@ -56,13 +56,13 @@ def evaluate(
     num_episodes: int,
     seed: np.random.SeedSequence,
 ) -> tuple[FinishedEpisode, ...]:
-    """Run a frozen policy for a number of whole episodes.
+    """Run a policy without learning for a number of whole episodes.
 
     Args:
         actor: chooses the actions.
         environments: B fresh environments; they are reset here.
         policy: stochastic or deterministic.
-        num_episodes: at least 0; each environment runs its equal share, the first ones one more.
+        num_episodes: at least 0; divided equally among the environments, the first ones run one more.
         seed: of the environments and of the policy's randomness.
 
     Returns:
@@ -92,7 +92,7 @@ def evaluate(
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One picture of a filmed episode.
+    """One frame of a filmed episode.
 
     Attributes:
         picture: RGB, uint8 [height, width, 3].
@@ -116,22 +116,21 @@ def film(
     seed: np.random.SeedSequence,
     every: int = 1,
 ) -> Iterator[Shot]:
-    """Look at a frozen policy for an episode: before the first step, and as it goes on.
+    """Film one episode of a policy without learning, from before the first step.
 
     Args:
         actor: chooses the actions.
-        environment: one that draws itself and reports ``info["cost"]``, as ``registry.make_drawn`` gives it.
+        environment: a rendering environment with ``info["cost"]``, for example of ``registry.make_drawn``.
         policy: stochastic or deterministic.
         num_costs: k.
         seed: of the environment and of the policy's randomness.
-        every: steps from one shot to the next, at least 1; drawing may take longer than all else.
+        every: steps from one frame to the next, at least 1; rendering may take longer than all else.
 
     Yields:
-        Shots, that of the last step included; none after ``MAX_FILMED_STEPS`` steps, should the episode not
-        have ended.
+        Shots, the last step included; none after ``MAX_FILMED_STEPS`` steps, even if the episode goes on.
 
     Raises:
-        ValueError: what the environment draws is no picture.
+        ValueError: the environment does not render an RGB frame.
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
@@ -157,11 +156,11 @@ def _picture(environment: gymnasium.Env[Any, Any]) -> npt.NDArray[np.uint8]:
     drawn: Any = environment.render()
     if not (isinstance(drawn, np.ndarray) and drawn.dtype == np.uint8 and drawn.shape[2:] == (3,)):
         kind = f"{drawn.dtype} {drawn.shape}" if isinstance(drawn, np.ndarray) else type(drawn).__name__
-        raise ValueError(f"a picture must be uint8 of shape [height, width, 3], got {kind}")
+        raise ValueError(f"a frame must be uint8 of shape [height, width, 3], got {kind}")
     picture: npt.NDArray[np.uint8] = drawn
     return picture
 
 
 def _spawned(seed: np.random.SeedSequence) -> list[np.random.SeedSequence]:
-    """Seeds of the environments and of the policy; the same however often they are asked for."""
+    """Return the seeds of the environments and of the policy; equal in every call."""
     return np.random.SeedSequence(entropy=seed.entropy, spawn_key=seed.spawn_key).spawn(2)

@@ -1,4 +1,4 @@
-"""What an agent knows after a rollout: its samples, what they were worth, and how the constraints stand.
+"""Experience of a rollout: samples, advantages and constraints.
 
 Notation: N samples, k costs, D unique pairs, E finished episodes, j of the k limits are finite.
 """
@@ -23,7 +23,7 @@ from recrl.environments.cmdp import Floats
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """What is known about the constraints after a rollout.
+    """Estimates of the constraints after a rollout.
 
     Attributes:
         limits: d, [k], possibly infinite.
@@ -51,7 +51,7 @@ class Constraints:
         Args:
             costs: undiscounted costs of the episodes, [E, k].
             lengths: their steps, [E].
-            values: what is constrained, [k]; NaN if E is 0.
+            values: the constrained values, [k]; NaN if E is 0.
             limits: d, [k].
         """
         gaps = np.where(np.isfinite(limits), values - limits, -np.inf)
@@ -69,7 +69,7 @@ class ActiveConstraints:
     """The constraints whose limits are finite, j of k.
 
     Attributes:
-        index: which they are, [j].
+        index: their indices, [j].
         violations: c, (constrained value - limit) / mean episode length, [j].
     """
 
@@ -78,14 +78,14 @@ class ActiveConstraints:
 
     @classmethod
     def of(cls, constraints: Constraints) -> ActiveConstraints:
-        """Those of ``constraints``, in the unit of the surrogates: cost per step."""
+        """Return the finite constraints, in the unit of the surrogates: cost per step."""
         index = np.flatnonzero(np.isfinite(constraints.limits))
         return cls(index, constraints.gaps[index] / constraints.episode_length)
 
 
 @dataclass(frozen=True, eq=False)
 class Experience:
-    """What a policy is improved by.
+    """Data for improving a policy.
 
     Attributes:
         batch: the samples, or a minibatch of them.
@@ -109,13 +109,13 @@ class Experience:
         advantages: Floats,
         constraints: Constraints,
     ) -> Experience:
-        """The experience of a policy that has not moved since it collected the samples."""
+        """Return the experience of the policy that collected the samples, before it changes."""
         old = policy.distribution(batch.unique_observations)
         log_probs = old.log_prob(batch.actions, batch.pair_observations)
         return cls(batch, old, log_probs, advantages, constraints)
 
     def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
-        """Minibatches without end, as ``LearningBatch.parts`` makes them; itself where there is one part."""
+        """Yield the minibatches of ``LearningBatch.parts``; the experience itself if there is one."""
         for part in self.batch.parts(size, generator):
             if part.samples is None:
                 yield self
@@ -130,11 +130,11 @@ class Experience:
         return torch.exp(log_probs - self.old_log_probs)
 
     def with_entropy(self, coefficient: float) -> Experience:
-        """The same, where the policy's entropy at every observation it saw is worth a reward.
+        """Return the experience with a reward for the policy's entropy at every observation.
 
-        At the policy that collected the samples, the gradient of the entropy is that of a surrogate whose
-        advantages are -log pi(a | s) - H(pi(. | s)): what was less likely than it might be is worth more.
-        They are added to the reward's, so that every agent climbs both, whatever it makes of advantages.
+        At the policy that collected the samples, the gradient of the entropy is that of a surrogate with the
+        advantages -log pi(a | s) - H(pi(. | s)). They are positive for unlikely actions. They are added to
+        the reward's, so that every agent ascends both.
 
         Args:
             coefficient: reward per nat, at least 0.
@@ -148,7 +148,7 @@ class Experience:
         return replace(self, advantages=advantages)
 
     def in_reward_spreads(self) -> tuple[Floats, Floats, Floats]:
-        """Centred advantages and violations, in standard deviations of the reward's advantages.
+        """Return centred advantages and violations, in standard deviations of the reward's advantages.
 
         Returns:
             Of the reward, [N]; of the costs that have a limit, [N, j]; and their violations c, [j].

@@ -1,4 +1,4 @@
-"""How the two presets differ: every option of every agent whose value in ``paper`` is not ours.
+"""Differences between the two presets: all options of agents whose value in ``paper`` is not ours.
 
 python -m recrl.agents.presets     prints the table of the README
 """
@@ -14,13 +14,13 @@ from recrl.agents.registry import AGENTS, agent_config
 
 @dataclass(frozen=True)
 class Deviation:
-    """One option that the presets set differently.
+    """An option with different values in the presets.
 
     Attributes:
-        option: the field that switches it.
-        recommended: its value there, as JSON.
+        option: name of the field.
+        recommended: its value in this preset, as JSON.
         paper: likewise.
-        agents: who have it with these values.
+        agents: the agents with these values.
     """
 
     option: str
@@ -30,7 +30,7 @@ class Deviation:
 
 
 def deviations() -> tuple[Deviation, ...]:
-    """All of them, in the order of the options."""
+    """Return all deviations, in the order of the options."""
     found: dict[tuple[str, str, str], list[str]] = {}
     for agent in AGENTS:
         ours, theirs = (options_of(agent, preset) for preset in ("recommended", "paper"))
@@ -41,7 +41,7 @@ def deviations() -> tuple[Deviation, ...]:
 
 
 def options_of(agent: str, preset: str) -> dict[str, Any]:
-    """Every option of an agent under a preset but the preset itself, as JSON values."""
+    """Return every option of an agent under a preset except the preset itself, as JSON values."""
     return agent_config(agent, {"preset": preset}).model_dump(mode="json", exclude={"preset"})
 
 

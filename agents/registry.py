@@ -1,8 +1,8 @@
-"""Every agent by name: its settings, and how to build it.
+"""Every agent by name: its options and its constructor.
 
 A name is one of ``AGENTS``, an entry point in the group ``recrl.agents``, or an import path
-``package.module:attribute``; what the last two lead to is an ``AgentEntry``. Importing this imports no torch:
-an agent's own module is loaded when one is made.
+``package.module:attribute``; the last two refer to an ``AgentEntry``. This module does not import torch: an
+agent's module is imported when one is made.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from recrl.environments.plugins import load_attribute, resolve
 
 @dataclass(frozen=True)
 class AgentEntry:
-    """How to build one agent.
+    """Entry of one agent.
 
     Attributes:
-        summary: one sentence for people who choose an agent.
+        summary: one sentence of description.
         config: a frozen pydantic model of its options.
         make: callable (cmdp, config, seed) -> Agent, or the import path of one.
     """
@@ -68,7 +68,7 @@ AGENTS: dict[str, AgentEntry] = {
         "recrl.agents.algorithms.focops:make_focops",
     ),
     "p3o": AgentEntry(
-        "Penalised proximal policy optimisation: an exact penalty, nothing to adapt.",
+        "Penalised proximal policy optimisation: an exact penalty with a constant factor.",
         P3OConfig,
         "recrl.agents.algorithms.p3o:make_p3o",
     ),
@@ -88,12 +88,12 @@ AGENTS: dict[str, AgentEntry] = {
         "recrl.agents.algorithms.trpo_lag:make_trpo_lag",
     ),
     "ppo": AgentEntry(
-        "PPO, which knows no constraint: a control.",
+        "PPO without constraints: a control.",
         PPOConfig,
         "recrl.agents.algorithms.ppo:make_ppo",
     ),
     "trpo": AgentEntry(
-        "TRPO, which knows no constraint: a control.",
+        "TRPO without constraints: a control.",
         TRPOConfig,
         "recrl.agents.algorithms.trpo:make_trpo",
     ),
@@ -101,11 +101,11 @@ AGENTS: dict[str, AgentEntry] = {
 
 
 def find_agent(name: str) -> AgentEntry:
-    """The agent called ``name``.
+    """Return the entry of the agent called ``name``.
 
     Raises:
-        UnknownNameError: nobody provides it; the message names the nearest known agent.
-        ValueError: what the name leads to is not an AgentEntry.
+        UnknownNameError: the name is not known; the message names the nearest known agent.
+        ValueError: the named object is not an AgentEntry.
     """
     found = resolve(name, kind="agent", group="recrl.agents", ours=AGENTS)
     if not isinstance(found, AgentEntry):
@@ -114,23 +114,23 @@ def find_agent(name: str) -> AgentEntry:
 
 
 def agent_config(name: str, options: Mapping[str, Any]) -> BaseModel:
-    """The validated options of an agent, preset and defaults filled in; ``model_dump`` of it is canonical.
+    """Return the validated options of an agent with preset and defaults; their ``model_dump`` is canonical.
 
     Raises:
-        UnknownNameError: nobody provides the agent.
+        UnknownNameError: the agent is not known.
         pydantic.ValidationError: all mistakes in the options at once.
     """
     return find_agent(name).config.model_validate(dict(options))
 
 
 def make_agent(name: str, cmdp: CMDPSpec, options: Mapping[str, Any], seed: np.random.SeedSequence) -> Agent:
-    """A fresh agent for a task; the same seed gives every agent with the same networks the same policy.
+    """Make a new agent for a task; with the same networks and seed, all have the same initial policy.
 
     Args:
         name: a name of ours, an entry point's name, or ``package.module:attribute``.
-        cmdp: what the task fixes.
+        cmdp: the task's CMDP.
         options: the agent's settings.
-        seed: of its initial parameters and of whatever randomness it needs later.
+        seed: of its initial parameters and its later randomness.
     """
     entry = find_agent(name)
     make = load_attribute(entry.make) if isinstance(entry.make, str) else entry.make

@@ -1,8 +1,8 @@
-"""What can be set of groups of agents, where the numbers come from, and the two presets.
+"""Options of groups of agents with their sources, and the two presets.
 
 ``recommended`` is every field's default. ``paper`` is safety-starter-agents' setting, which the paper took
 over unchanged; it assumes rollouts of 30,000 steps (``rollout_steps`` x ``num_envs`` of the trial). Options
-given beside ``preset`` override its values. Imports no torch, so that a grid is validated in a moment.
+given together with ``preset`` override its values. Without torch, so that validating a grid is fast.
 """
 
 from __future__ import annotations
@@ -50,14 +50,15 @@ STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
 
 
 class ActorCriticConfig(BaseModel):
-    """Settings that all agents with a policy and 1 + k critics share."""
+    """Settings of all agents with a policy and 1 + k critics."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     paper: ClassVar[Mapping[str, Any]] = STARTER_AGENTS_SETTING
 
     preset: Literal["recommended", "paper"] = Field(
         default="recommended",
-        description="Where unset options come from: ours, or safety-starter-agents' as used in the paper.",
+        description="Source of unset options: recommended (ours), or paper "
+        "(safety-starter-agents, as used in the paper).",
     )
     hidden_sizes: Annotated[tuple[Width, ...], Field(max_length=8)] = Field(
         default=(64, 64),
@@ -65,26 +66,27 @@ class ActorCriticConfig(BaseModel):
     )
     activation: Literal["tanh", "relu", "elu", "silu", "gelu"] = Field(
         default="tanh",
-        description="Function between the layers (paper tanh). tanh is the fastest.",
+        description="Activation between the layers (paper tanh). tanh is the fastest.",
     )
     network: Annotated[str, Field(pattern=IMPORT_PATH)] | None = Field(
         default=None,
-        description="Import path package.module:function of a network of your own: the function takes the "
-        "numbers of inputs and outputs and returns a torch.nn.Module from [U, inputs] to [U, outputs]; it "
-        "makes the policy and every critic. hidden_sizes, activation and initialisation are then not used.",
+        description="Import path package.module:function of your own network. The function takes "
+        "the numbers of inputs and outputs and returns a torch.nn.Module from [U, "
+        "inputs] to [U, outputs]. It makes the policy and every critic. Then "
+        "hidden_sizes, activation and initialisation are not used.",
     )
     initialisation: Literal["orthogonal", "xavier"] = Field(
-        default="orthogonal", description="How weights begin (ours; paper xavier)."
+        default="orthogonal", description="Initialisation of the weights (ours; paper xavier)."
     )
     last_layer_scale: Positive = Field(
         default=0.01,
-        description="Factor on the policy's last initial weights, so that it begins nearly uniform "
-        "(Andrychowicz et al. 2021; paper 1).",
+        description="Factor on the initial weights of the policy's last layer, so that it begins "
+        "nearly uniform (Andrychowicz et al. 2021; paper 1).",
     )
     encoder: Literal["proximity", "none"] = Field(
         default="proximity",
-        description="What networks see beside the observation: where a task declares a lidar, features that "
-        "resolve small distances (ours), or nothing (paper).",
+        description="Additional inputs of the networks: proximity, features of the task's lidars "
+        "that resolve small distances (ours); or none (paper).",
     )
     proximity_scales: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=8)] = Field(
         default=(0.15, 0.4),
@@ -94,52 +96,57 @@ class ActorCriticConfig(BaseModel):
         default=False,
         description="Standardise observations by their running mean and standard deviation (ours).",
     )
-    discount: Share = Field(default=0.99, description="gamma of the critics, per step (paper).")
+    discount: Share = Field(default=0.99, description="Discount gamma of the critics, per step (paper).")
     reward_trace_decay: Share = Field(
-        default=0.9, description="lambda of the reward's advantages (ours; paper 0.97)."
+        default=0.9, description="GAE lambda of the reward's advantages (ours; paper 0.97)."
     )
     cost_trace_decay: Share = Field(
-        default=0.9, description="lambda of the costs' advantages (ours; paper 0.97)."
+        default=0.9, description="GAE lambda of the costs' advantages (ours; paper 0.97)."
     )
-    critic_learning_rate: Positive = Field(default=1e-3, description="Adam's, for the critics (paper).")
+    critic_learning_rate: Positive = Field(
+        default=1e-3, description="Learning rate of the critics' Adam (paper)."
+    )
     minibatch_size: Count | None = Field(
         default=1024,
-        description="Samples of a gradient step where a rollout has more distinct observations than that; "
-        "null for all (ours; paper: all).",
+        description="Minibatch size, if a rollout has more distinct observations; null for all "
+        "(ours; paper: all).",
     )
-    critic_steps: Count = Field(default=40, description="Steps of the critics an update (ours; paper 80).")
+    critic_steps: Count = Field(
+        default=40, description="Gradient steps of the critics per update (ours; paper 80)."
+    )
     critic_passes: Count = Field(
         default=5,
-        description="Passes of the critics over the samples an update, where these are more steps than "
-        "critic_steps (ours).",
+        description="Epochs of the critics per update, if these are more steps than critic_steps (ours).",
     )
     constraint: Literal["mean", "cvar"] = Field(
         default="mean",
-        description="What of an episode's cost is constrained: its mean (paper), or its mean in the worst "
-        "episodes, the conditional value at risk (named by the paper as an extension).",
+        description="Constrained measure of the episode cost: mean (paper), or cvar, the "
+        "conditional value at risk (suggested by the paper). It is the mean of the "
+        "worst episodes.",
     )
     cvar_level: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
         default=0.9,
-        description="alpha of the CVaR, which is the mean of the worst share 1 - alpha of the episodes; only "
-        "with the constraint cvar (ours).",
+        description="alpha of the CVaR, which is the mean of the worst fraction 1 - alpha of the "
+        "episodes; only with the constraint cvar (ours).",
     )
     constraint_window: Count = Field(
         default=16,
-        description="Episodes, at least, from which a mean cost is estimated: where fewer finish in an "
-        "update, those of the updates before it count as well (ours).",
+        description="Least number of episodes for a mean cost. If fewer finish in an update, "
+        "those of earlier updates are included (ours).",
     )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",
-        description="What critics learn: advantage plus value (ours), or the bootstrapped discounted "
-        "reward-to-go (paper).",
+        description="Targets of the critics: advantage plus value (ours), or the bootstrapped "
+        "discounted reward-to-go (paper).",
     )
     value_scale: Literal["running", "none"] = Field(
         default="running",
-        description="Whether critics learn their targets divided by the targets' running root mean square, "
-        "so that the size of rewards and costs does not matter (ours), or the targets themselves (paper).",
+        description="Whether critics learn targets divided by their running root mean square "
+        "(ours), which makes the scale of rewards and costs irrelevant, or raw "
+        "targets (paper).",
     )
     target_kl: Positive = Field(
-        default=0.01, description="Size of the trust region, mean KL in nats an update (paper)."
+        default=0.01, description="Size of the trust region, mean KL in nats per update (paper)."
     )
     policy_average: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
         default=0.9,
@@ -149,8 +156,9 @@ class ActorCriticConfig(BaseModel):
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",
-        description="What policy noise does: make the policy as random as its mixture with a uniform one, or "
-        "divide logits (multiply standard deviations) by 1 / (1 - noise) (ours; the paper is silent).",
+        description="Meaning of policy noise (ours; the paper does not define it). match-mixture: "
+        "make the policy as random as its mixture with a uniform one. temperature: "
+        "divide logits or multiply standard deviations by 1 / (1 - noise).",
     )
     compaction: bool = Field(
         default=True,
@@ -166,25 +174,26 @@ class ActorCriticConfig(BaseModel):
 
 
 class AscentConfig(ActorCriticConfig):
-    """Settings of agents that climb an objective by Adam until the policy has moved far enough."""
+    """Settings of agents that ascend an objective by Adam until the KL is too large."""
 
     paper: ClassVar[Mapping[str, Any]] = {**STARTER_AGENTS_SETTING, **STARTER_AGENTS_ASCENT}
 
     target_kl: Positive = Field(
         default=0.02,
-        description="Size of the trust region, mean KL in nats an update (ours; paper 0.01).",
+        description="Size of the trust region, mean KL in nats per update (ours; paper 0.01).",
     )
     policy_learning_rate: Positive = Field(
         default=5e-4,
-        description="Adam's, for the policy; the KL keeps it in bounds (ours; paper 3e-4).",
+        description="Learning rate of the policy's Adam; the KL bounds the change (ours; paper 3e-4).",
     )
     policy_steps: Count = Field(
-        default=20, description="Steps of the policy an update; the KL may stop it before (ours; paper 80)."
+        default=20,
+        description="Gradient steps of the policy per update; the KL may stop it earlier (ours; paper 80).",
     )
     policy_passes: Count = Field(
         default=10,
-        description="Passes of the policy over the samples an update, where these are more steps than "
-        "policy_steps; the KL may stop it before (ours).",
+        description="Epochs of the policy per update, if these are more steps than policy_steps; "
+        "the KL may stop it earlier (ours).",
     )
     stop_kl_factor: Positive = Field(
         default=1.2, description="Stop the policy's steps when the KL exceeds this times target_kl (paper)."
@@ -192,22 +201,23 @@ class AscentConfig(ActorCriticConfig):
 
 
 class LagrangianConfig(BaseModel):
-    """How Lagrange multipliers move: options beside those of an ``ActorCriticConfig``."""
+    """Options of Lagrange multipliers, in addition to those of an ``ActorCriticConfig``."""
 
     multiplier_rule: Literal["projected", "softplus-adam", "pid"] = Field(
         default="pid",
-        description="How multipliers move: PID, a damped dual ascent (Stooke et al. 2020; ours), plain "
-        "projected dual ascent, or softplus with Adam (paper).",
+        description="Update rule of the multipliers: PID, a damped dual ascent (Stooke et al. "
+        "2020; ours), plain projected dual ascent, or softplus with Adam (paper).",
     )
     multiplier_initial: NonNegative = Field(
-        default=0.0, description="First value of every multiplier (ours; paper 1)."
+        default=0.0, description="Initial value of every multiplier (ours; paper 1)."
     )
     multiplier_unit: Literal["relative", "cost"] = Field(
         default="relative",
-        description="What violations and multipliers are counted in. relative: violations per limit and "
-        "standard error, multipliers per ratio of the running spreads of reward and cost advantages, so that "
-        "no unit of the task matters (ours). cost: violations in episode cost, multipliers in standard "
-        "deviations of the reward advantages per unit of cost (paper).",
+        description="Units of violations and multipliers. relative: violations per limit and "
+        "standard error, multipliers per ratio of the running spreads of reward and "
+        "cost advantages; the task's units do not matter (ours). cost: violations in "
+        "episode cost, multipliers in standard deviations of the reward advantages "
+        "per unit of cost (paper).",
     )
     multiplier_step: Positive = Field(
         default=0.1,
@@ -217,7 +227,7 @@ class LagrangianConfig(BaseModel):
     multiplier_derivative: NonNegative = Field(default=0.0, description="K_D of the PID rule (ours).")
     multiplier_maximum: Positive = Field(
         default=1000.0,
-        description="The largest multiplier that projected ascent and PID give (ours; anti-wind-up).",
+        description="Largest multiplier of projected ascent and PID (ours; anti-wind-up).",
     )
 
     @model_validator(mode="after")
@@ -231,7 +241,7 @@ class LagrangianConfig(BaseModel):
 
 
 class TrustRegionConfig(ActorCriticConfig):
-    """Settings of agents that take one trust-region step an update."""
+    """Settings of agents that take one trust-region step per update."""
 
     paper: ClassVar[Mapping[str, Any]] = {**STARTER_AGENTS_SETTING, **STARTER_AGENTS_TRUST_REGION}
 
@@ -241,10 +251,10 @@ class TrustRegionConfig(ActorCriticConfig):
     conjugate_gradient_steps: Count = Field(default=10, description="Iterations for each direction (paper).")
     metric_samples: Count | None = Field(
         default=2048,
-        description="Samples, drawn at random, on which the Hessian of the KL is evaluated; null for all "
+        description="Number of samples, drawn at random, for the Hessian of the KL; null for all "
         "(ours; paper: all).",
     )
     backtrack_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.8, description="Factor on the step from one try of the line search to the next (paper)."
+        default=0.8, description="Factor by which each try of the line search shortens the step (paper)."
     )
     backtrack_tries: Count = Field(default=10, description="Tries of the line search (paper).")

@@ -1,7 +1,7 @@
-"""What spaces agents can handle, and how observations and actions cross between them and tasks.
+"""Supported spaces, and conversion of observations and actions between agents and tasks.
 
-Observations become float32 rows: ``Discrete`` one-hot, ``Box``, ``MultiBinary`` and whatever else is an
-array of numbers flattened. Actions are ``Discrete`` (categorical policies) or ``Box`` (Gaussian policies).
+Observations become float32 rows: ``Discrete`` one-hot, ``Box``, ``MultiBinary`` and other arrays of numbers
+flattened. Actions are ``Discrete`` (categorical policies) or ``Box`` (Gaussian policies).
 
 Notation: B environments, n observation components, m action components.
 """
@@ -20,7 +20,7 @@ from recrl.agents.errors import UnsupportedSpaceError
 
 
 def observation_size(space: gymnasium.Space[Any]) -> int:
-    """The number of components of an observation row, n.
+    """Return the number of components of an observation row, n.
 
     Raises:
         UnsupportedSpaceError: the space is neither Discrete nor Box nor MultiBinary.
@@ -33,7 +33,7 @@ def observation_size(space: gymnasium.Space[Any]) -> int:
 
 
 def observation_rows(space: gymnasium.Space[Any], observations: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    """B observations of ``space``, [B, ...], as float32 rows, [B, n].
+    """Return B observations of ``space``, [B, ...], as float32 rows, [B, n].
 
     >>> observation_rows(Discrete(3), np.array([2, 0])).tolist()
     [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
@@ -46,7 +46,7 @@ def observation_rows(space: gymnasium.Space[Any], observations: npt.NDArray[Any]
 
 
 def action_size(space: gymnasium.Space[Any]) -> int:
-    """The number of actions of a Discrete space, or of components, m, of a Box.
+    """Return the number of actions of a Discrete space, or of components, m, of a Box.
 
     Raises:
         UnsupportedSpaceError: the space is neither Discrete nor a Box of floats.
@@ -59,10 +59,10 @@ def action_size(space: gymnasium.Space[Any]) -> int:
 
 
 def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """What the task is given for B actions of an agent, int64 [B] or float32 [B, m].
+    """Convert B actions of an agent, int64 [B] or float32 [B, m], to actions of the task.
 
     Discrete actions are shifted to the space's first one; Gaussian ones are clipped to the bounds of the
-    Box. The agent learns from the unclipped actions, whose density it knows.
+    Box. The agent learns from the unclipped actions, whose density is known.
     """
     if isinstance(space, Discrete):
         shifted: npt.NDArray[np.int64] = actions + space.start

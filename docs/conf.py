@@ -27,7 +27,7 @@ suppress_warnings = ["mystnb.unknown_mime_type"]
 # Pages in Markdown, notebooks among them; :::{note} and $equations$.
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 3
-nb_execution_mode = "force"  # the code may have changed where the notebook has not
+nb_execution_mode = "force"  # the code may have changed even if the notebook has not
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True

@@ -1,13 +1,12 @@
-"""The vocabulary of constrained Markov decision processes that every other package speaks.
+"""Vocabulary of constrained Markov decision processes (CMDPs), used by all packages.
 
-A CMDP is (S, A, T, gamma, R, C, d) (paper, section 3). ``CMDPSpec`` is all of it that a task fixes;
-the limits d are never part of it, because in RECRL they change (``CostLimits``). The discount gamma
-belongs to the agent's critics: returns, episode costs and limits are *undiscounted* sums over an
-episode, which is the unit in which the paper states its limits.
+A CMDP is (S, A, T, gamma, R, C, d) (paper, section 3). ``CMDPSpec`` holds what a task fixes. The limits d are
+separate (``CostLimits``), because in RECRL they change. The discount gamma belongs to the agent's critics.
+Returns, episode costs and limits are *undiscounted* sums over an episode, as in the paper.
 
 Notation: k is the number of cost functions, b an episode's index, B the training budget.
 
-Imports neither Gymnasium nor torch at run time, so that teachers can use it alone.
+Imports neither Gymnasium nor torch at run time, so that curricula do not depend on them.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Phase(StrEnum):
-    """Where a trial stands: the paper's training phase (limits d_t ... d_d) or deployment (d_d)."""
+    """Phase of a trial: the paper's training (limits d_t ... d_d) or deployment (d_d)."""
 
     TRAINING = "training"
     DEPLOYMENT = "deployment"
@@ -36,14 +35,14 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class ObservationComponent:
-    """A named run of consecutive numbers of a flattened observation, and what they measure.
+    """A named slice of a flattened observation.
 
     Attributes:
         name: for example ``hazards_lidar``.
-        size: how many numbers, at least 1.
-        lidar_range: of a lidar, its range in metres: each number v in [0, 1] is then one direction, and the
-            nearest object in it is at the distance ``(1 - v) * lidar_range``, with 0 where there is none;
-            None for any other measurement.
+        size: length of the slice, at least 1.
+        lidar_range: range in metres if the slice is a lidar, else None. Each value v in [0, 1] belongs to one
+            direction. The nearest object there is at the distance ``(1 - v) * lidar_range``; v is 0 if there
+            is none.
     """
 
     name: str
@@ -62,7 +61,7 @@ class ObservationComponent:
 
 @dataclass(frozen=True)
 class CMDPSpec:
-    """What a task fixes of a CMDP: spaces, cost functions and horizon, but not the limits d.
+    """The parts of a CMDP that a task fixes: spaces, cost functions and horizon, but not the limits d.
 
     Attributes:
         name: the task's registry name, for example ``rivergrid-1a``.
@@ -70,7 +69,7 @@ class CMDPSpec:
         action_space: of one environment; ``Discrete`` or a bounded or unbounded ``Box``.
         cost_names: names of the k >= 1 cost functions, in the order of every cost vector.
         horizon: steps after which an episode is truncated, or None if it never is.
-        components: the parts of a flattened observation in their order, or none if the task does not say.
+        components: the slices of a flattened observation in order; empty if the task does not declare them.
     """
 
     name: str
@@ -94,13 +93,13 @@ class CMDPSpec:
 
     @property
     def _observation_size(self) -> int | None:
-        """The numbers of an observation where that is an array, else None."""
+        """Size of an observation if it is an array, else None."""
         shape = self.observation_space.shape
         return None if shape is None else math.prod(shape)
 
     @property
     def num_costs(self) -> int:
-        """The number of cost functions, k."""
+        """Number of cost functions, k."""
         return len(self.cost_names)
 
 
@@ -136,7 +135,7 @@ class CostLimits:
 
     @property
     def finite(self) -> tuple[bool, ...]:
-        """Which dimensions constrain anything, [k]."""
+        """Whether each dimension constrains anything, [k]."""
         return tuple(math.isfinite(value) for value in self.values)
 
     @property
@@ -145,32 +144,32 @@ class CostLimits:
         return np.array(self.values, dtype=np.float64)
 
     def to_json(self) -> list[float | str]:
-        """The limits as strict JSON, infinity spelt ``"inf"``: JSON has no infinite number."""
+        """Return the limits as strict JSON, with ``"inf"`` for infinity, which JSON lacks."""
         return [value if math.isfinite(value) else "inf" for value in self.values]
 
     @classmethod
     def from_json(cls, values: Iterable[float | str]) -> CostLimits:
-        """The inverse of ``to_json``."""
+        """Inverse of ``to_json``."""
         return cls(tuple(float(value) for value in values))
 
     @classmethod
     def unlimited(cls, num_costs: int) -> CostLimits:
-        """Limits that constrain nothing: the CMDP is an MDP (paper, section 4)."""
+        """Limits that constrain nothing: the CMDP becomes an MDP (paper, section 4)."""
         return cls((math.inf,) * num_costs)
 
 
 @dataclass(frozen=True)
 class CurriculumStep:
-    """What a curriculum asks for one policy update: while its samples are collected, and while it learns.
+    """Output of a curriculum for one policy update: it applies to collection and to learning.
 
     Attributes:
         limits: the cost limits d, [k].
-        policy_noise: eps_pi in [0, 1], noise that is added to the policy once, before it collects samples for
-            the update (Algorithm 2, line 9); 0 for none.
-        entropy_coefficient: what a nat of the policy's entropy is worth in the update, in the task's reward
-            per step, at least 0; None if the curriculum never rewards entropy.
+        policy_noise: eps_pi in [0, 1], noise added to the policy once, before it collects the samples of the
+            update (Algorithm 2, line 9); 0 for none.
+        entropy_coefficient: reward per nat of policy entropy and step, in units of the task's reward, at
+            least 0; None if the curriculum never rewards entropy.
         start_limits: the training limits d_t from which the curriculum starts, [k]; None while they are being
-            measured. For the record only; agents do not use them.
+            measured. They are logged only; agents do not use them.
     """
 
     limits: CostLimits
@@ -179,7 +178,7 @@ class CurriculumStep:
     start_limits: CostLimits | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.limits, CostLimits):  # a curriculum of a user's may give plain numbers
+        if not isinstance(self.limits, CostLimits):  # a user's curriculum may return plain numbers
             object.__setattr__(self, "limits", CostLimits(tuple(self.limits)))
         if not 0.0 <= self.policy_noise <= 1.0:
             raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
@@ -189,16 +188,16 @@ class CurriculumStep:
 
     @property
     def rewards_entropy(self) -> bool:
-        """Whether the policy's entropy is worth anything in this update."""
+        """Whether this update rewards entropy."""
         return self.entropy_coefficient is not None and self.entropy_coefficient > 0.0
 
     def in_deployment(self, deploy_limits: CostLimits) -> CurriculumStep:
-        """The step after this one when deployment begins: limits d_d, no noise, no reward for entropy."""
+        """Return the step with which deployment begins: limits d_d, no noise, no reward for entropy."""
         coefficient = None if self.entropy_coefficient is None else 0.0
         return CurriculumStep(deploy_limits, 0.0, coefficient, self.start_limits)
 
     def to_json(self) -> dict[str, Any]:
-        """The step as strict JSON, by the attributes' names."""
+        """Return the step as strict JSON, keyed by the attributes' names."""
         return {
             "limits": self.limits.to_json(),
             "policy_noise": self.policy_noise,
@@ -208,7 +207,7 @@ class CurriculumStep:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> CurriculumStep:
-        """The inverse of ``to_json``; ``entropy_coefficient`` may be missing, and other keys are ignored."""
+        """Inverse of ``to_json``; ``entropy_coefficient`` may be missing, and other keys are ignored."""
         start, coefficient = values["start_limits"], values.get("entropy_coefficient")
         return cls(
             CostLimits.from_json(values["limits"]),
@@ -220,17 +219,17 @@ class CurriculumStep:
 
 @dataclass(frozen=True)
 class EpisodeStats:
-    """One finished episode: all that a teacher, a figure or a user ever sees of it.
+    """Record of one finished episode, for curricula, figures and users.
 
     Attributes:
         index: b, counted from 0 over the whole trial in the order in which episodes end.
         phase: the phase in which it ended.
-        end_step: environment steps the trial had taken, over all its environments, when it ended.
+        end_step: environment steps of the trial when the episode ended, over all environments.
         length: its number of steps, at least 1.
         episode_return: undiscounted sum of rewards.
         costs: undiscounted sums of costs, [k].
         limits: the cost limits in force when it ended, [k].
-        noise: the teacher's policy noise in force when it ended, in [0, 1].
+        noise: the curriculum's policy noise in force when it ended, in [0, 1].
     """
 
     index: int

@@ -48,7 +48,7 @@ def continuous_bandit_optimum(name: str, options: ContinuousBanditOptions, limit
 
 
 class ContinuousBanditVectorEnv(CMDPVectorEnv):
-    """B continuous bandits; deterministic, so that nothing but the step counts is state."""
+    """B continuous bandits. They are deterministic: the step counts are their only state."""
 
     def __init__(self, name: str, num_envs: int, options: ContinuousBanditOptions) -> None:
         if num_envs < 1:
@@ -111,8 +111,8 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
         """Continue exactly where ``state_dict`` was taken."""
         if np.shape(state["elapsed"]) != (self.num_envs,):
             raise ValueError(
-                f"{self.cmdp.name}: the saved state is of {np.size(state['elapsed'])} environments, "
-                f"these are {self.num_envs}"
+                f"{self.cmdp.name}: the saved state has {np.size(state['elapsed'])} environments, "
+                f"expected {self.num_envs}"
             )
         self._elapsed = np.array(state["elapsed"], np.int64)
 

@@ -1,20 +1,23 @@
-"""A batch of scalar Gymnasium environments as a ``CMDPVectorEnv``: the way in for a user's own task.
+"""A batch of scalar Gymnasium environments as a ``CMDPVectorEnv``: for users' own tasks.
 
-Gymnasium's ``SyncVectorEnv`` would do but for a trap: with same-step autoreset it moves the info of an
-episode's last step to ``final_info`` and puts the *reset's* info in its place, so the cost of the last step
-is lost to whoever reads ``info["cost"]``. Here it stays.
+Gymnasium's ``SyncVectorEnv`` loses the cost of an episode's last step. With same-step autoreset it moves the
+last info to ``final_info`` and puts the *reset's* info in its place, so ``info["cost"]`` is that of the
+reset. Here it stays.
 
-What a scalar environment must do: report ``info["cost"]``, a number or k numbers, at every step; have a
-``Discrete`` or a bounded or unbounded floating-point ``Box`` action space; and be a function of its seed and
-its actions: ``reset(seed=...)`` must determine an episode. It may name its costs in an attribute
-``cost_names``, and the parts of its flattened observation in ``observation_components`` (a sequence of
-``recrl.environments.cmdp.ObservationComponent``), which tell agents what is a lidar. Observations of any kind
-are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to their bounds.
+Requirements for a scalar environment:
 
-Every episode is started by ``reset(seed=...)`` with a new seed drawn here, which makes an exact checkpoint
-possible without asking the environment for its state and without pickling it: the seed and the actions so
-far. Restoring replays them, at most one episode per environment, and checks that the same observation comes
-out.
+- It reports ``info["cost"]``, a number or k numbers, at every step.
+- Its action space is ``Discrete`` or a floating-point ``Box``, bounded or not.
+- It is a function of its seed and its actions: ``reset(seed=...)`` determines an episode.
+
+An environment may name its costs in an attribute ``cost_names``. It may describe the slices of its flattened
+observation in ``observation_components``, a sequence of ``recrl.environments.cmdp.ObservationComponent``;
+from it agents learn which of them are lidars. Observations of any kind are flattened to float32 vectors
+(``gymnasium.spaces.flatten``), actions clipped to their bounds.
+
+Every episode starts with ``reset(seed=...)`` and a new seed drawn here. A checkpoint holds that seed and the
+actions so far, so the environment need not be pickled. Restoring replays them, at most one episode per
+environment, and checks that the last observation is the same.
 """
 
 from __future__ import annotations
@@ -47,7 +50,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         name: the task's name, for ``cmdp.name``.
         factories: one callable per environment; each returns a new one.
         cost_names: names of the k costs; by default the environment's ``cost_names``, else ``cost``.
-        costless: report zero costs instead of asking the environment for them.
+        costless: report zero costs instead of reading them from the environment.
     """
 
     def __init__(
@@ -92,7 +95,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start B episodes; ``seed`` restarts the generator that every episode's seed is drawn from."""
+        """Start B episodes; ``seed`` restarts the generator from which episode seeds are drawn."""
         super().reset(seed=seed, options=options)
         self._observations = np.stack([self._start_episode(index) for index in range(self.num_envs)])
         return self._observations.copy(), {}
@@ -143,7 +146,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             environment.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """The seed and the actions so far of every episode, what they led to, and the generator."""
+        """Return seed, actions so far and last observation of every episode, and the generator."""
         if self._observations is None:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
         space = self.single_action_space
@@ -161,13 +164,13 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         """Continue exactly where ``state_dict`` was taken, by replaying the episodes under way.
 
         Raises:
-            ValueError: the replay led elsewhere, so the environment has state that its seed and its actions
-                do not determine and cannot be resumed.
+            ValueError: the replay gave another observation: the environment is not determined by its seed and
+                its actions and cannot be resumed.
         """
         if len(state["episode_seeds"]) != self.num_envs:
             raise ValueError(
-                f"{self.cmdp.name}: the saved state is of {len(state['episode_seeds'])} environments, "
-                f"these are {self.num_envs}"
+                f"{self.cmdp.name}: the saved state has {len(state['episode_seeds'])} "
+                f"environments, expected {self.num_envs}"
             )
         self._episode_seeds = [int(seed) for seed in state["episode_seeds"]]
         self._episode_actions = [list(actions) for actions in state["episode_actions"]]
@@ -211,7 +214,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             raise ValueError(f"{self.cmdp.name}: a reward must be a number, got {_brief(reward)}") from error
 
     def _check(self, observations: npt.NDArray[np.float32], rewards: Floats | None = None) -> None:
-        """Name the task where it is at fault: later it would be the policy that returns no numbers."""
+        """Raise an error that names the task; otherwise the policy would fail later."""
         if not np.isfinite(observations).all():
             bad = observations[~np.isfinite(observations).all(axis=-1)][0]
             raise ValueError(f"{self.cmdp.name}: an observation must be finite, got {_brief(bad)}")
@@ -222,7 +225,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
     def _flat(self, observation: Any) -> npt.NDArray[np.float32]:
         cause: Exception | None = None
         try:
-            if observation is not None:  # NumPy would make NaN of it
+            if observation is not None:  # NumPy would convert it to NaN
                 flat = np.asarray(spaces.flatten(self._raw_observation_space, observation), np.float32)
                 if flat.shape == self.single_observation_space.shape:
                     return flat
@@ -277,7 +280,7 @@ class GymnasiumOptions(BaseModel):
 
     id: str = Field(description="The id registered with Gymnasium, or module:id to import the module first.")
     keywords: dict[str, JsonValue] = Field(
-        default_factory=dict, description="What gymnasium.make passes on to the environment."
+        default_factory=dict, description="Keyword arguments for gymnasium.make."
     )
     cost_names: tuple[str, ...] | None = Field(
         default=None,
@@ -322,14 +325,14 @@ def make_from_callable(
 
 
 def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
-    """An environment of a registered id that draws itself."""
+    """Return a rendering environment of a registered id."""
     keywords: dict[str, Any] = {**options.keywords, "render_mode": "rgb_array"}
     environment: Environment = gymnasium.make(options.id, disable_env_checker=True, **keywords)
     return _Costless(environment, len(options.cost_names or ("cost",))) if options.costless else environment
 
 
 def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:
-    """An environment of a user's callable; it draws itself if the callable takes ``render_mode``."""
+    """Return an environment of a user's callable; it renders if the callable takes ``render_mode``."""
     keywords = options.model_dump()
     parameters = inspect.signature(factory).parameters.values()
     if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
@@ -338,7 +341,7 @@ def draw_from_callable(factory: Callable[..., Environment], name: str, options: 
 
 
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment that reports a cost of 0 for each of ``num_costs``."""
+    """Wrapper that reports a cost of 0 for each of ``num_costs`` costs."""
 
     def __init__(self, environment: Environment, num_costs: int) -> None:
         super().__init__(environment)
@@ -350,14 +353,14 @@ class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
-    """What an environment says of the parts of its flattened observation; none if it says nothing."""
+    """Return the declared slices of an environment's flattened observation, or none."""
     if not environment.has_wrapper_attr("observation_components"):
         return ()
     return tuple(environment.get_wrapper_attr("observation_components"))
 
 
 def _made(name: str, factory: Callable[[], Environment]) -> Environment:
-    """A new environment, if that is what the factory makes."""
+    """Return a new environment; raise an error if the factory returns something else."""
     environment = factory()
     if not isinstance(environment, gymnasium.Env):
         raise ValueError(f"{name} must return a Gymnasium environment, got {_brief(environment)}")
@@ -365,7 +368,7 @@ def _made(name: str, factory: Callable[[], Environment]) -> Environment:
 
 
 def _brief(value: Any) -> str:
-    """A value as a message shows it."""
+    """Describe a value for an error message."""
     if value is None:
         return "None"
     kind = type(value).__name__

@@ -1,11 +1,11 @@
-"""Finding tasks, agents and teachers by name, so that a user's package plugs in without a fork.
+"""Look up tasks, agents and curricula by name, including those of users' packages.
 
 A name is, in this order: one of ours; an entry point of an installed package; an import path
 ``package.module:attribute``. Imports nothing but the standard library.
 
-An import path runs whatever code it names, and names come from files that others may have made. So a process
-that only reads such files calls ``refuse_import_paths`` before: then only what somebody has installed here,
-as an entry point, is imported. SECURITY.md says which commands do.
+An import path runs the code that it names, and names come from files that others may have made. A process
+that only reads such files first calls ``refuse_import_paths``. Then only installed entry points are imported.
+SECURITY.md lists the commands that do so.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from typing import Any
 
 
 class UnknownNameError(ValueError):
-    """A task, agent or teacher that nobody provides."""
+    """A task, agent or curriculum name that is not known."""
 
 
 class UntrustedNameError(Exception):
-    """An import path that this process does not follow.
+    """An import path that this process refuses to follow.
 
-    No ValueError: pydantic would take it for a mistake in the options.
+    It is not a ValueError, because pydantic would report that as an invalid option.
     """
 
     def __init__(self, path: str) -> None:
@@ -39,13 +39,13 @@ class UntrustedNameError(Exception):
 
 
 IMPORT_PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
-MODULES = "RECRL_MODULES"  # in the environment: a folder of modules, looked at last
-_refused = False  # of the whole process: threads must not be let off
+MODULES = "RECRL_MODULES"  # an environment variable: a folder of modules, searched last
+_refused = False  # of the whole process, so that it holds in all threads
 
 
 @contextmanager
 def refuse_import_paths() -> Iterator[None]:
-    """Follow no import path in this process until the end of the ``with`` block."""
+    """Refuse import paths in this process until the end of the ``with`` block."""
     global _refused  # noqa: PLW0603
     before, _refused = _refused, True
     try:
@@ -55,13 +55,13 @@ def refuse_import_paths() -> Iterator[None]:
 
 
 def require_trust(path: str) -> None:
-    """Let an import path from a file pass, unless this process refuses them.
+    """Check that this process may follow an import path from a file.
 
     Args:
         path: ``package.module:attribute``, or an id of Gymnasium's with a module in front.
 
     Raises:
-        UntrustedNameError: it does.
+        UntrustedNameError: this process refuses import paths.
     """
     if _refused:
         raise UntrustedNameError(path)
@@ -69,9 +69,9 @@ def require_trust(path: str) -> None:
 
 @contextmanager
 def modules_in(folder: Path) -> Iterator[None]:
-    """Let import paths lead to modules in a folder until the end of the block, also in child processes.
+    """Add a folder of modules for import paths until the end of the block, also in child processes.
 
-    The folder is looked at last, so that nothing in it takes the place of an installed package.
+    The folder is searched last, so that it cannot shadow an installed package.
     """
     before, found = os.environ.get(MODULES), list(sys.path)
     os.environ[MODULES] = str(folder.absolute())
@@ -86,7 +86,7 @@ def modules_in(folder: Path) -> Iterator[None]:
 
 
 def import_module(name: str) -> ModuleType:
-    """A module by its dotted name, also from the folder of ``modules_in``.
+    """Import a module by its dotted name, also from the folder of ``modules_in``.
 
     Raises:
         ImportError: it cannot be imported.
@@ -98,7 +98,7 @@ def import_module(name: str) -> ModuleType:
 
 
 def load_attribute(path: str) -> Any:
-    """The object at ``package.module:attribute``.
+    """Load the object at ``package.module:attribute``.
 
     Raises:
         UnknownNameError: the module cannot be imported or has no such attribute.
@@ -122,7 +122,7 @@ def load_attribute(path: str) -> Any:
 
 
 def trusted_attribute(path: str) -> Any:
-    """The object at ``package.module:attribute`` that an option names.
+    """Load the object at ``package.module:attribute`` that an option names.
 
     Raises:
         UnknownNameError: the module cannot be imported or has no such attribute.
@@ -133,7 +133,7 @@ def trusted_attribute(path: str) -> Any:
 
 
 def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any:
-    """What ``name`` stands for.
+    """Return the object that ``name`` refers to.
 
     Args:
         name: a name of ours, an entry point's name, or ``package.module:attribute``.
@@ -142,8 +142,8 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
         ours: the built-in registry.
 
     Raises:
-        UnknownNameError: nobody provides it; the message names the nearest known names.
-        UntrustedNameError: it is an import path, and this process follows none.
+        UnknownNameError: the name is not known; the message names the nearest known names.
+        UntrustedNameError: it is an import path, and this process refuses them.
     """
     if name in ours:
         return ours[name]

@@ -20,7 +20,7 @@ VELOCITY = "recrl.environments.velocity.environments"
 
 
 def register_all() -> None:
-    """Make all tasks known to Gymnasium: ``recrl/RiverGrid-1a-v0``, ``recrl/CarGoal2-v0``, and so on."""
+    """Register all tasks with Gymnasium: ``recrl/RiverGrid-1a-v0``, ``recrl/CarGoal2-v0``, and so on."""
     if "recrl/RiverGrid-v0" in gymnasium.registry:
         return
     gymnasium.register("recrl/RiverGrid-v0", entry_point=RIVER_GRID)
@@ -38,7 +38,7 @@ def _register(identifier: str, task: str, single: str, batch: str) -> None:
         entry_point=single,
         vector_entry_point=batch,
         kwargs={"task": task},
-        disable_env_checker=True,  # its checks would take a tenth of every step; the tests make them
+        disable_env_checker=True,  # its checks would take a tenth of every step; the tests apply them
     )
 
 

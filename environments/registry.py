@@ -1,10 +1,10 @@
-"""Every task by name: how to build it, what can be set, and its optimum where that is known.
+"""Every task by name: how to build it, its options, and its optimum if known.
 
 A name is one of ``TASKS``, an entry point in the group ``recrl.tasks``, or an import path
-``package.module:attribute``. What the last two lead to is either a ``Task``, or a callable that takes the
-task's options as keywords and returns one scalar Gymnasium environment that reports ``info["cost"]``.
+``package.module:attribute``. The last two refer to a ``Task`` or to a callable. A callable takes the task's
+options as keywords and returns one scalar Gymnasium environment with ``info["cost"]``.
 
-Nothing here imports a task's module before that task is asked for.
+A task's module is imported only when that task is requested.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class NotDrawnError(ValueError):
-    """A task of which there are no pictures."""
+    """The task cannot be rendered."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,13 @@ class Task:
     """How to build one task. Strings are import paths ``package.module:attribute``, loaded when needed.
 
     Attributes:
-        summary: one sentence for people who choose a task.
-        options: a frozen pydantic model of what can be set.
+        summary: one sentence of description.
+        options: a frozen pydantic model of the options.
         make: callable (name, num_envs, options) -> CMDPVectorEnv.
-        optimum: callable (name, options, limits) -> J*(d), or None where nobody knows it.
-        drawn: callable (name, options) -> one scalar Gymnasium environment of the task that draws itself
-            (``render_mode`` is ``rgb_array``) and reports ``info["cost"]``, or None.
-        sample_options: options under which the contract suite runs it: whatever is required, and short
-            episodes.
+        optimum: callable (name, options, limits) -> J*(d), or None if it is not known.
+        drawn: callable (name, options) -> one scalar Gymnasium environment with ``info["cost"]`` that renders
+            (``render_mode`` is ``rgb_array``), or None.
+        sample_options: options for the contract tests: the required ones, and short episodes.
     """
 
     summary: str
@@ -105,7 +104,7 @@ TASKS: dict[str, Task] = {
         sample_options={"horizon": 20},
     ),
     "rivergrid": Task(
-        summary="RiverGrid on a map of one's own or on a random solvable one.",
+        summary="RiverGrid on a map of your own or on a random solvable one.",
         options="recrl.environments.rivergrid.grid_world:RiverGridMapOptions",
         make="recrl.environments.rivergrid.grid_world:make_river_grid",
         optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
@@ -113,7 +112,7 @@ TASKS: dict[str, Task] = {
         sample_options={"horizon": 20, "generate": {"seed": 3}},
     ),
     "rivergrid-generated": Task(
-        summary="RiverGrid on an instance like the paper's two that a seed draws.",
+        summary="RiverGrid on a random instance with the properties of the paper's two.",
         options="recrl.environments.rivergrid.grid_world:RiverGridGeneratedOptions",
         make="recrl.environments.rivergrid.grid_world:make_river_grid",
         optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
@@ -153,17 +152,17 @@ TASKS: dict[str, Task] = {
 
 
 class KeywordOptions(BaseModel):
-    """The options of a task that is a plain callable: whatever it takes as keywords."""
+    """Options of a task that is a plain callable: its keyword arguments."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
 
 def find_task(name: str) -> Task:
-    """The task called ``name``.
+    """Return the task called ``name``.
 
     Raises:
-        UnknownNameError: nobody provides it; the message names the nearest known task.
-        ValueError: what the name leads to is neither a Task nor callable.
+        UnknownNameError: the name is not known; the message names the nearest known task.
+        ValueError: the named object is neither a Task nor callable.
     """
     found = resolve(name, kind="task", group="recrl.tasks", ours=TASKS)
     if isinstance(found, Task):
@@ -183,27 +182,27 @@ def find_task(name: str) -> Task:
 
 
 def task_options(name: str, options: Mapping[str, Any]) -> BaseModel:
-    """The validated options of a task, defaults filled in; ``model_dump`` of it is canonical.
+    """Return the validated options of a task with defaults; their ``model_dump`` is canonical.
 
     Raises:
-        UnknownNameError: nobody provides the task.
+        UnknownNameError: the task is not known.
         pydantic.ValidationError: all mistakes in the options at once.
     """
     return options_model(name).model_validate(dict(options))
 
 
 def options_model(name: str) -> type[BaseModel]:
-    """The pydantic model of a task's options.
+    """Return the pydantic model of a task's options.
 
     Raises:
-        UnknownNameError: nobody provides the task.
+        UnknownNameError: the task is not known.
     """
     model: type[BaseModel] = _loaded(find_task(name).options)
     return model
 
 
 def make_vector(name: str, num_envs: int, *, options: Mapping[str, Any] | None = None) -> CMDPVectorEnv:
-    """B = ``num_envs`` environments of a task; ``reset(seed=...)`` seeds them.
+    """Make B = ``num_envs`` environments of a task; ``reset(seed=...)`` seeds them.
 
     Args:
         name: a name of ours, an entry point's name, or ``package.module:attribute``.
@@ -216,22 +215,22 @@ def make_vector(name: str, num_envs: int, *, options: Mapping[str, Any] | None =
 
 
 def make_drawn(name: str, *, options: Mapping[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
-    """One environment of a task that draws itself: ``render()`` gives uint8 [height, width, 3].
+    """Make one rendering environment of a task: ``render()`` returns uint8 [height, width, 3].
 
     Raises:
-        NotDrawnError: the task has no pictures.
+        NotDrawnError: the task cannot be rendered.
     """
     task = find_task(name)
     if task.drawn is None:
-        raise NotDrawnError(f"the task {name} has no pictures")
+        raise NotDrawnError(f"the task {name} cannot be rendered")
     environment: gymnasium.Env[Any, Any] = _loaded(task.drawn)(name, task_options(name, options or {}))
     return environment
 
 
 def optimal_return(name: str, options: Mapping[str, Any], limits: CostLimits) -> float | None:
-    """J*(d), the largest expected undiscounted return under limits d.
+    """Return J*(d), the largest expected undiscounted return under limits d.
 
-    None where nobody knows it; -inf where no policy keeps the limits, the supremum of an empty set.
+    The result is None if it is not known, and -inf if no policy keeps the limits.
     """
     task = find_task(name)
     if task.optimum is None:

@@ -1,19 +1,19 @@
-"""The seam between environments and agents: a batch of CMDPs stepped together.
+"""Interface between environments and agents: a batch of CMDPs stepped together.
 
-Every task reaches the agents as a ``CMDPVectorEnv``. What crosses, and nothing else:
+Agents see every task as a ``CMDPVectorEnv``. Its contract:
 
 - ``step(actions)`` returns observations [B, ...], rewards float64 [B], terminated bool [B], truncated
   bool [B] and ``info``, in which
     - ``info["cost"]`` is float64 [B, k], the step's costs in the order of ``cmdp.cost_names``;
     - ``info["final_obs"]`` [B, ...] holds the true last observation in the rows where an episode
       ended (elsewhere its content means nothing); it is present only if one ended.
-- An environment whose episode ended is reset in the same step (Gymnasium's ``SAME_STEP``), so row i of
-  the returned observations is then the first of the next episode.
+- An environment whose episode ended is reset in the same step (Gymnasium's ``SAME_STEP``). Row i of
+  the returned observations is then the first one of the next episode.
 - ``restart(index)`` cuts the episodes of some environments short and begins new ones in them.
-- Actions that mean nothing (a wrong shape, a number that is no action, NaN) and a step before the first reset
-  raise a ValueError. Continuous actions outside their bounds are clipped to them.
-- ``state_dict`` holds everything that the future depends on, generators included; a tree of dicts,
-  lists, JSON scalars and NumPy arrays. ``load_state_dict`` continues exactly from there.
+- Invalid actions (a wrong shape, a number that is no action, NaN) and a step before the first reset raise a
+  ValueError. Continuous actions outside their bounds are clipped to them.
+- ``state_dict`` holds everything that the future depends on, generators included. It is a tree of dicts,
+  lists, JSON scalars and NumPy arrays. ``load_state_dict`` continues exactly from it.
 
 Notation: B environments, k costs.
 """
@@ -34,7 +34,7 @@ class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
     """B environments of one task; see the module's docstring for the contract.
 
     Attributes:
-        cmdp: what the task fixes of the CMDP.
+        cmdp: the parts of the CMDP that the task fixes.
     """
 
     cmdp: CMDPSpec
@@ -42,13 +42,13 @@ class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
 
     @abstractmethod
     def restart(self, index: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
-        """Begin new episodes in some environments, whatever they were doing.
+        """Begin new episodes in some environments, in any state.
 
         Args:
             index: which of the B environments, [M], each at most once.
 
         Returns:
-            What all environments now observe, [B, ...].
+            The new observations of all environments, [B, ...].
 
         Raises:
             ValueError: ``reset`` was not called before.
@@ -56,7 +56,7 @@ class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Everything the future of these environments depends on."""
+        """Return everything that the future of these environments depends on."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -102,7 +102,7 @@ class SweepPlace(Protocol):
         """Send what the folder says of the sweep itself."""
         ...
 
-    def mirrored(self, stop: threading.Event) -> AbstractContextManager[None]:
+    def kept_up_to_date(self, stop: threading.Event) -> AbstractContextManager[None]:
         """Keep the folder up to date while the body runs, and once more after it."""
         ...
 
@@ -172,7 +172,7 @@ class LocalSweep:
     def publish(self) -> None:
         """See ``SweepPlace``."""
 
-    def mirrored(self, stop: threading.Event) -> AbstractContextManager[None]:
+    def kept_up_to_date(self, stop: threading.Event) -> AbstractContextManager[None]:
         """See ``SweepPlace``."""
         return nullcontext()
 

@@ -23,20 +23,20 @@ from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.provenance import collect
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.grid.plan import Plan, Work, make_plan, select
+from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan, select
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.sweep_progress import Standing, SweepProgress, TrialProgress, progress
+from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
 
 # How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
-MIRROR_SECONDS = 120.0
-HASTY_MIRROR_SECONDS = 10.0
+SYNC_SECONDS = 120.0
+HASTY_SYNC_SECONDS = 10.0
 REQUEST_SECONDS = 0.5  # between two looks whether somebody asks to stop, or has been heard
 
 logger = logging.getLogger("recrl.sweep")
 
 
-class Mirror(Protocol):
+class BackgroundSync(Protocol):
     """Something that shows the sweep elsewhere while it runs."""
 
     def stop(self, timeout: float) -> bool:
@@ -56,18 +56,18 @@ class SweepResult:
         plan: what there was to do.
         progress: where the chosen trials stand now.
         stopped: whether it was asked to stop before its end.
-        mirrored: whether the mirror shows everything; None if there was none.
+        synced: whether the sync shows everything; None if there was none.
     """
 
     plan: Plan
     progress: SweepProgress
     stopped: bool
-    mirrored: bool | None
+    synced: bool | None
 
     @property
     def failed(self) -> tuple[TrialProgress, ...]:
         """The trials that stand as failed, also from earlier launches."""
-        return self.progress.standing(Standing.FAILED)
+        return self.progress.with_status(DisplayStatus.FAILED)
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class LaunchSettings:
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again.
         rerun_changed: whether trials that ran other code than is installed now are run again.
-        start_mirror: begins to show the sweep elsewhere, before the first trial.
+        start_sync: begins to show the sweep elsewhere, before the first trial.
         watch: told the plan before the first trial.
-        finish: called after the last trial, before the mirror stops: draws figures, for example.
+        finish: called after the last trial, before the sync stops: draws figures, for example.
     """
 
     grid: GridSpec
@@ -94,7 +94,7 @@ class LaunchSettings:
     retry_failed: bool = False
     rerun_damaged: bool = False
     rerun_changed: bool = False
-    start_mirror: Callable[[SweepStore], Mirror] | None = None
+    start_sync: Callable[[SweepStore], BackgroundSync] | None = None
     watch: Callable[[Plan], None] = lambda plan: None
     finish: Callable[[SweepProgress], None] = lambda after: None
 
@@ -124,7 +124,7 @@ def launch(settings: LaunchSettings, *, stop: threading.Event) -> SweepResult:
         _leave_none_running(specs, store)  # of a launch that died
         plan = _plan(settings, specs)
         settings.watch(plan)
-        for trial in plan.doing(Work.RERUN):
+        for trial in plan.with_action(PlannedAction.RERUN):
             store.trial(trial.spec).set_all_aside()
         return _run(settings, plan, stop)
 
@@ -143,26 +143,26 @@ def _plan(settings: LaunchSettings, specs: Sequence[TrialSpec]) -> Plan:
 def _run(settings: LaunchSettings, plan: Plan, stop: threading.Event) -> SweepResult:
     """Run the trials of a plan, and show them elsewhere meanwhile."""
     store = settings.place.store
-    mirror = settings.start_mirror(store) if settings.start_mirror is not None else None
-    patience = HASTY_MIRROR_SECONDS
-    mirrored: bool | None = None
+    sync = settings.start_sync(store) if settings.start_sync is not None else None
+    patience = HASTY_SYNC_SECONDS
+    synced: bool | None = None
     try:
         _run_trials(settings, plan.to_do, stop)
         after = progress([trial.spec for trial in plan.trials], store)
         settings.finish(after)
         if not stop.is_set():
-            patience = MIRROR_SECONDS
+            patience = SYNC_SECONDS
     finally:
-        if mirror is not None:
-            mirrored = mirror.stop(patience)
-    return SweepResult(plan, after, stopped=stop.is_set(), mirrored=mirrored)
+        if sync is not None:
+            synced = sync.stop(patience)
+    return SweepResult(plan, after, stopped=stop.is_set(), synced=synced)
 
 
 def _run_trials(settings: LaunchSettings, specs: Sequence[TrialSpec], stop: threading.Event) -> None:
     """Run trials; afterwards none of them stands as running, whatever happened."""
     place = settings.place
     try:
-        with place.mirrored(stop):
+        with place.kept_up_to_date(stop):
             settings.executor.run(specs, place, stop)
     finally:
         _leave_none_running(specs, place.store)

@@ -19,7 +19,7 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 SILENCE_SECONDS = 300.0
 
 
-class Standing(StrEnum):
+class DisplayStatus(StrEnum):
     """Where a trial stands for a person: its status, and whether it is still alive."""
 
     COMPLETE = "complete"
@@ -37,20 +37,20 @@ class TrialProgress:
 
     Attributes:
         spec: the trial.
-        standing: where it stands.
+        status: where it stands.
         record: what its files say.
     """
 
     spec: TrialSpec
-    standing: Standing
+    status: DisplayStatus
     record: TrialRecord
 
     @property
     def fraction(self) -> float:
         """The share of its environment steps that is done, in [0, 1]; 0 of a damaged one."""
-        if self.standing is Standing.COMPLETE:
+        if self.status is DisplayStatus.COMPLETE:
             return 1.0
-        if self.standing is Standing.DAMAGED:
+        if self.status is DisplayStatus.DAMAGED:
             return 0.0
         return min(1.0, self.record.env_steps / self.spec.total_steps)
 
@@ -66,10 +66,10 @@ class SweepProgress:
     trials: tuple[TrialProgress, ...]
 
     @property
-    def counts(self) -> Mapping[Standing, int]:
+    def counts(self) -> Mapping[DisplayStatus, int]:
         """How many trials stand where."""
-        found = Counter(trial.standing for trial in self.trials)
-        return {standing: found[standing] for standing in Standing}
+        found = Counter(trial.status for trial in self.trials)
+        return {status: found[status] for status in DisplayStatus}
 
     @property
     def fraction(self) -> float:
@@ -83,13 +83,13 @@ class SweepProgress:
         return sum(
             (1.0 - trial.fraction) * trial.spec.total_steps
             for trial in self.trials
-            if trial.standing is not Standing.FAILED
+            if trial.status is not DisplayStatus.FAILED
         )
 
     @property
     def steps_per_second(self) -> float:
         """Environment steps per second of all running trials together."""
-        return sum(trial.record.steps_per_second for trial in self.standing(Standing.RUNNING))
+        return sum(trial.record.steps_per_second for trial in self.with_status(DisplayStatus.RUNNING))
 
     @property
     def seconds_left(self) -> float | None:
@@ -99,11 +99,11 @@ class SweepProgress:
     @property
     def is_complete(self) -> bool:
         """Whether every trial is complete."""
-        return all(trial.standing is Standing.COMPLETE for trial in self.trials)
+        return all(trial.status is DisplayStatus.COMPLETE for trial in self.trials)
 
-    def standing(self, *standings: Standing) -> tuple[TrialProgress, ...]:
+    def with_status(self, *statuses: DisplayStatus) -> tuple[TrialProgress, ...]:
         """The trials that stand there."""
-        return tuple(trial for trial in self.trials if trial.standing in standings)
+        return tuple(trial for trial in self.trials if trial.status in statuses)
 
 
 def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None = None) -> SweepProgress:
@@ -118,24 +118,24 @@ def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None
     trials = []
     for spec in specs:
         record = store.trial(spec).record()
-        trials.append(TrialProgress(spec, standing_of(record, now=now), record))
+        trials.append(TrialProgress(spec, display_status(record, now=now), record))
     return SweepProgress(tuple(trials))
 
 
-def standing_of(record: TrialRecord, *, now: float) -> Standing:
+def display_status(record: TrialRecord, *, now: float) -> DisplayStatus:
     """Where a trial stands at a time: its status, unless it died without a word."""
     match record.status:
         case TrialState.COMPLETE:
-            return Standing.COMPLETE
+            return DisplayStatus.COMPLETE
         case TrialState.FAILED:
-            return Standing.FAILED
+            return DisplayStatus.FAILED
         case TrialState.DAMAGED:
-            return Standing.DAMAGED
+            return DisplayStatus.DAMAGED
         case TrialState.WAITING:
-            return Standing.STOPPED if record.attempt else Standing.WAITING
+            return DisplayStatus.STOPPED if record.attempt else DisplayStatus.WAITING
         case TrialState.RUNNING:
             silent = now - record.heartbeat > SILENCE_SECONDS
-            return Standing.INTERRUPTED if silent or _has_no_process(record) else Standing.RUNNING
+            return DisplayStatus.INTERRUPTED if silent or _has_no_process(record) else DisplayStatus.RUNNING
 
 
 def _has_no_process(record: TrialRecord) -> bool:

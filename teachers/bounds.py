@@ -1,28 +1,28 @@
-"""What a curriculum may cost at worst: Lemma 1 and Proposition 1 of the paper (section 5.2), and the inverse.
+"""Worst-case cost of a curriculum: Lemma 1 and Proposition 1 of the paper (section 5.2), and the inverse.
 
-CPO bounds by how much one update may overshoot its limit (Lemma 1). Summed over the updates of a training
-phase, under the limits D(b) of a curriculum, this bounds what the whole phase costs (Proposition 1). Turned
-round, it says which d_t a budget of cumulative cost allows.
+CPO bounds the violation of one update (Lemma 1). Summed over the updates of a training phase under the limits
+D(b) of a curriculum, this bounds the cost of the whole phase (Proposition 1). The inverse gives the largest
+d_t within a budget of cumulative cost.
 
-*What is summed.* The paper counts one episode to a policy, b = 1 ... B. Here b counts the policies, n of
-them; a trial that collects E episodes with each costs E times as much.
+*Index.* In the paper each policy runs one episode, b = 1 ... B. Here b counts the policies, n of them; a
+trial that collects E episodes with each costs E times as much.
 
-*When the clock is read.* In Algorithm 1 policy b learns under p = b / n (``end``): the first limit is already
-below d_t, and the last one is d_d. A trial sets the limit before it collects (``start``): p = (b - 1) / n,
-and the first limit is d_t. The sum is then larger by D(0) - D(1) = d_t - d_d.
+*Clock.* In Algorithm 1 policy b learns under p = b / n (``end``): the first limit is already below d_t, and
+the last one is d_d. A trial sets the limit before it collects (``start``): p = (b - 1) / n, and the first
+limit is d_t. The sum is then larger by D(0) - D(1) = d_t - d_d.
 
 *The paper's sum.* Its proof has sum D(b) = B (d_d + d_t) / 2 for the linear curriculum. The sum of Algorithm
-1's limits is less, by (d_t - d_d) / 2, so Proposition 1 holds; a trial's is more, by as much.
+1's limits is smaller by (d_t - d_d) / 2, so Proposition 1 holds. A trial's sum is larger by the same amount.
 
-*Discounted or not.* Lemma 1 is about the discounted cost, sum gamma^t c_t. Limits in this package are on the
-undiscounted cost of an episode, for which the like is proved below (``undiscounted_excess``). Never add one
-kind to the other.
+*Discounting.* Lemma 1 is about the discounted cost, sum gamma^t c_t. Limits in this package are on the
+undiscounted cost of an episode; ``undiscounted_excess`` has a corresponding lemma with proof. Do not add
+discounted and undiscounted values.
 
-The bounds hold for updates that solve CPO's problem under a finite limit. Recovery steps, updates that
-noise was added to, and those over which an infinite d_t is measured are not covered.
+The bounds hold for updates that solve CPO's problem under a finite limit. They do not cover recovery steps,
+updates with noise, and updates during the measurement of an infinite d_t.
 
-Notation: d_t, d_d training and deployment limit of one cost, d a limit in force, n the number of policies,
-p in [0, 1] progress, w(p) the weight of d_t in D = d_d + w (d_t - d_d), delta the bound on (or the measured)
+Notation: d_t, d_d training and deployment limit of one cost, d a limit in force, n the number of policies, p
+in [0, 1] progress, w(p) the weight of d_t in D = d_d + w (d_t - d_d), delta the bound on (or the measured)
 mean KL divergence of an update, eps = max_s |E_{a ~ new policy} A_C(s, a)|, gamma the discount, H the
 horizon.
 """
@@ -35,11 +35,11 @@ from typing import Literal
 
 from recrl.teachers.static import Decay, cosine, exponential, hold, limit_at, linear
 
-# When a policy's progress is read: p = b / n (Algorithm 1) or p = (b - 1) / n (a trial).
+# Time of a policy's progress: p = b / n (Algorithm 1) or p = (b - 1) / n (a trial).
 Clock = Literal["start", "end"]
 
-# The curricula that have a bound before they have run. The limits of ``dynamic`` are unknown but at most d_t,
-# as those of ``step``.
+# Curricula with a bound known in advance. The limits of ``dynamic`` are unknown, but at most d_t like those
+# of ``step``.
 DECAYS: dict[str, Decay] = {
     "step": hold,
     "dynamic": hold,
@@ -70,7 +70,7 @@ _WEIGHT_SUMS: dict[str, Callable[[int], float]] = {
 
 
 def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
-    """By how much one update's discounted cost may exceed its limit (Lemma 1).
+    """Bound the excess of one update's discounted cost over its limit (Lemma 1).
 
     sqrt(2 delta) gamma eps / (1 - gamma)^2, from J_C(pi_{b+1}) <= d + this.
 
@@ -86,12 +86,12 @@ def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
 
 
 def undiscounted_excess(kl: float, advantage: float, *, horizon: int) -> float:
-    """By how much one update's undiscounted episode cost may exceed its limit.
+    """Bound the excess of one update's undiscounted episode cost over its limit.
 
     sqrt(2 delta) H (H - 1) eps: Lemma 1 for episodes of at most H steps without discounting; ours, not the
-    paper's. J_C(new) - J_C(old) is the sum over t of E A_t under the new policy's states. Replace them by the
-    old policy's, which is what CPO constrains: the state distributions at t differ (in L1) by at most
-    2 sum_{j<t} E TV(new, old), TV <= sqrt(KL / 2) (Pinsker), and |E A_t| <= eps. Sum over t = 1 ... H - 1.
+    paper's. J_C(new) - J_C(old) is the sum over t of E A_t under the new policy's states. CPO constrains it
+    under the old policy's states instead. The state distributions at t differ (in L1) by at most 2 sum_{j<t}
+    E TV(new, old), TV <= sqrt(KL / 2) (Pinsker), and |E A_t| <= eps. Sum over t = 1 ... H - 1.
 
     Args:
         kl: delta, mean over the steps of the old policy's episodes, at least 0.
@@ -105,21 +105,21 @@ def undiscounted_excess(kl: float, advantage: float, *, horizon: int) -> float:
 
 
 def worst_case_cost(limit: float, excess: float) -> float:
-    """Lemma 1: J_C(pi_{b+1}) <= d + excess, discounted or not as the excess is."""
+    """Return the bound of Lemma 1: J_C(pi_{b+1}) <= d + excess, discounted or not like the excess."""
     return limit + excess
 
 
 def summed_limits(
     curriculum: str, train_limit: float, deploy_limit: float, *, policies: int, clock: Clock
 ) -> float:
-    """The sum of a curriculum's limits, sum_b D(b), by adding them up.
+    """Return the sum of a curriculum's limits, sum_b D(b), by adding them up.
 
     Args:
         curriculum: a key of ``MEAN_WEIGHTS``; for ``dynamic`` an upper bound.
         train_limit: d_t, finite.
         deploy_limit: d_d, at most d_t.
         policies: n, at least 1.
-        clock: when progress is read.
+        clock: time of a policy's progress.
     """
     _require_bound(curriculum)
     if curriculum == "none":
@@ -132,7 +132,7 @@ def summed_limits(
 
 
 def weight_sum(curriculum: str, *, policies: int, clock: Clock) -> float:
-    """The sum of the weights of d_t, sum_b w(p_b), in closed form.
+    """Return the sum of the weights of d_t, sum_b w(p_b), in closed form.
 
     With p_b = b / n: linear (n - 1) / 2; cosine (cot(pi / 4n) - 1) / 2; exponential
     1 / (e^(1/n) - 1) - n / (e - 1); step n - 1. With p_b = (b - 1) / n one more, w(0) - w(1) = 1.
@@ -148,14 +148,14 @@ def weight_sum(curriculum: str, *, policies: int, clock: Clock) -> float:
 def cumulative_bound(
     curriculum: str, train_limit: float, deploy_limit: float, *, excesses: Sequence[float], clock: Clock
 ) -> float:
-    """What a training phase may cost: sum_b (D(b) + excess_b), exactly summed in closed form.
+    """Bound the cost of a training phase: sum_b (D(b) + excess_b), in closed form.
 
     Args:
         curriculum: a key of ``MEAN_WEIGHTS``.
         train_limit: d_t, finite.
         deploy_limit: d_d, at most d_t.
         excesses: of each policy, [n], n >= 1; all discounted or all undiscounted.
-        clock: when progress is read.
+        clock: time of a policy's progress.
 
     Returns:
         A bound on the sum over the n policies of their expected cost per episode.
@@ -167,11 +167,11 @@ def cumulative_bound(
 def proposition_1(
     curriculum: str, train_limit: float, deploy_limit: float, *, excesses: Sequence[float]
 ) -> float:
-    """Proposition 1, for every curriculum: n (d_d + (d_t - d_d) integral w) + sum_b excess_b.
+    """Return Proposition 1 for any curriculum: n (d_d + (d_t - d_d) integral w) + sum_b excess_b.
 
-    For the linear one, n (d_d + d_t) / 2 + sum_b excess_b as in the paper. The weights fall, so their sum at
-    p = b / n is at most n times the integral: it bounds ``cumulative_bound`` with the clock ``end``, not with
-    ``start``.
+    For the linear one it is n (d_d + d_t) / 2 + sum_b excess_b as in the paper. The weights decrease, so
+    their sum at p = b / n is at most n times the integral. So it bounds ``cumulative_bound`` with the clock
+    ``end``, not with ``start``.
 
     Args:
         curriculum: a key of ``MEAN_WEIGHTS``.
@@ -190,16 +190,16 @@ def proposition_1(
 def largest_train_limit(
     curriculum: str, budget: float, deploy_limit: float, *, excesses: Sequence[float], clock: Clock
 ) -> float:
-    """The largest d_t whose ``cumulative_bound`` is within a budget: its inverse.
+    """Return the largest d_t with a ``cumulative_bound`` within a budget.
 
-    d_t = d_d + (budget - n d_d - sum_b excess_b) / sum_b w(p_b); infinite where d_t does not matter.
+    d_t = d_d + (budget - n d_d - sum_b excess_b) / sum_b w(p_b); infinite if d_t does not matter.
 
     Args:
         curriculum: a key of ``MEAN_WEIGHTS``.
-        budget: cumulative cost that is allowed, of the same kind as the excesses.
+        budget: allowed cumulative cost, discounted or not like the excesses.
         deploy_limit: d_d.
         excesses: of each policy, [n], n >= 1.
-        clock: when progress is read.
+        clock: time of a policy's progress.
 
     Raises:
         ValueError: not even d_t = d_d is within the budget.
@@ -218,7 +218,7 @@ def largest_train_limit(
 
 
 def _require_bound(curriculum: str) -> None:
-    """Raise ValueError if nothing is known of the curriculum's limits before it has run."""
+    """Raise ValueError if the curriculum's limits are not known in advance."""
     if curriculum not in MEAN_WEIGHTS:
         raise ValueError(
             f"only {', '.join(MEAN_WEIGHTS)} have a bound before they have run, got {curriculum!r}"

@@ -1,22 +1,21 @@
-"""The cooling curriculum: a reward for being random, and a limit that is relaxed in proportion to it (ours).
+"""The cooling curriculum: an annealed entropy reward, and a limit that is relaxed in proportion to it (ours).
 
-An agent that settles on the first way it finds tries no other, and noise in its parameters is undone before
-it leads anywhere. Here randomness is *worth* something: every nat of the policy's entropy counts as so much
-reward, a temperature that falls in a straight line. While it is high the agent keeps several ways open and
-the best of them gains as it falls, instead of the first. A random policy cannot keep d_d, and an agent that
-is held to it all the same stays where nothing costs anything; so the limit is relaxed as far as the
-temperature is high, and both arrive together.
+An agent that converges to the first solution it finds tries no other, and parameter noise is undone before it
+has an effect. Here the policy's *entropy* is rewarded, with a coefficient that decreases linearly. While the
+coefficient is large, the agent keeps several solutions, and the best of them gains as it decreases. A random
+policy cannot keep d_d: under that limit an agent would only avoid all cost. So the limit is relaxed in
+proportion to the coefficient, and both reach their final values together.
 
-    h = max(0, 1 - p / cooled)      heat: 1 at first, 0 from the share ``cooled`` of B on
+    h = max(0, 1 - p / cooled)      annealing factor: 1 at first, 0 from the fraction ``cooled`` of B on
     d = min(d_t, d_d (1 + relaxation h))
     tau = temperature h             reward per nat, in the next update
 
-Where nothing is left to learn at a temperature, log pi(a | s) is the advantage over the temperature, up to a
-constant: ``Experience.with_entropy``. It needs an agent whose price for a violation can rise until no way
-through it pays (``ppo-lag`` as it is, or with a ``multiplier_maximum`` above that price; ``cpo``).
+If learning has converged at a coefficient tau, log pi(a | s) is the advantage over tau, up to a constant; see
+``Experience.with_entropy``. The agent's multiplier must be able to grow until no violation pays. ``ppo-lag``
+(with a sufficient ``multiplier_maximum``) and ``cpo`` have this property.
 
 Notation: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
-environment steps, p in [0, 1] the share of B that is used up, k the number of costs.
+environment steps, p in [0, 1] the used fraction of B, k the number of costs.
 """
 
 from __future__ import annotations
@@ -42,27 +41,28 @@ class CoolingConfig(BaseModel):
         default=1.0,
         gt=0.0,
         allow_inf_nan=False,
-        description="What a nat of the policy's entropy is worth at first, in the task's reward per step; "
-        "about a tenth of what an episode is about.",
+        description="Initial entropy coefficient: reward per nat and step, in the task's unit; "
+        "about a tenth of the differences in return of an episode.",
     )
     relaxation: float = Field(
         default=1.5,
         ge=0.0,
         allow_inf_nan=False,
-        description="By what share of itself d_d is relaxed at first, d_t permitting.",
+        description="Initial relaxation of the limit, as a fraction of d_d; the limit is at most d_t.",
     )
     cooled: float = Field(
         default=0.7,
         gt=0.0,
         le=1.0,
-        description="Share of the training budget from which entropy is worth nothing and the limit is d_d.",
+        description="Fraction of the training budget after which the entropy coefficient is 0 and "
+        "the limit is d_d.",
     )
 
 
-def heat(p: float, cooled: float) -> float:
-    """h: 1 at first, then falling in a straight line, 0 from p = cooled on.
+def annealing_factor(p: float, cooled: float) -> float:
+    """Return h: 1 at first, linearly decreasing, 0 from p = ``cooled`` on.
 
-    >>> heat(0.25, 0.5)
+    >>> annealing_factor(0.25, 0.5)
     0.5
     """
     return max(0.0, 1.0 - p / cooled)
@@ -72,7 +72,7 @@ class CoolingTeacher:
     """The cooling curriculum, a function of the clock only.
 
     Its state holds ``update``, ``limits`` [k], ``policy_noise`` (always 0), ``entropy_coefficient``
-    and ``start_limits`` (where the limits begin, [k]).
+    and ``start_limits`` (the initial limits, [k]).
 
     Args:
         spec: d_t, d_d, B and the options of ``CoolingConfig``.
@@ -90,19 +90,19 @@ class CoolingTeacher:
         """See ``Teacher.step``."""
         if already_seen(state, report):
             return CurriculumStep.from_json(state), state
-        left = heat(progress(report.env_steps, self.spec.train_steps), self.config.cooled)
-        return self._taught(report.update, left, self.config.temperature * left)
+        factor = annealing_factor(progress(report.env_steps, self.spec.train_steps), self.config.cooled)
+        return self._taught(report.update, factor, self.config.temperature * factor)
 
-    def _limits(self, left: float) -> CostLimits:
-        """The limits at the heat h, [k]."""
+    def _limits(self, factor: float) -> CostLimits:
+        """Return the limits at the annealing factor h, [k]."""
         return CostLimits(
             tuple(
-                min(train, deploy * (1.0 + self.config.relaxation * left))
+                min(train, deploy * (1.0 + self.config.relaxation * factor))
                 for train, deploy in zip(self.spec.train_limits, self.spec.deploy_limits, strict=True)
             )
         )
 
-    def _taught(self, update: int, left: float, coefficient: float) -> tuple[CurriculumStep, TeacherState]:
-        """The step at the heat h after an update, and the state that says so."""
-        step = CurriculumStep(self._limits(left), 0.0, coefficient, self._limits(1.0))
+    def _taught(self, update: int, factor: float, coefficient: float) -> tuple[CurriculumStep, TeacherState]:
+        """Return the step at the annealing factor h after an update, and its state."""
+        step = CurriculumStep(self._limits(factor), 0.0, coefficient, self._limits(1.0))
         return step, {"update": update, **step.to_json()}

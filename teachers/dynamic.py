@@ -1,51 +1,50 @@
 """The dynamic curriculum: the cost limit follows the agent (CLiC_D, Algorithm 2 of the paper).
 
-The teacher compares the agent's last two windows. Once return and costs have stopped changing, an agent
-that keeps its limit is given a lower one, and an agent that does not is stuck: its policy gets noise.
+The curriculum compares the agent's last two windows. It decides once return and costs have converged. An
+agent that keeps its limit gets a lower one. An agent that does not is stuck, and its policy gets noise.
 
-Where Algorithm 2 is silent or goes wrong, and what is done here; the preset ``paper`` is the pseudocode to
-the letter wherever it is defined.
+The list below has the gaps and faults of Algorithm 2, and their solutions here. The preset ``paper`` is the
+literal pseudocode wherever it is defined.
 
-- *Clock.* The agent learns once per policy update, so it is judged once per update, over windows of whole
-  updates (``windows``). With one episode an update this is Algorithm 2's clock.
-- *Enough episodes* (``window_grows``). The ratio of two noisy means passes the test of line 5 by chance: with
-  8 episodes a window, frozen policies of Safety Gym did in up to 59% of the cases. So a window takes in more
-  updates until the standard errors of its means are within the tolerances, and until then nothing is decided.
-  The tolerances are of the mean or of the episodes' standard deviation, whichever is more, so that 100
-  episodes always are enough.
-- *Zero and negative means* (line 5). |new / old - 1| divides by zero for an agent that has become perfectly
-  safe, and it would wait for ever. |new - old| <= eps max(|old|, floor) is the same test where that is
-  defined, and 0 against 0 has converged. The floor keeps small means from being compared by their noise.
-- *Nothing finished.* A window without an episode says nothing: hold.
-- *Adherence* (line 6). An agent at its optimum has a mean cost a little above its limit as often as below,
-  or always (whoever must cross five tiles of river and slips once in a while costs 5.004), and C <= d would
-  kick it for ever. C may exceed d by as much as line 5 lets equal costs differ, or by its standard error.
-- *The step* (line 7). B - b counts episodes, b being the one about to be played, but a limit moves only once
-  per window, so that the limits stay far above d_d. Counted in windows that are left, the steps add up to the
-  whole way. The last two are not counted: so long an agent may need to settle after a large step, and it
-  would meet d_d only at B.
-- *Which limits a window was played under.* The newer window lies wholly after the last change (line 4); the
-  older one may lie before it, so that an agent who follows each change at once is not made to wait twice.
-- *last_change* is reset when limits or policy have changed. Line 11 also resets it when nothing has, that
-  is, whenever the agent has converged: a limit that is d_d already, or noise of 0, then delays the next
-  test by a window (``clock_reset``).
-- *Noise* (line 9) is a disturbance of the teacher's own making: costs jump, and take updates to come back. If
-  the next window is compared with the one before the noise, two windows with the same jump in them look
-  converged and above the limit, and noise follows noise at the pace of the windows for ever. Both windows
-  lie after the last noise.
-- *Limits never rise.* With the tolerance C may lie above d: the step is taken from min(C, d).
-- *Infinite limits.* C <= d holds, and line 7 takes d from infinity to about C: nothing goes wrong. But the
-  start may be measured instead (``start_fraction``), and then nothing is judged until it is known.
-- *Several costs* (lines 5 to 7 say "for all i"). One cost that is still moving, or that cannot be kept,
-  would hold the limits of all the others at d_t. Each limit goes its own way: it falls when the return and
-  its own cost have converged and its own limit is kept; the policy gets noise when any converged cost is
-  above its limit. A step in one dimension makes the others wait for one window, and noise for two.
-- *The end.* At B the limits are d_d whatever the agent does, and there is no noise.
+- *Clock.* The agent learns once per policy update, so the curriculum decides once per update, over windows of
+  whole updates (``windows``). With one episode per update this is Algorithm 2's clock.
+- *Enough episodes* (``window_grows``). The ratio of two noisy means passes the test of line 5 by chance. With
+  8 episodes per window, constant policies of Safety Gym did in up to 59% of the cases. So a window includes
+  more updates until the standard errors of its means are within the tolerances. Until then there is no
+  decision. The tolerances are relative to the mean or to the episodes' standard deviation, whichever is
+  larger, so that 100 episodes are always enough.
+- *Zero and negative means* (line 5). For an agent without costs, |new / old - 1| divides by zero, and the
+  agent would wait without end. Here the test is |new - old| <= eps max(|old|, floor). It is the same if old
+  is large, and 0 after 0 has converged. The floor avoids comparing small means by their noise.
+- *No finished episode.* A window without an episode gives no information: the limits do not change.
+- *Adherence* (line 6). The mean cost of an agent at its optimum is a little above its limit as often as
+  below, or always: an agent that must cross five tiles of river and sometimes slips costs 5.004. C <= d would
+  add noise again and again. So C may exceed d by the change that line 5 tolerates, or by its standard error.
+- *The step* (line 7). B - b counts episodes, b being the next one, but a limit changes only once per window,
+  so the limits would stay far above d_d. With the remaining windows as the divisor, the steps reach d_d. The
+  last two windows are not counted: the agent may need them to converge after a large step. Otherwise it would
+  reach d_d only at B.
+- *Limits of a window.* The newer window lies entirely after the last change (line 4). The older one may lie
+  before it, so an agent that follows each change immediately need not wait twice.
+- *last_change* is reset when limits or policy have changed. Line 11 also resets it when neither has, that is,
+  whenever the agent has converged. With a limit of d_d or noise of 0 that delays the next test by a window
+  (``clock_reset``).
+- *Noise* (line 9) is a disturbance that the curriculum itself makes: costs jump, and recover over several
+  updates. Two windows after the noise may look converged and above the limit, because both contain the jump.
+  Then noise would follow noise at every window. So both windows must lie after the last noise.
+- *Limits never rise.* With the tolerance C may lie above d: the step starts from min(C, d).
+- *Infinite limits.* C <= d holds, and line 7 takes d from infinity to about C, which is correct. But the
+  start may be measured instead (``start_fraction``); then there is no decision until it is known.
+- *Several costs* (lines 5 to 7 say "for all i"). One cost that has not converged, or cannot be kept, would
+  keep all other limits at d_t. Here each limit is separate. It falls when the return and its own cost have
+  converged and its own limit is kept. The policy gets noise when any converged cost is above its limit. A
+  step in one dimension makes the others wait for one window, and noise for two.
+- *The end.* At B the limits are d_d in any case, and there is no noise.
 
-Line 7 is kept as it is: an agent whose converged cost is below d_d is given d_d at once.
+Line 7 is used as it is: an agent whose converged cost is below d_d gets d_d immediately.
 
 Notation: d limits in force, d_t training limits, d_d deployment limits, B the training budget in environment
-steps, b an episode, C-bar and r-bar the mean episode cost and return of a window, W a window's size, k the
+steps, b an episode; C-bar and r-bar the mean episode cost and return of a window, W a window's size; k the
 number of costs, eps_r, eps_c, eps_pi the paper's settings.
 """
 
@@ -63,9 +62,9 @@ from recrl.teachers.windows import WindowStatistics, extend, last_two_windows
 
 
 def has_converged(new: float, old: float, *, tolerance: float, floor: float) -> bool:
-    """Whether a mean has stopped changing: |new - old| <= eps max(|old|, floor).
+    """Whether a mean has converged: |new - old| <= eps max(|old|, floor).
 
-    Algorithm 2, line 5, |new / old - 1| <= eps, made sound for means that are or nearly are zero.
+    Algorithm 2, line 5, |new / old - 1| <= eps, corrected for means at or near zero.
 
     Args:
         new: mean over the last window.
@@ -82,15 +81,15 @@ def has_converged(new: float, old: float, *, tolerance: float, floor: float) -> 
 
 
 def keeps_limit(cost: float, limit: float, *, tolerance: float) -> bool:
-    """Whether the policy adheres to a limit: C-bar <= d + tolerance (Algorithm 2, line 6, has none).
+    """Whether the policy adheres to a limit: C-bar <= d + tolerance (none in Algorithm 2, line 6).
 
-    A mean of equal numbers may differ from them in the last digits, so equality is up to 1e-9.
+    The comparison allows for rounding errors of 1e-9.
     """
     return cost <= limit + tolerance or math.isclose(cost, limit, rel_tol=1e-9)
 
 
 def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int) -> float:
-    """The limit after one that was kept: d <- max(d_d, C - (C - d_d) / n) with C = min(C-bar, d).
+    """Return the limit after one that was kept: max(d_d, C - (C - d_d) / n) with C = min(C-bar, d).
 
     Algorithm 2, line 7, where C-bar <= d. Written d_d + (C - d_d)(1 - 1 / n), which is the same and is d_d
     exactly when n = 1.
@@ -99,7 +98,7 @@ def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int
         limit: d, possibly infinite.
         cost: C-bar, at least 0.
         deploy_limit: d_d, finite.
-        remaining: n, the steps that are left; less than 1 counts as 1.
+        remaining: n, the number of remaining steps; less than 1 counts as 1.
 
     >>> next_limit(math.inf, 65.0, 5.0, remaining=6)
     55.0
@@ -119,11 +118,11 @@ def decide(
     remaining: int,
     config: DynamicConfig,
 ) -> CurriculumStep:
-    """Lines 5 to 10 of Algorithm 2: the next step.
+    """Return the next step, by lines 5 to 10 of Algorithm 2.
 
     Args:
         old: the window before the last.
-        new: the last window, wholly after the last change.
+        new: the last window, entirely after the last change.
         limits: d in force, [k].
         deploy_limits: d_d, [k].
         remaining: n of ``next_limit``.
@@ -148,7 +147,7 @@ def decide(
 def _converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConfig) -> list[bool]:
     """Whether the return and the cost of each dimension have converged (line 5), [k].
 
-    Never where a window has no episode. Jointly, none has before all have.
+    It is false if a window has no episode. With joint limits, it is the same for all costs.
     """
     if old.episodes == 0 or new.episodes == 0:
         return [False] * len(new.mean_costs)
@@ -164,7 +163,7 @@ def _converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConf
 
 
 def _floors(window: WindowStatistics, config: DynamicConfig) -> tuple[float, tuple[float, ...]]:
-    """What a mean return and mean costs at least count as in a comparison: the floor, or the spread."""
+    """Return the scales for comparing the mean return and the mean costs: the floor, or the spread."""
     if not config.window_grows:
         return config.return_floor, (config.cost_floor,) * len(window.mean_costs)
     cost_floors = tuple(max(spread, config.cost_floor) for spread in window.cost_spreads)
@@ -172,7 +171,7 @@ def _floors(window: WindowStatistics, config: DynamicConfig) -> tuple[float, tup
 
 
 def is_precise(window: WindowStatistics, config: DynamicConfig) -> bool:
-    """Whether a window's means are known to within what equal means may differ by.
+    """Whether the standard errors of a window's means are within the tolerances.
 
     s <= eps max(|mean|, floor, standard deviation), s the standard error of the return and of each cost. With
     eps = 0.1 a hundred episodes are always enough.
@@ -197,7 +196,7 @@ def _kept(new: WindowStatistics, limits: CostLimits, config: DynamicConfig) -> l
 
 
 def _tolerance(limit: float, standard_error: float, config: DynamicConfig) -> float:
-    """By how much a mean cost may exceed its limit."""
+    """Return the tolerance by which a mean cost may exceed its limit."""
     match config.adherence_tolerance:
         case "none":
             return 0.0
@@ -210,13 +209,12 @@ def _tolerance(limit: float, standard_error: float, config: DynamicConfig) -> fl
 def steps_left(
     last: WindowStatistics, *, env_steps: int, train_steps: int, unit: Literal["windows", "episodes"]
 ) -> int:
-    """How many steps of ``next_limit`` the training budget has room for, at the pace of the last window.
+    """Return the number of steps of ``next_limit`` in the remaining budget, at the last window's pace.
 
-    B is given in environment steps; how many episodes it holds is known only afterwards. The last window
-    took some steps and finished some episodes, so what is left holds (B - env steps) / steps such windows,
-    and as many times its episodes. Rounded down. The last two windows are not counted. Of the episodes the
-    next one is not counted: Algorithm 2 judges before it plays episode b, when b - 1 are played and
-    B - b + 1 are left.
+    B is in environment steps, and its number of episodes is not known in advance. At the steps and episodes
+    of the last window, (B - env steps) / steps windows remain, with that multiple of its episodes. Both are
+    rounded down. The last two windows are not counted, nor is the next episode: Algorithm 2 decides before it
+    runs episode b, when B - b + 1 episodes remain.
 
     >>> last = WindowStatistics(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
@@ -232,8 +230,8 @@ class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
-    episodes since limits or policy were changed, in the unit of W), ``history`` (``WindowStatistics`` of each
-    update of the last two windows, as far as they are comparable) and the keys of ``StartMeasurement``.
+    episodes since limits or policy were changed); ``history`` (``WindowStatistics`` of each comparable update
+    of the last two windows) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
@@ -291,7 +289,7 @@ class DynamicTeacher:
         return CurriculumStep.from_json(next_state), next_state
 
     def _history(self, state: TeacherState, report: ProgressReport) -> tuple[WindowStatistics, ...]:
-        """The updates of the last two windows, or all of them as long as they are fewer."""
+        """Return the updates of the last two windows, or all of them if they are fewer."""
         latest = WindowStatistics.of_update(
             report.episodes,
             env_steps=report.env_steps - state["env_steps"],
@@ -308,7 +306,7 @@ class DynamicTeacher:
 
     @property
     def _groups(self) -> tuple[tuple[int, ...], ...]:
-        """The costs that are judged together: all, or where windows grow each limit on its own."""
+        """Return the groups of costs with common windows: all costs, or each one separately."""
         costs = tuple(range(len(self.spec.train_limits)))
         if self.config.window_grows and self.config.dimensions == "separate":
             return tuple((index,) for index in costs)
@@ -317,7 +315,7 @@ class DynamicTeacher:
     def _last_two(
         self, history: Sequence[WindowStatistics], group: tuple[int, ...]
     ) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
-        """The updates of the last two windows for a group of costs, or None as long as there are too few."""
+        """Return the updates of the last two windows for a group of costs, or None if there are too few."""
         config = self.config
         return last_two_windows(
             history,
@@ -329,7 +327,7 @@ class DynamicTeacher:
         )
 
     def _is_due(self, newest: Sequence[WindowStatistics], last_change: int) -> bool:
-        """Whether a newest window lies wholly after the last change (line 4)."""
+        """Whether a newest window lies entirely after the last change (line 4)."""
         in_episodes = self.config.window_unit == "episodes"
         length = sum(each.episodes for each in newest) if in_episodes else len(newest)
         return not self.config.window_grows or last_change >= length
@@ -337,7 +335,7 @@ class DynamicTeacher:
     def _windows(
         self, history: Sequence[WindowStatistics], group: tuple[int, ...], last_change: int
     ) -> tuple[WindowStatistics, WindowStatistics] | None:
-        """The last two windows of a group of costs, each pooled; None if they are too few or too old."""
+        """Return the last two windows of a group of costs, each pooled; None if too few or too old."""
         windows = self._last_two(history, group)
         if windows is None or not self._is_due(windows[1], last_change):
             return None
@@ -352,7 +350,7 @@ class DynamicTeacher:
     def _decide(
         self, limits: CostLimits, history: Sequence[WindowStatistics], env_steps: int, last_change: int
     ) -> CurriculumStep:
-        """The next step once W has passed since the last change."""
+        """Return the next step once W has passed since the last change."""
         values, noise = list(limits), 0.0
         for group in self._groups:
             windows = self._windows(history, group, last_change)
@@ -384,7 +382,7 @@ def _state(
     history: Sequence[WindowStatistics],
     start: dict[str, Any],
 ) -> dict[str, Any]:
-    """A state as JSON."""
+    """Return a state as JSON."""
     return {
         "update": update,
         "env_steps": env_steps,

@@ -1,4 +1,4 @@
-"""The teachers by name; a user's own come in by entry point (``recrl.teachers``) or import path."""
+"""The curricula by name; users add theirs by entry point (``recrl.teachers``) or import path."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from recrl.teachers.teacher import Teacher, TeacherSpec
 
 @dataclass(frozen=True)
 class TeacherKind:
-    """What a teacher's name stands for; a user's entry point or import path leads to one of these.
+    """Entry of a curriculum in the registry; users' entry points and import paths refer to one.
 
     Attributes:
-        summary: one sentence for people who choose a curriculum.
+        summary: one sentence of description.
         config: the pydantic model of its options.
-        make: builds it; may rely on options that ``config`` has accepted.
+        make: builds it, from options that ``config`` has accepted.
     """
 
     summary: str
@@ -46,10 +46,10 @@ TEACHERS: dict[str, TeacherKind] = {
     "none": TeacherKind("No curriculum: d_d from the start.", NoConfig, none_teacher),
     "step": TeacherKind("A control: d_t until B, then d_d at once.", NoConfig, step_teacher),
     "unconstrained": TeacherKind(
-        "A control: no limit until B, whatever d_t is, then d_d at once.", NoConfig, unconstrained_teacher
+        "A control: no limit until B, for any d_t, then d_d at once.", NoConfig, unconstrained_teacher
     ),
     "linear": TeacherKind(
-        "CLiC_L: from d_t to d_d in a straight line.", DecayConfig, partial(decay_teacher, decay=linear)
+        "CLiC_L: from d_t to d_d linearly.", DecayConfig, partial(decay_teacher, decay=linear)
     ),
     "cosine": TeacherKind(
         "CLiC_C: from d_t to d_d, slowly at first.", DecayConfig, partial(decay_teacher, decay=cosine)
@@ -58,12 +58,12 @@ TEACHERS: dict[str, TeacherKind] = {
         "CLiC_E: from d_t to d_d, fast at first.", DecayConfig, partial(decay_teacher, decay=exponential)
     ),
     "dynamic": TeacherKind(
-        "CLiC_D: lower limits for an agent that keeps them, noise for one that is stuck.",
+        "CLiC_D: lower limits for an agent that keeps them, noise for an agent that is stuck.",
         DynamicConfig,
         DynamicTeacher,
     ),
     "cooling": TeacherKind(
-        "Ours: entropy is worth a reward that falls to 0, and the limit, relaxed as far, falls with it.",
+        "Ours: a rewarded entropy that is annealed, and a limit that falls with it.",
         CoolingConfig,
         CoolingTeacher,
     ),
@@ -71,11 +71,11 @@ TEACHERS: dict[str, TeacherKind] = {
 
 
 def find_teacher(name: str) -> TeacherKind:
-    """The curriculum called ``name``.
+    """Return the entry of the curriculum called ``name``.
 
     Raises:
-        UnknownNameError: nobody provides it; the message names the nearest known one.
-        TypeError: what the name leads to is not a TeacherKind.
+        UnknownNameError: the name is not known; the message names the nearest known one.
+        TypeError: the named object is not a TeacherKind.
     """
     kind = resolve(name, kind="teacher", group="recrl.teachers", ours=TEACHERS)
     if not isinstance(kind, TeacherKind):
@@ -84,20 +84,20 @@ def find_teacher(name: str) -> TeacherKind:
 
 
 def teacher_config(name: str, options: Mapping[str, Any]) -> BaseModel:
-    """The validated settings of a teacher, with its defaults and its preset filled in.
+    """Return the validated settings of a curriculum, with its defaults and preset.
 
     Raises:
-        UnknownNameError: nobody provides a teacher of that name.
+        UnknownNameError: there is no curriculum of that name.
         pydantic.ValidationError: an option is unknown or out of its range.
     """
     return find_teacher(name).config.model_validate(dict(options))
 
 
 def make_teacher(spec: TeacherSpec) -> Teacher:
-    """The teacher that ``spec`` describes.
+    """Make the curriculum of ``spec``.
 
     Raises:
-        UnknownNameError: nobody provides a teacher of that name.
+        UnknownNameError: there is no curriculum of that name.
         pydantic.ValidationError: an option is unknown or out of its range.
     """
     kind = find_teacher(spec.name)

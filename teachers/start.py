@@ -1,18 +1,18 @@
-"""Where a curriculum starts when the training limits d_t are infinite.
+"""Initial limits of a curriculum if the training limits d_t are infinite.
 
 A decay from infinity is not defined. Section 5.1 of the paper: "a finite initial cost limit should be used.
 For instance, the agent can be executed on the training model M_t for a few episodes, and the incurred costs
 can be used as the initial cost limits."
 
-Which episodes? An untrained agent may be the most expensive one, as on RiverGrid, where it wanders about in
-the river; or the cheapest, as on Safety Gym, where it hardly moves and an agent that earns reward costs twice
-as much. A limit measured there would be tight from the start. So for a share f of the training budget the
-agent learns without limits in the infinite dimensions, and then
+The choice of the episodes matters. An untrained agent may have the highest cost, as on RiverGrid, where it
+moves at random in the river. Or it has the lowest, as on Safety Gym, where it hardly moves and an agent with
+reward costs twice as much. A limit measured there would be tight from the start. So for a fraction f of the
+training budget the agent learns without limits in the infinite dimensions. Then
 
     d_t := max(d_d, the largest mean cost of any window of episodes so far),
 
 where windows are consecutive and of at least 32 episodes. If no episode has finished by then, the measurement
-goes on until one has.
+continues until one has.
 
 Notation: k the number of costs, B the training budget in environment steps, f = ``start_fraction``.
 """
@@ -33,22 +33,22 @@ KEYS = ("start_limits", "start_episodes", "start_cost_sums", "start_peaks")
 
 @dataclass(frozen=True)
 class StartMeasurement:
-    """The limits a curriculum starts from: d_t where it is finite, else measured.
+    """Initial limits of a curriculum: d_t where it is finite, else measured.
 
-    It keeps four keys in the teacher's state: ``start_limits`` (the d_t that is really used, [k], None as
-    long as it is being measured); ``start_episodes`` and ``start_cost_sums`` [k] of the window under way; and
-    ``start_peaks``, the largest mean cost of a whole window, [k], None before the first.
+    It keeps four keys in the curriculum's state: ``start_limits`` (the actual d_t, [k], None during the
+    measurement); ``start_episodes`` and ``start_cost_sums`` [k] of the present window; and ``start_peaks``,
+    the largest mean cost of a whole window, [k], None before the first.
 
     Attributes:
-        spec: the teacher's.
-        start_fraction: f; 0 takes d_t as it is, infinite or not.
+        spec: of the curriculum.
+        start_fraction: f; 0 uses d_t even if it is infinite.
     """
 
     spec: TeacherSpec
     start_fraction: float
 
     def begin(self) -> dict[str, Any]:
-        """The four keys before any update."""
+        """Return the four keys before any update."""
         is_open = any(
             math.isinf(train) and math.isfinite(deploy)
             for train, deploy in zip(self.spec.train_limits, self.spec.deploy_limits, strict=True)
@@ -62,7 +62,7 @@ class StartMeasurement:
         }
 
     def advance(self, state: TeacherState, report: ProgressReport) -> dict[str, Any]:
-        """The four keys after ``report``."""
+        """Return the four keys after ``report``."""
         keys = {key: state[key] for key in KEYS}
         if keys["start_limits"] is not None:
             return keys
@@ -73,7 +73,7 @@ class StartMeasurement:
         ]
         peaks = keys["start_peaks"]
         is_over = report.env_steps >= self.start_fraction * self.spec.train_steps
-        # What is left of the last window counts only where there is no whole one.
+        # An incomplete last window counts only if there is no complete one.
         if episodes >= WINDOW_EPISODES or (is_over and peaks is None and episodes > 0):
             means = [cost_sum / episodes for cost_sum in sums]
             peaks = means if peaks is None else [max(pair) for pair in zip(peaks, means, strict=True)]
@@ -82,7 +82,7 @@ class StartMeasurement:
         return dict(zip(KEYS, (measured, episodes, sums, peaks), strict=True))
 
     def _measured(self, peaks: list[float]) -> list[float | str]:
-        """d_t where it is finite, else the peak, but at least d_d, as JSON."""
+        """Return d_t where it is finite, else the peak, but at least d_d, as JSON."""
         spec = self.spec
         return CostLimits(
             tuple(
@@ -92,6 +92,6 @@ class StartMeasurement:
         ).to_json()
 
     def limits(self, keys: TeacherState) -> CostLimits:
-        """The d_t in force: the start limits, or d_t itself while they are being measured, [k]."""
+        """Return the d_t in force: the start limits, or d_t itself during the measurement, [k]."""
         start = keys["start_limits"]
         return self.spec.train_limits if start is None else CostLimits.from_json(start)

@@ -1,7 +1,7 @@
 """Static curricula: the cost limit is a fixed function of the training's progress (Algorithm 1).
 
-The three decays of the paper, and the controls that hold one limit for the whole training phase. The clock
-counts environment steps (``teacher.progress``) and is read once per policy update.
+The three decays of the paper, and the controls with a constant limit during training. The clock counts
+environment steps (``teacher.progress``) and is read once per policy update.
 
 Notation: d_t training limits, d_d deployment limits, B the training budget in environment steps,
 p = env steps / B in [0, 1] the progress, k the number of costs.
@@ -64,9 +64,10 @@ def hold(p: float, train_limit: float, deploy_limit: float) -> float:
 
 
 def limit_at(p: float, train_limit: float, deploy_limit: float, decay: Decay) -> float:
-    """The limit of one dimension at progress p, defined for infinite limits too.
+    """Return the limit of one dimension at progress p; d_t may be infinite.
 
-    d_d from p = 1 on; infinite as long as d_t is; else the decay, kept above d_d against rounding.
+    It is d_d from p = 1 on, and infinite before if d_t is. Else it is the decay, at least d_d despite
+    rounding.
     """
     if p >= 1.0 or train_limit == deploy_limit:
         return deploy_limit
@@ -76,15 +77,15 @@ def limit_at(p: float, train_limit: float, deploy_limit: float, decay: Decay) ->
 
 
 class StaticTeacher:
-    """A curriculum that looks at the clock only.
+    """A curriculum that depends on the clock only.
 
     Its state holds ``update``, ``limits`` [k], ``policy_noise`` (always 0) and the keys of
     ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d and B.
-        decay: how the limit falls.
-        start_fraction: share of B in which an infinite d_t is measured; 0 to keep it infinite.
+        decay: the limit as a function of progress.
+        start_fraction: fraction of B for measuring an infinite d_t; 0 to keep it infinite.
     """
 
     def __init__(self, spec: TeacherSpec, *, decay: Decay, start_fraction: float = 0.0) -> None:
@@ -124,13 +125,13 @@ class StaticTeacher:
 
 
 class NoConfig(BaseModel):
-    """The settings of a teacher that has none."""
+    """Settings of a curriculum without options."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class DecayConfig(BaseModel):
-    """The settings of a decaying curriculum."""
+    """Settings of a decaying curriculum."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -138,13 +139,14 @@ class DecayConfig(BaseModel):
         default=START_FRACTION,
         gt=0.0,
         le=0.5,
-        description="Share of the training steps without limits in which the start of the decay is measured "
-        "where train_limits is infinite (section 5.1 of the paper: 'a few episodes').",
+        description="Fraction of the training steps without limits for measuring the start of the "
+        "decay, if train_limits is infinite (section 5.1 of the paper: 'a few "
+        "episodes').",
     )
 
 
 def decay_teacher(spec: TeacherSpec, *, decay: Decay) -> StaticTeacher:
-    """CLiC_L, CLiC_C or CLiC_E, from d_t, or from the measured costs where d_t is infinite."""
+    """CLiC_L, CLiC_C or CLiC_E, from d_t, or from the measured costs if d_t is infinite."""
     return StaticTeacher(
         spec, decay=decay, start_fraction=DecayConfig.model_validate(spec.options).start_fraction
     )
@@ -161,10 +163,10 @@ def step_teacher(spec: TeacherSpec) -> StaticTeacher:
 
 
 def unconstrained_teacher(spec: TeacherSpec) -> StaticTeacher:
-    """A control: no limit at all until B, whatever d_t is, then d_d at once.
+    """A control: no limit until B, for any d_t, then d_d at once.
 
-    It is ``step`` with d_t = infinity, which makes an MDP of the training model (paper, section 4): what the
-    agent earns and costs when nothing holds it back.
+    It is ``step`` with d_t = infinity, which turns the training model into an MDP (paper, section 4). It
+    shows return and cost of the unconstrained agent.
     """
     unlimited = CostLimits.unlimited(len(spec.train_limits))
     return StaticTeacher(replace(spec, train_limits=unlimited), decay=hold)

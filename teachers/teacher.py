@@ -1,12 +1,12 @@
-"""The seam between a trial and its teacher.
+"""Interface between a trial and its curriculum.
 
 A teacher is a pure function ``step(state, report) -> (CurriculumStep, state')``. The *trial* holds the state,
-which is opaque to it, and checkpoints it with the agent. A teacher keeps nothing between calls, so it can run
-inline, in an actor of its own or in one actor that a whole sweep shares, and always gives the same limits. It
-is asked once per policy update, with every episode that finished since the last one.
+which is opaque to it, and checkpoints it with the agent. A teacher keeps nothing between calls. So it can run
+inline, in an actor of its own or in one actor for a whole sweep, and always gives the same limits. It is
+called once per policy update, with every episode that finished since the last call.
 
-Notation: d_t training limits, d_d deployment limits, B the training budget in environment steps,
-p = env steps / B in [0, 1] the progress, k the number of costs.
+Notation: d_t training limits, d_d deployment limits, B the training budget in environment steps, p = env
+steps / B in [0, 1] the progress, k the number of costs.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from typing import Any, Protocol
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats
 
-# A teacher's state: JSON values only, so that it can be checkpointed and sent between processes.
+# State of a teacher: JSON values only, so that it can be checkpointed and sent between processes.
 TeacherState = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class ProgressReport:
-    """What a trial tells its teacher after a policy update.
+    """Report of a trial to its teacher after a policy update.
 
     Attributes:
-        update: index of the policy update just done, counted from 1.
+        update: index of the last policy update, counted from 1.
         env_steps: environment steps taken so far, over all the trial's environments.
         episodes: the episodes that finished since the last report, in order; may be empty.
     """
@@ -37,7 +37,7 @@ class ProgressReport:
     episodes: tuple[EpisodeStats, ...]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled by columns: a report of 500 episodes in a quarter of the time and of the bytes."""
+        """Pickle by columns: a report of 500 episodes takes a quarter of the time and of the bytes."""
         columns = tuple(zip(*map(_episode_row, self.episodes), strict=True))
         return _report_of_columns, (self.update, self.env_steps, columns)
 
@@ -51,11 +51,11 @@ def _report_of_columns(update: int, env_steps: int, columns: tuple[Any, ...]) ->
 
 @dataclass(frozen=True)
 class TeacherSpec:
-    """Everything a teacher is made of; crosses process boundaries.
+    """Specification of a teacher; it can be sent between processes.
 
     Attributes:
         name: registry name (``none``, ``linear``, ``dynamic``, ...), entry point or import path.
-        options: the teacher's settings, validated by its config class.
+        options: the teacher's settings, which its config class validates.
         train_limits: d_t, [k], possibly infinite.
         deploy_limits: d_d, [k], finite, each at most d_t.
         train_steps: B, environment steps of the training phase, at least 1.
@@ -86,32 +86,32 @@ class Teacher(Protocol):
     """A cost-limit curriculum (the paper's CLiC teacher)."""
 
     def start(self) -> tuple[CurriculumStep, TeacherState]:
-        """The step of the first update and the state before any update."""
+        """Return the step of the first update and the state before any update."""
         ...
 
     def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
-        """The step of the next update, given all finished episodes; never changes ``state``.
+        """Return the step of the next update, given the finished episodes; ``state`` is not changed.
 
-        Idempotent on the update index: asked again for the update that ``state`` has already seen, it
-        returns the same step and the same state.
+        Idempotent in the update index: a repeated report of the update in ``state`` returns the same step and
+        state.
 
         Raises:
-            ValueError: ``report.update`` is neither the update after the state's nor the state's own.
+            ValueError: ``report.update`` is neither the update of the state nor the next one.
         """
         ...
 
 
 def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[CurriculumStep, TeacherState]:
-    """Return what a curriculum answered.
+    """Check and return the result of a curriculum.
 
     Args:
-        answer: of ``Teacher.start`` or ``Teacher.step``; a user's may be anything.
+        answer: result of ``Teacher.start`` or ``Teacher.step``, possibly of a user's code.
         curriculum: its label, for the error.
         num_costs: k.
 
     Raises:
         TypeError: it is not a pair of a CurriculumStep and a mapping.
-        ValueError: its limits are not one for each cost.
+        ValueError: the number of its limits is not that of the costs.
     """
     match answer:
         case (CurriculumStep() as step, Mapping() as state):
@@ -131,13 +131,13 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
     )
 
 
-# What follows is shared by the teachers of this package. Their states hold at least ``update``, the last
-# update seen (0 before the first), and the keys of ``CurriculumStep.to_json``, so that a repeated question is
-# answered from the state alone.
+# The rest is common to the teachers of this package. Their states hold at least ``update``, the last update
+# seen (0 before the first), and the keys of ``CurriculumStep.to_json``. So a repeated report is answered from
+# the state alone.
 
 
 def progress(env_steps: int, train_steps: int) -> float:
-    """The share p of the training budget that is used up: p = env steps / B, at most 1.
+    """Return the used fraction of the training budget: p = env steps / B, at most 1.
 
     Algorithm 1, line 3, has p = b / B in episodes. Episodes differ in length, and a run's length is set in
     steps, so the clock counts steps: p = 1 exactly when deployment begins.
@@ -146,7 +146,7 @@ def progress(env_steps: int, train_steps: int) -> float:
 
 
 def already_seen(state: TeacherState, report: ProgressReport) -> bool:
-    """Whether ``state`` has taken in this very report (False: the report is the next one).
+    """Whether ``state`` includes this report already (False: the report is the next one).
 
     Raises:
         ValueError: the report is for any other update.

@@ -1,8 +1,7 @@
-"""What an agent did over some consecutive policy updates, and the two windows the dynamic teacher compares.
+"""Statistics of consecutive policy updates, and the two windows that the dynamic curriculum compares.
 
-A policy is constant between two updates, so a window is made of whole updates and its episodes are summed
-up once, when they are reported: judging costs nothing per episode, and a state keeps one short record for
-each update of the last two windows.
+A policy is constant between two updates, so a window consists of whole updates. Its episodes are summed up
+once, when they are reported, and a state keeps one short record for each update of the last two windows.
 
 Notation: k the number of costs, W a window's size.
 """
@@ -21,11 +20,11 @@ WindowUnit = Literal["updates", "episodes"]
 
 @dataclass(frozen=True)
 class WindowStatistics:
-    """The episodes that finished over some consecutive policy updates.
+    """Statistics of the episodes that finished over some consecutive policy updates.
 
     Attributes:
         env_steps: environment steps taken in these updates, over all the trial's environments.
-        episodes: how many episodes finished, n; where it is 0 the means are 0 and mean nothing.
+        episodes: number of finished episodes, n; if it is 0, the means are 0 and not meaningful.
         mean_return: r-bar, the mean undiscounted return.
         mean_costs: C-bar, the mean undiscounted episode costs, [k].
         cost_scatter: sums of squared deviations from ``mean_costs``, [k].
@@ -43,7 +42,7 @@ class WindowStatistics:
     def of_update(
         cls, episodes: Sequence[EpisodeStats], *, env_steps: int, num_costs: int
     ) -> WindowStatistics:
-        """What one update's report says."""
+        """Return the statistics of one update's report."""
         count = len(episodes)
         if count == 0:
             return cls(env_steps, 0, 0.0, (0.0,) * num_costs, (0.0,) * num_costs)
@@ -59,7 +58,7 @@ class WindowStatistics:
 
     @classmethod
     def pooled(cls, parts: Sequence[WindowStatistics]) -> WindowStatistics:
-        """Several statistics as one; exact sums, so that the order does not matter."""
+        """Pool several statistics; the sums are exact, so that the order does not matter."""
         env_steps = sum(part.env_steps for part in parts)
         episodes = sum(part.episodes for part in parts)
         if episodes == 0:
@@ -70,7 +69,7 @@ class WindowStatistics:
             math.fsum(part.episodes * part.mean_costs[i] for part in parts) / episodes
             for i in range(len(parts[0].mean_costs))
         )
-        # Between the parts and within them: sum of n (mean of the part - mean)^2, plus their own scatter.
+        # Between and within the parts: sum of n (mean of the part - mean)^2, plus their own scatter.
         cost_scatter = tuple(
             math.fsum(
                 part.episodes * (part.mean_costs[i] - mean) ** 2 + part.cost_scatter[i] for part in parts
@@ -83,7 +82,7 @@ class WindowStatistics:
         return cls(env_steps, episodes, mean_return, mean_costs, cost_scatter, return_scatter)
 
     def of_costs(self, group: Sequence[int]) -> WindowStatistics:
-        """The same with some of the costs alone."""
+        """Return the same statistics with some of the costs only."""
         return replace(
             self,
             mean_costs=tuple(self.mean_costs[index] for index in group),
@@ -92,24 +91,24 @@ class WindowStatistics:
 
     @property
     def cost_spreads(self) -> tuple[float, ...]:
-        """Standard deviations of the episode costs, sqrt(scatter / (n - 1)), [k]; 0 where n < 2."""
+        """Standard deviations of the episode costs, sqrt(scatter / (n - 1)), [k]; 0 if n < 2."""
         return tuple(self._spread(scatter) for scatter in self.cost_scatter)
 
     @property
     def return_spread(self) -> float:
-        """Standard deviation of the returns; 0 where n < 2."""
+        """Standard deviation of the returns; 0 if n < 2."""
         return self._spread(self.return_scatter)
 
     @property
     def standard_errors(self) -> tuple[float, ...]:
-        """Standard errors of ``mean_costs``, sqrt(scatter / (n - 1) / n), [k]; 0 where n < 2."""
+        """Standard errors of ``mean_costs``, sqrt(scatter / (n - 1) / n), [k]; 0 if n < 2."""
         return tuple(spread / math.sqrt(max(self.episodes, 1)) for spread in self.cost_spreads)
 
     def _spread(self, scatter: float) -> float:
         return math.sqrt(scatter / (self.episodes - 1)) if self.episodes > 1 else 0.0
 
     def to_json(self) -> list[Any]:
-        """The statistics as a JSON list, in the order of the attributes."""
+        """Return the statistics as a JSON list, in the order of the attributes."""
         return [
             self.env_steps,
             self.episodes,
@@ -121,7 +120,7 @@ class WindowStatistics:
 
     @classmethod
     def from_json(cls, values: Sequence[Any]) -> WindowStatistics:
-        """The inverse of ``to_json``."""
+        """Inverse of ``to_json``."""
         env_steps, episodes, mean_return, mean_costs, cost_scatter, return_scatter = values
         return cls(env_steps, episodes, mean_return, tuple(mean_costs), tuple(cost_scatter), return_scatter)
 
@@ -129,10 +128,10 @@ class WindowStatistics:
 def extend(
     history: Sequence[WindowStatistics], latest: WindowStatistics, *, unit: WindowUnit
 ) -> tuple[WindowStatistics, ...]:
-    """The history with one more update.
+    """Return the history with one more update.
 
-    Where windows are counted in episodes, an update in which none finished only lends its steps to the
-    next one that has any: a history is never longer than the episodes it holds.
+    If windows are counted in episodes, the steps of an update without any are added to the next one with
+    some. So a history is never longer than its number of episodes.
     """
     if unit == "episodes" and history and history[-1].episodes == 0:
         return (*history[:-1], WindowStatistics.pooled([history[-1], latest]))
@@ -146,11 +145,11 @@ def latest_window(
     unit: WindowUnit,
     is_enough: Callable[[WindowStatistics], bool] | None = None,
 ) -> int | None:
-    """How many of the last updates make a window of W; None if there are too few.
+    """Return how many of the last updates make a window of W; None if there are too few.
 
-    ``updates``: the last W updates. ``episodes``: the fewest last updates in which at least W episodes
-    finished; with one episode an update, as in Algorithm 2, these are exactly the last W episodes. With
-    ``is_enough`` a window takes in more updates until that holds of it.
+    ``updates``: the last W updates. ``episodes``: the fewest last updates with at least W finished episodes;
+    with one episode per update, as in Algorithm 2, these are the last W episodes. With ``is_enough`` a window
+    includes more updates until it is true.
     """
     count = _latest_of_size(history, size, unit=unit)
     if count is None or is_enough is None:
@@ -182,7 +181,7 @@ def last_two_windows(
     unit: WindowUnit,
     is_enough: Callable[[WindowStatistics], bool] | None = None,
 ) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
-    """The updates of the window before the last one, and of the last one; None if there are too few."""
+    """Return the updates of the last two windows, the older one first; None if there are too few."""
     new = latest_window(history, size, unit=unit, is_enough=is_enough)
     if new is None:
         return None

@@ -1,11 +1,11 @@
 """Constrained policy optimisation (Achiam et al. 2017), for any small number of constraints.
 
-One trust-region step an update: the direction from ``recrl.agents.trust_region.cpo_dual``, shortened by a
-line search until the true surrogates and the true KL agree with the linear model. Cost advantages are centred
-and not scaled, and the constraints enter in cost per step, so that b and c have one unit.
+Each update takes one trust-region step. Its direction is from ``recrl.agents.trust_region.cpo_dual``. A line
+search shortens it until the true surrogates and the true KL agree with the linear model. Cost advantages are
+centred and not scaled, and the constraints enter in cost per step, so that b and c have one unit.
 
-If no episode finished, nothing is known about the constraints and the policy stays. A cost whose limit is
-infinite is no constraint.
+If no episode finished, nothing is known about the constraints and the policy does not change. A cost whose
+limit is infinite is no constraint.
 
 Notation: N samples, k costs, P parameters, delta the trust region's size, H its metric.
 """
@@ -38,11 +38,11 @@ NAN = float("nan")
 
 
 class LocalModel:
-    """Surrogates and divergence of a policy that moves away from the one that collected the samples.
+    """Surrogates and divergence of a changing policy, relative to the policy that collected the samples.
 
     Args:
-        policy: judged at its present parameters, whatever they are when asked.
-        experience: the samples, and what the old policy was.
+        policy: evaluated at its present parameters in each call.
+        experience: the samples and the old policy.
         advantages: of the reward, then each cost, [N, 1 + k].
     """
 
@@ -51,16 +51,16 @@ class LocalModel:
         self._advantages = experience.batch.per_pair(advantages)
 
     def gradients(self) -> Tensor:
-        """The gradients of all surrogates at the policy as it is now, [1 + k, P]."""
+        """Return the gradients of all surrogates at the policy's present parameters, [1 + k, P]."""
         now = self._policy.evaluate(self._experience.batch.unique_observations)
         surrogates = self._surrogates(now.distribution)
         return torch.stack([now.gradient(each, retain_graph=True).clone() for each in surrogates.unbind()])
 
     def metric(self, config: TrustRegionConfig, generator: np.random.Generator) -> FisherMetric:
-        """The Hessian of the divergence at the policy as it is now, plus damping.
+        """Return the Hessian of the divergence at the policy's present parameters, plus damping.
 
-        On ``metric_samples`` of the samples, drawn once: of 30,000, every tenth gives a direction that has a
-        cosine of 0.998 with the one that all give, at a tenth of the time.
+        It is evaluated on ``metric_samples`` of the samples, drawn once. With every tenth of 30,000 samples
+        the direction has a cosine of 0.998 with the full one and takes a tenth of the time.
         """
         rows, weights = self._experience.batch.thinned(config.metric_samples, generator)
         return FisherMetric(self._policy, rows, weights, config.damping)
@@ -74,7 +74,7 @@ class LocalModel:
         return surrogate(ones, self._advantages).numpy(force=True)
 
     def measure(self) -> tuple[npt.NDArray[np.floating], float]:
-        """Surrogates [1 + k] and mean KL of the policy as it is now, in nats."""
+        """Return the surrogates [1 + k] and the mean KL at the present parameters, in nats."""
         batch = self._experience.batch
         distribution = self._policy.distribution(batch.unique_observations)
         divergence = mean_divergence(self._experience.old, distribution, batch.observation_weights)
@@ -88,17 +88,17 @@ def constrained_step(
     config: TrustRegionConfig,
     generator: np.random.Generator,
 ) -> dict[str, float]:
-    """Take one step in the trust region, unless nothing is known about the constraints.
+    """Take one step in the trust region; skip it if nothing is known about the constraints.
 
     Args:
         policy: changed in place.
         experience: the samples.
         solve: the step of the linearised problem.
         config: the trust region, conjugate gradients and line search.
-        generator: of the samples that the metric is evaluated on.
+        generator: for the choice of the metric's samples.
 
     Returns:
-        The step's metrics; ``multiplier_i`` are in standard deviations of the reward's advantages.
+        Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages.
     """
     constraints = experience.constraints
     multipliers = np.full_like(constraints.limits, NAN)
@@ -106,7 +106,7 @@ def constrained_step(
         stayed = {"policy_steps": 0.0, "case": NAN, "line_search_steps": NAN, "step_norm": 0.0}
         return {**stayed, **indexed("multiplier", multipliers)}
     centred = experience.advantages - experience.advantages.mean(axis=0)
-    centred[:, 0] /= reward_spread(centred)  # changes no step, only the unit of the multipliers
+    centred[:, 0] /= reward_spread(centred)  # does not change the step, only the unit of the multipliers
     model = LocalModel(policy, experience, centred)
     active = ActiveConstraints.of(constraints)
     metric = model.metric(config, generator)
@@ -122,14 +122,14 @@ def constrained_step(
 def linearise(
     model: LocalModel, active: ActiveConstraints, metric: FisherMetric, config: TrustRegionConfig
 ) -> tuple[StepProblem, Tensor]:
-    """The step's problem reduced to products, and H^-1 g, H^-1 b_1, ..., H^-1 b_j, [1 + j, P]."""
+    """Return the step's problem reduced to products, and H^-1 g, H^-1 b_1, ..., H^-1 b_j, [1 + j, P]."""
     gradients = model.gradients()
     chosen = torch.cat([-gradients[:1], gradients[1 + torch.as_tensor(active.index)]])
     solved = torch.stack(
         [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in chosen]
     )
-    # u.H u for u = H^-1 v, as safety-starter-agents takes it, not v.u: where conjugate gradients have not
-    # converged, that is the true size of the step.
+    # The product u.H u for u = H^-1 v, as in safety-starter-agents, not v.u: if conjugate gradients have not
+    # converged, this is the true size of the step.
     products = torch.stack([metric(direction) for direction in solved])
     gram = (solved @ products.T).numpy(force=True).astype(np.float64)
     require_finite("products of the trust region's directions", gram)
@@ -139,7 +139,7 @@ def linearise(
 
 
 def to_parameter_step(solution: DualSolution, solved: Tensor) -> Tensor:
-    """The step x, [P], that a solution stands for; ``solved`` is as ``linearise`` gives it."""
+    """Return the step x, [P], of a solution; ``solved`` is from ``linearise``."""
     weights = np.concatenate([[solution.gradient_weight], solution.constraint_weights])
     return -to_tensor(weights) @ solved
 
@@ -147,16 +147,16 @@ def to_parameter_step(solution: DualSolution, solved: Tensor) -> Tensor:
 def acceptance(
     model: LocalModel, active: ActiveConstraints, solution: DualSolution, target_kl: float
 ) -> Callable[[], bool]:
-    """The line search's test of the policy as it is when asked.
+    """Return the line search's test of the policy at its present parameters.
 
-    The KL is within delta; cost surrogate i rises by at most max(-c_i, 0); and the reward surrogate does not
-    fall, unless a constraint is violated. In recovery only the costs that are recovered and those within
-    their limits are judged: where constraints contradict one another, the other violated ones have to wait.
+    The KL is within delta; cost surrogate i rises by at most max(-c_i, 0). The reward surrogate does not
+    fall, unless a constraint is violated. In recovery only the recovered costs and the costs within their
+    limits are checked: contradicting constraints cannot all improve at once.
 
     Args:
-        model: asked for surrogates and KL.
+        model: gives surrogates and KL.
         active: the constraints.
-        solution: what the step solves.
+        solution: the solved step.
         target_kl: delta.
     """
     before = model.start()
@@ -186,10 +186,10 @@ class ConstrainedPolicyOptimisation:
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one constrained trust-region step, unless nothing is known about the constraints."""
+        """Take one constrained trust-region step; skip it if nothing is known about the constraints."""
         return constrained_step(policy, experience, solve_dual, self._config, generator)
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh CPO agent."""
+    """Make a new CPO agent."""
     return fresh_agent(cmdp, config, seed, lambda _: ConstrainedPolicyOptimisation(config))

@@ -1,18 +1,18 @@
 """First-order constrained optimisation in policy space (Zhang, Vuong and Ross 2020, algorithm 1).
 
-The best policy near pi_old is known in closed form, pi* ~ pi_old exp((A_r - sum_i nu_i A_i) / lam); the
-network is drawn towards it. Up to constants, climbing
+The optimal policy near pi_old has a closed form, pi* ~ pi_old exp((A_r - sum_i nu_i A_i) / lam). The network
+is fitted to it. Up to constants, this is gradient ascent on
 
     mean over samples of 1[KL(s) <= delta] (ratio (A_r - sum_i nu_i A_i) / lam - KL(s)),
-    KL(s) = KL(pi(. | s) || pi_old(. | s)),
+    KL(s) = KL(pi(. | s) || pi_old(. | s)).
 
-does that. lam, the paper's temperature, is the option ``focops_lambda``, in standard deviations of the reward
+lam, the paper's temperature, is the option ``focops_lambda``, in standard deviations of the reward
 advantages. The multipliers nu move by a rule of ``recrl.agents.constraints.multiplier_rules``; the paper's is
-projected ascent up to 2. Here, as in ``ppo-lag``, the penalised advantage is divided by 1 + sum_i nu_i, so
-that a large multiplier does not make the policy jump; lam keeps its meaning where no constraint binds.
+projected ascent up to 2. As in ``ppo-lag``, the penalised advantage is divided by 1 + sum_i nu_i, so that a
+large multiplier does not make the policy jump. If no constraint binds, lam keeps its meaning.
 
-The source stops when the mean KL is past delta; but the step that went past stands, and one Adam step may
-double the KL. So, ours, it is taken back as far as it went past: ``trust_region: kept``.
+The source stops once the mean KL exceeds delta, but keeps the last step, and one Adam step may double the KL.
+So, ours, the step is shortened until the KL is delta: ``trust_region: kept``.
 
 Notation: N samples, U rows, D unique pairs, k costs, P parameters.
 """
@@ -39,13 +39,13 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 def projection_objective(
     experience: Experience, advantages: Floats, *, focops_lambda: float, radius: float
 ) -> Objective:
-    """What draws the policy towards pi*: the module's formula.
+    """Return the objective of the module's formula.
 
     Args:
         experience: the samples, and pi_old at their rows.
         advantages: of the Lagrangian, of all samples of the rollout, [N].
         focops_lambda: lam, above 0.
-        radius: delta, nats; rows that have moved further pull no more.
+        radius: delta, nats; rows with a larger KL have no gradient.
     """
     batch, old = experience.batch, experience.old
     pull = batch.per_pair(advantages / focops_lambda)
@@ -63,9 +63,9 @@ def projection_objective(
 
 
 def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, radius: float) -> None:
-    """Take a change of the parameters back until the mean KL is the radius, if it is more.
+    """Shorten a change of the parameters until the mean KL is the radius, if it exceeds it.
 
-    theta <- theta_0 + sqrt(delta / KL) (theta - theta_0): exact as far as the KL is a square of the change.
+    theta <- theta_0 + sqrt(delta / KL) (theta - theta_0): exact if the KL is quadratic in the change.
 
     Args:
         policy: changed in place.
@@ -113,7 +113,7 @@ class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
 
 
 def make_focops(cmdp: CMDPSpec, config: FOCOPSConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh FOCOPS agent."""
+    """Make a new FOCOPS agent."""
     return fresh_agent(
         cmdp, config, seed, lambda policy: FirstOrderConstrainedOptimisation(config, policy, cmdp.num_costs)
     )

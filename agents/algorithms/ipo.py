@@ -1,15 +1,15 @@
 """Interior-point policy optimisation (Liu, Ding and Liu 2020): a logarithmic barrier before each limit.
 
-The policy climbs, in cost per step,
+The policy takes gradient steps on, in cost per step,
 
     L_r + sum_i phi(s_i),  s_i = -(L_i + c_i),  c_i = (mean episode cost i - limit i) / mean episode length,
 
 with L_r the clipped surrogate of the reward, L_i that of cost i, and phi(s) = log(s) / t. L_i is, ours, the
-*pessimistic* surrogate of ``p3o``: with the source's plain one, a violated constraint sends the policy as far
-as it can within an update, for a relief that is true only nearby (on a RiverGrid, to one goal for good). The
-optimum gives away 1 / t of reward a step for each constraint that binds. The paper leaves open what happens
-where there is no slack: there phi goes on along its tangent (Kervadec et al. 2022), from the slack
-1 / (t kappa) at which its slope is kappa,
+*pessimistic* surrogate of ``p3o``. The source's plain surrogate extrapolates a decrease of cost that holds
+only locally. So a violated constraint moves the policy too far in one update (on a RiverGrid, to one goal
+permanently). The optimum loses 1 / t of reward a step for each binding constraint. The paper does not define
+phi without slack. Here it continues along its tangent (Kervadec et al. 2022), from the slack 1 / (t kappa) at
+which its slope is kappa,
 
     phi(s) = log(s) / t                                if s >= 1 / (t kappa),
              kappa s - (1 + log(t kappa)) / t          otherwise,
@@ -17,8 +17,8 @@ where there is no slack: there phi goes on along its tangent (Kervadec et al. 20
 so that a violated constraint is an exact penalty with the factor kappa. All advantages and c are in standard
 deviations of the reward's advantages, so that kappa is in reward per unit of cost, as multipliers are.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
-pairs, k costs.
+If no episode finished, nothing is known about the constraints and the policy does not change. Notation: N
+samples, D pairs, k costs.
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 
 
 def barrier(slack: Tensor, *, sharpness: float, slope: float) -> Tensor:
-    """The barrier phi of each slack, any shape; ``sharpness`` is t and ``slope`` is kappa."""
+    """Return the barrier phi of each slack, any shape; ``sharpness`` is t and ``slope`` is kappa."""
     edge = 1.0 / (sharpness * slope)
     inside = torch.log(slack.clamp(min=edge)) / sharpness
     return inside + slope * (slack - edge).clamp(max=0.0)
 
 
 def slopes(slack: npt.NDArray[np.floating], config: IPOConfig) -> Floats:
-    """The derivatives of the barriers, what they charge for cost: 1 / (t s), or kappa without that slack."""
+    """Return the derivatives of the barriers, which weight the costs: 1 / (t s), or kappa."""
     edge = 1.0 / (config.barrier_sharpness * config.barrier_slope)
     charged = 1.0 / (config.barrier_sharpness * np.maximum(slack, edge))
     return np.asarray(charged, dtype=np.float64)
 
 
 def relief_of(batch: LearningBatch, costs: Floats, config: IPOConfig) -> Callable[[Tensor], Tensor]:
-    """-L_i, how far the surrogates of costs, [N, j], have fallen, as a function of the ratios, [D] -> [j]."""
+    """Return a function of the ratios, [D] -> [j]: -L_i, the decrease of the cost surrogates, [N, j]."""
     if config.cost_surrogate == "pessimistic":
         split = [SignedAdvantages.split(batch, -column) for column in costs.T]
         return partial(pessimistic_relief, relief=split, clip=config.clip)
@@ -73,10 +73,10 @@ def relief_of(batch: LearningBatch, costs: Floats, config: IPOConfig) -> Callabl
 def barrier_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, violations: Floats, config: IPOConfig
 ) -> Callable[[Tensor], tuple[Tensor, float]]:
-    """The module's formula, a function of the ratios, with the sum of the barriers' slopes.
+    """Return the module's formula, a function of the ratios, and the sum of the barriers' slopes.
 
-    A minibatch's mean cost advantage is not 0, as that of all samples is; it says nothing about the policy,
-    so surrogates of cost are counted from their value at ratios of 1.
+    The mean cost advantage of a minibatch is not 0, unlike that of all samples. This is independent of the
+    policy, so surrogates of cost are relative to their value at ratios of 1.
 
     Args:
         batch: the samples.
@@ -104,7 +104,7 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Climb the surrogate between the barriers, unless nothing is known about the constraints."""
+        """Ascend the surrogate with barriers; skip it if nothing is known about the constraints."""
         config, constraints = self._config, experience.constraints
         if not constraints.known:
             return no_steps(constraints)
@@ -122,5 +122,5 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
 
 
 def make_ipo(cmdp: CMDPSpec, config: IPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh IPO agent."""
+    """Make a new IPO agent."""
     return fresh_agent(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))

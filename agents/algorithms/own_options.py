@@ -1,6 +1,6 @@
-"""What can be set of each algorithm; ``recrl.agents.shared_options`` has what several of them share.
+"""Options of each algorithm; ``recrl.agents.shared_options`` has those that several of them share.
 
-Imports no torch, so that a grid is validated in a moment: that is why these are not beside the algorithms.
+They are separate from the algorithms, so that validating a grid does not import torch.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from recrl.agents.shared_options import (
 
 
 class PPOConfig(AscentConfig):
-    """Settings of ``ppo``, which knows no constraint."""
+    """Settings of ``ppo``, an agent without constraints."""
 
     clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
     )
     entropy_bonus: NonNegative = Field(
         default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
@@ -45,14 +45,15 @@ class PPOLagConfig(LagrangianConfig, AscentConfig):
     }
 
     clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
     )
     entropy_bonus: NonNegative = Field(
         default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
     )
     penalty: Literal["combined", "separate"] = Field(
         default="combined",
-        description="Clip the surrogate of reward minus multiplied costs (ours) or the reward's (paper).",
+        description="Clip the surrogate of the whole Lagrangian (combined, ours) or of the reward "
+        "only (separate, paper).",
     )
 
 
@@ -74,18 +75,18 @@ class FOCOPSConfig(LagrangianConfig, AscentConfig):
 
     policy_learning_rate: Positive = Field(
         default=3e-4,
-        description="Adam's, for the policy (Zhang et al. 2020). Larger steps go far past the trust region "
-        "before the KL is seen.",
+        description="Learning rate of the policy's Adam (Zhang et al. 2020). Larger steps go far "
+        "beyond the trust region before the KL is measured.",
     )
     focops_lambda: Positive = Field(
         default=0.5,
-        description="lambda, standard deviations of the reward advantages that are worth a nat (ours; Zhang "
-        "et al. 2020: 1.5).",
+        description="lambda, the temperature, in standard deviations of the reward advantages per "
+        "nat (ours; Zhang et al. 2020: 1.5).",
     )
     trust_region: Literal["kept", "passed"] = Field(
         default="kept",
-        description="Whether the step that goes past target_kl is taken back to it (ours), or stands as the "
-        "last (Zhang et al. 2020).",
+        description="Whether a step beyond target_kl is shortened to it (kept, ours), or is the "
+        "last step (Zhang et al. 2020).",
     )
 
 
@@ -93,12 +94,12 @@ class P3OConfig(AscentConfig):
     """Settings of ``p3o``, penalised proximal policy optimisation."""
 
     clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
     )
     penalty_factor: Positive = Field(
         default=20.0,
-        description="kappa, reward per unit of cost; must exceed every multiplier of the task (ours; Zhang "
-        "et al. 2022 fix one for all tasks).",
+        description="kappa, reward per unit of cost; must exceed every multiplier of the task "
+        "(ours; Zhang et al. 2022 use one value for all tasks).",
     )
 
 
@@ -113,22 +114,23 @@ class IPOConfig(AscentConfig):
     }
 
     clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="How far the probability ratio pays off: 1 +- clip (paper)."
+        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
     )
     barrier_sharpness: Positive = Field(
         default=2000.0,
-        description="t of the barrier log(slack) / t; at the optimum it gives away 1 / t of the reward "
-        "advantages' standard deviation a step and constraint (ours; Liu et al. 2020: 20).",
+        description="t of the barrier log(slack) / t. At the optimum each binding constraint "
+        "loses 1 / t of the reward advantages' standard deviation a step (ours; Liu "
+        "et al. 2020: 20).",
     )
     cost_surrogate: Literal["pessimistic", "plain"] = Field(
         default="pessimistic",
-        description="Whether a cost's surrogate counts relief beyond the clip range: not (ours), or however "
-        "far the policy goes (Liu et al. 2020).",
+        description="Whether a decrease of cost beyond the clip range counts: not (pessimistic, "
+        "ours), or without bound (Liu et al. 2020).",
     )
     barrier_slope: Positive = Field(
         default=20.0,
-        description="The barrier's steepest slope, with which it goes on where there is no slack, reward per "
-        "unit of cost; must exceed every multiplier of the task (ours).",
+        description="Largest slope of the barrier, used where there is no slack, reward per unit "
+        "of cost; must exceed every multiplier of the task (ours).",
     )
 
 
@@ -141,7 +143,7 @@ class PCPOConfig(TrustRegionConfig):
 
 
 class TRPOConfig(TrustRegionConfig):
-    """Settings of ``trpo``, which knows no constraint."""
+    """Settings of ``trpo``, an agent without constraints."""
 
 
 class TRPOLagConfig(LagrangianConfig, TrustRegionConfig):
@@ -156,8 +158,9 @@ class TRPOLagConfig(LagrangianConfig, TrustRegionConfig):
 
     kl_price: NonNegative = Field(
         default=1.0,
-        description="lambda, what a nat of KL must be worth in the surrogate, that is 1 + the multipliers "
-        "standard deviations of the reward advantages, so that steps end with the gain (ours; paper 0).",
+        description="lambda, the coefficient of the KL in the surrogate, which is the Lagrangian "
+        "over 1 + the multipliers, in standard deviations of the reward advantages. "
+        "Steps get shorter as the gain falls (ours; paper 0).",
     )
 
 
@@ -172,11 +175,11 @@ class CRPOConfig(TrustRegionConfig):
 
     kl_price: NonNegative = Field(
         default=1.0,
-        description="lambda, what a nat of KL must be worth beyond a limit, in standard deviations of the "
-        "reward advantages, so that steps end with the gain; 0 for steps as long as the trust region allows "
-        "(ours; Xu et al. 2021: 0).",
+        description="lambda, the coefficient of the KL beyond a limit, in standard deviations of "
+        "the reward advantages per nat. Steps get shorter as the gain falls; 0 for "
+        "steps as long as the trust region allows (ours; Xu et al. 2021: 0).",
     )
     tolerance: NonNegative = Field(
         default=0.0,
-        description="eta, the violation that is borne, in episode cost (ours; Xu et al. 2021: 0.5).",
+        description="eta, the tolerated violation, in episode cost (ours; Xu et al. 2021: 0.5).",
     )

@@ -1,16 +1,16 @@
 """Penalised proximal policy optimisation (Zhang et al. 2022): an exact penalty instead of multipliers.
 
-The policy climbs, in cost per step,
+The policy takes gradient steps on, in cost per step,
 
     L_r - kappa sum_i max(0, L_i + c_i),  c_i = (mean episode cost i - limit i) / mean episode length,
 
-with L_r the clipped surrogate of the reward and L_i that of cost i, which is *pessimistic about cost*: the
-mean of max(ratio A_i, clip(ratio) A_i). The penalty is exact: if kappa exceeds every multiplier of the
-constrained problem, both have the same optimum, and nothing has to adapt. All advantages and c are divided by
-the standard deviation of the reward's, so that kappa is in reward per unit of cost, as multipliers are.
+with L_r the clipped surrogate of the reward. The surrogate L_i of cost i is *pessimistic*: the mean of
+max(ratio A_i, clip(ratio) A_i). The penalty is exact: if kappa exceeds every multiplier of the constrained
+problem, both have the same optimum. Nothing is adapted. All advantages and c are divided by the standard
+deviation of the reward's, so that kappa is in reward per unit of cost, as multipliers are.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, D
-pairs, k costs.
+If no episode finished, nothing is known about the constraints and the policy does not change. Notation: N
+samples, D pairs, k costs.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def penalised_surrogate_objective(
     clip: float,
     factor: float,
 ) -> Callable[[Tensor], tuple[Tensor, float]]:
-    """The module's formula, a function of the ratios, with the sum of the penalty factors in force.
+    """Return the module's formula, a function of the ratios, and the sum of the active penalty factors.
 
-    A minibatch's mean cost advantage is not 0, as that of all samples is; it says nothing about the policy,
-    so surrogates of cost are counted from their value at ratios of 1.
+    The mean cost advantage of a minibatch is not 0, unlike that of all samples. This is independent of the
+    policy, so surrogates of cost are relative to their value at ratios of 1.
 
     Args:
         batch: the samples.
@@ -72,7 +72,7 @@ class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Climb the penalised surrogate, unless nothing is known about the constraints."""
+        """Ascend the penalised surrogate; skip it if nothing is known about the constraints."""
         config, constraints = self._config, experience.constraints
         if not constraints.known:
             return no_steps(constraints)
@@ -92,5 +92,5 @@ class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
 
 
 def make_p3o(cmdp: CMDPSpec, config: P3OConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh P3O agent."""
+    """Make a new P3O agent."""
     return fresh_agent(cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy))

@@ -9,12 +9,12 @@ The optimum is x = y - sum_i nu_i w_i, where nu >= 0 solves the complementarity 
 
     e - S nu <= 0,  nu.(e - S nu) = 0,    e = c - sqrt(2 delta / q) r  (the excesses b_i.y + c_i of y);
 
-for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far from feasible is far from it
-too: the paper bounds the damage, here the step is scaled back into the trust region. Then it is shortened by
-``cpo``'s line search, which the paper leaves out.
+for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far from feasible is a long step.
+The paper bounds the damage; here the step is scaled back into the trust region. Then ``cpo``'s line search
+shortens it, which the paper does not do.
 
-If no episode finished, nothing is known about the constraints and the policy stays. Notation: N samples, k
-costs, P parameters.
+If no episode finished, nothing is known about the constraints and the policy does not change. Notation: N
+samples, k costs, P parameters.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from recrl.environments.cmdp import CMDPSpec
 
 
 def projected_step(problem: StepProblem) -> DualSolution:
-    """The reward's step, projected and scaled back into the trust region.
+    """Return the reward's step, projected and scaled back into the trust region.
 
-    Where the constraints contradict one another, only the one that is violated most is projected on.
+    If the constraints contradict one another, it projects on the most violated one only.
     """
     squared = problem.squared_gradient
     reach = float(np.sqrt(2.0 * problem.radius / squared)) if squared > NO_INFLUENCE else 0.0
@@ -72,10 +72,10 @@ class ProjectionBasedConstrainedPolicyOptimisation:
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one projected step, unless nothing is known about the constraints."""
+        """Take one projected step; skip it if nothing is known about the constraints."""
         return constrained_step(policy, experience, projected_step, self._config, generator)
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PCPO agent."""
+    """Make a new PCPO agent."""
     return fresh_agent(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))

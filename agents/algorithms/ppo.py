@@ -1,7 +1,7 @@
-"""Proximal policy optimisation (Schulman et al. 2017): the control that knows no constraint.
+"""Proximal policy optimisation (Schulman et al. 2017): a control without constraints.
 
-Its objective is the clipped surrogate of the standardised reward advantages. Costs are learnt and reported,
-as with every agent, and change nothing; so do limits, and whether an episode finished.
+Its objective is the clipped surrogate of the standardised reward advantages. Cost critics are learnt and
+costs reported, as with every agent. Neither they nor the limits affect the policy.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Climb the reward's surrogate."""
+        """Ascend the reward's surrogate."""
         config = self._config
         rewards, _ = scaled_advantages(experience.advantages)
 
@@ -43,5 +43,5 @@ class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
 
 
 def make_ppo(cmdp: CMDPSpec, config: PPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PPO agent."""
+    """Make a new PPO agent."""
     return fresh_agent(cmdp, config, seed, lambda policy: ProximalPolicyOptimisation(config, policy))

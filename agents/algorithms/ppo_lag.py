@@ -1,11 +1,12 @@
 """PPO on the Lagrangian (Ray et al. 2019, section 5).
 
-Multipliers first answer the gaps; then the policy climbs the penalised surrogate until its steps are done or
-it has moved too far. If no episode finished, nothing is known about the constraints: the multipliers stay.
+First the multipliers are updated from the gaps. Then the policy ascends the penalised surrogate, until its
+steps are done or the KL is too large. If no episode finished, nothing is known about the constraints and the
+multipliers do not change.
 
 The objective is (L_r - sum_i p_i L_i) / (1 + sum_i p_i), p the multipliers. ``separate`` clips the reward's
 surrogate only (the paper's agents); ``combined`` clips the surrogate of the penalised advantage
-A_r - sum_i p_i A_i, so that the policy gains nothing from leaving the clip range for a cost's sake either.
+A_r - sum_i p_i A_i, so that leaving the clip range to decrease a cost gains nothing either.
 
 Notation: N samples, D unique pairs, k costs.
 """
@@ -33,7 +34,7 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 def combined_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
 ) -> Callable[[Tensor], Tensor]:
-    """The clipped surrogate of the penalised advantages, as a function of the ratios, [D].
+    """Return the clipped surrogate of the penalised advantages, as a function of the ratios, [D].
 
     Args:
         batch: the samples.
@@ -49,7 +50,7 @@ def combined_surrogate_objective(
 def separate_surrogate_objective(
     batch: LearningBatch, rewards: Floats, costs: Floats, multipliers: Floats, clip: float
 ) -> Callable[[Tensor], Tensor]:
-    """The reward's clipped surrogate minus the multiplied costs' surrogates.
+    """Return the reward's clipped surrogate minus the costs' surrogates times their multipliers.
 
     The arguments are those of ``combined_surrogate_objective``.
     """
@@ -59,7 +60,7 @@ def separate_surrogate_objective(
     return lambda ratios: clipped_surrogate(ratios, signed, clip) - surrogate(ratios, penalty)
 
 
-# By the name that the option ``penalty`` has.
+# By the value of the option ``penalty``.
 SURROGATE_OBJECTIVES = {"combined": combined_surrogate_objective, "separate": separate_surrogate_objective}
 
 
@@ -92,5 +93,5 @@ class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
 
 
 def make_ppo_lag(cmdp: CMDPSpec, config: PPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh PPO-Lagrangian agent."""
+    """Make a new PPO-Lagrangian agent."""
     return fresh_agent(cmdp, config, seed, lambda policy: PPOLagrangian(config, policy, cmdp.num_costs))

@@ -1,9 +1,9 @@
-"""Trust region policy optimisation (Schulman et al. 2015): the control that knows no constraint.
+"""Trust region policy optimisation (Schulman et al. 2015): a control without constraints.
 
-One step an update, along H^-1 g and as long as the trust region allows, sqrt(2 delta / q) H^-1 g with
-q = g.H^-1 g (appendix C), shortened until the surrogate does not fall and the true KL is within delta. ``g``
-is the gradient of a surrogate and H the Hessian of the mean KL plus damping. With no finite limit, ``cpo``
-takes the same step.
+Each update takes one step, sqrt(2 delta / q) H^-1 g with q = g.H^-1 g (appendix C), as long as the trust
+region allows. It is shortened until the surrogate does not fall and the true KL is within delta. ``g`` is the
+gradient of a surrogate and H the Hessian of the mean KL plus damping. With no finite limit, ``cpo`` takes the
+same step.
 
 Notation: N samples, k costs, P parameters, delta the trust region's size.
 """
@@ -35,21 +35,22 @@ def step_up(
     *,
     kl_price: float = 0.0,
 ) -> dict[str, float]:
-    """Take one trust-region step up the surrogate of some advantages, or none where they are all equal.
+    """Take one trust-region step on the surrogate of some advantages; skip it if they are all equal.
 
-    With a price lambda of the KL it solves max over x of g.x - lambda x.H x / 2 within x.H x / 2 <= delta, by
-    min(sqrt(2 delta / q), 1 / lambda) H^-1 g: shorter than the trust region where little is to be gained.
+    With a coefficient lambda of the KL it solves max over x of g.x - lambda x.H x / 2 within x.H x / 2 <=
+    delta. The solution is min(sqrt(2 delta / q), 1 / lambda) H^-1 g: shorter than the trust region if the
+    gain is small.
 
     Args:
         policy: changed in place.
         experience: the samples.
-        objective: the advantages to climb, [N].
+        objective: the advantages of the surrogate, [N].
         config: the trust region, conjugate gradients and line search.
-        generator: of the samples that the metric is evaluated on.
-        kl_price: lambda, what a nat must be worth, in the advantages' unit, at least 0.
+        generator: for the choice of the metric's samples.
+        kl_price: lambda, the coefficient of the KL, in the advantages' unit per nat, at least 0.
 
     Returns:
-        The step's metrics.
+        Metrics of the step.
     """
     model = LocalModel(policy, experience, objective[:, None])
     metric = model.metric(config, generator)
@@ -70,7 +71,7 @@ def step_up(
 
 
 def step_size(squared: float, target_kl: float, kl_price: float) -> float:
-    """The factor on H^-1 g: min(sqrt(2 delta / q), 1 / lambda).
+    """Return the factor on H^-1 g: min(sqrt(2 delta / q), 1 / lambda).
 
     Args:
         squared: q, above 0.
@@ -94,12 +95,12 @@ class TrustRegionPolicyOptimisation:
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one step up the reward's surrogate."""
+        """Take one step on the reward's surrogate."""
         rewards, _ = scaled_advantages(experience.advantages)
         metrics = step_up(policy, experience, rewards, self._config, generator)
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 
 
 def make_trpo(cmdp: CMDPSpec, config: TRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh TRPO agent."""
+    """Make a new TRPO agent."""
     return fresh_agent(cmdp, config, seed, lambda _: TrustRegionPolicyOptimisation(config))

@@ -1,11 +1,11 @@
 """TRPO on the Lagrangian (Ray et al. 2019, section 5).
 
-Multipliers first answer the gaps; then the policy takes one trust-region step up the surrogate of
-(A_r - sum_i p_i A_i) / (1 + sum_i p_i), p the multipliers. If no episode finished, the multipliers stay.
+First the multipliers p are updated from the gaps. Then the policy takes one trust-region step on the
+surrogate of (A_r - sum_i p_i A_i) / (1 + sum_i p_i). If no episode finished, the multipliers do not change.
 
-At a saddle of the Lagrangian that surrogate has no gradient, but a step that always reaches the edge of the
-trust region is as long there as anywhere, and the policy swings about the limit for ever. So, ours, a nat of
-KL must be worth ``kl_price`` in that surrogate, and steps end with the gain.
+At a saddle point of the Lagrangian that surrogate has no gradient. A step to the edge of the trust region has
+the same length there as elsewhere, so the policy would oscillate about the limit. So, ours, the KL is
+subtracted with the coefficient ``kl_price``, and steps get shorter as the gain falls.
 
 Notation: N samples, k costs.
 """
@@ -49,5 +49,5 @@ class TRPOLagrangian:
 
 
 def make_trpo_lag(cmdp: CMDPSpec, config: TRPOLagConfig, seed: np.random.SeedSequence) -> ActorCritic:
-    """A fresh TRPO-Lagrangian agent."""
+    """Make a new TRPO-Lagrangian agent."""
     return fresh_agent(cmdp, config, seed, lambda _: TRPOLagrangian(config, cmdp.num_costs))

@@ -1,1 +1,1 @@
-"""How an agent measures its constraints and moves its Lagrange multipliers."""
+"""Measurement of constraints and update rules of Lagrange multipliers."""

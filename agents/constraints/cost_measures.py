@@ -1,6 +1,7 @@
-"""What of an episode's cost is constrained: its mean, or its mean in the worst episodes (CVaR).
+"""Constrained measures of the episode cost: the mean, or the mean of the worst episodes (CVaR).
 
-The conditional value at risk at level alpha of an episode's cost C is the mean of its worst share 1 - alpha,
+The conditional value at risk at level alpha of an episode's cost C is the mean of its worst fraction 1 -
+alpha,
 
     CVaR(C) = min over nu of  nu + E[max(C - nu, 0)] / (1 - alpha)        (Rockafellar and Uryasev 2000),
 
@@ -10,19 +11,19 @@ minimises, a small change of the policy changes the CVaR as if nu were fixed (Ta
 
     c'_t = (max(S_{t+1} - nu, 0) - max(S_t - nu, 0)) / (1 - alpha),  S_t the episode's cost before step t,
 
-which sum to max(C - nu, 0) / (1 - alpha) over an episode: only cost beyond the quantile counts. So an agent
-of mean costs that is given c'_t for the costs, and nu + the mean of their sums for the mean episode cost,
-keeps the CVaR within the limit, whatever its algorithm.
+which sum to max(C - nu, 0) / (1 - alpha) over an episode: only cost beyond the quantile counts. Any agent for
+mean costs can therefore constrain the CVaR. It receives c'_t in place of the costs, and nu + the mean of
+their sums in place of the mean episode cost.
 
-Where all episodes are about equally bad, no episode has cost beyond its quantile: the CVaR is flat there, and
-an agent that violates its limit d could not leave (Greenberg et al. 2022). But the CVaR is at most d if and
-only if nu + E[max(C - nu, 0)] / (1 - alpha) is, for some nu <= d. Hence nu is the value at risk or d,
-whichever is less; where the limit is kept, that is the value at risk.
+If all episodes have about the same cost, none has cost beyond the quantile. The CVaR then has no gradient,
+and an agent that violates its limit d could not improve (Greenberg et al. 2022). But the CVaR is at most d if
+and only if nu + E[max(C - nu, 0)] / (1 - alpha) is, for some nu <= d. Hence nu is the smaller of the value at
+risk and d. If the limit holds, that is the value at risk.
 
-Left out: Chow et al. let policy and critics see S_t. Here both see the task's observations alone; the policy
-is the best of those, and the critics are baselines that know the average S_t. What a step does to later tail
-costs is therefore seen by the trace, not by the bootstrap: with ``cvar``, a ``cost_trace_decay`` near 1 is
-right. And only a share 1 - alpha of the episodes of an update counts: it needs many.
+Left out: in Chow et al., policy and critics observe S_t. Here both see only the task's observations, so the
+critics are baselines for the average S_t. The effect of a step on later tail costs is therefore estimated by
+the trace, not by bootstrapping: with ``cvar``, choose a ``cost_trace_decay`` near 1. Only a fraction 1 -
+alpha of the episodes of an update counts, so an update needs many.
 
 Notation: T steps, B environments, k costs, E finished episodes, alpha the level, nu the value at risk.
 """
@@ -41,19 +42,19 @@ from recrl.environments.cmdp import Floats
 
 
 def value_at_risk(costs: Floats, level: float) -> Floats:
-    """nu, the smallest of E costs that at least a share alpha of them does not exceed, [E, k] -> [k].
+    """Return nu, the smallest of E costs that a fraction of at least alpha does not exceed, [E, k] -> [k].
 
     >>> value_at_risk(np.array([[4.0], [1.0], [3.0], [2.0]]), 0.75)
     array([3.])
     """
-    # Without the tolerance a level that is a count over E, 0.9 of 10, may round up to the next count.
+    # Without the tolerance a level that is a multiple of 1 / E, 0.9 of 10, may round up to the next one.
     rank = max(math.ceil(level * len(costs) - 1e-9), 1)
     quantile: Floats = np.sort(costs, axis=0)[rank - 1]
     return quantile
 
 
 def conditional_value_at_risk(costs: Floats, level: float) -> Floats:
-    """The mean of the worst share 1 - alpha of E costs, [E, k] -> [k].
+    """Return the mean of the worst fraction 1 - alpha of E costs, [E, k] -> [k].
 
     >>> conditional_value_at_risk(np.array([[4.0], [1.0], [3.0], [2.0]]), 0.5)
     array([3.5])
@@ -62,7 +63,7 @@ def conditional_value_at_risk(costs: Floats, level: float) -> Floats:
 
 
 def tail_bound(costs: Floats, threshold: Floats, level: float) -> Floats:
-    """At least the CVaR of E costs, for any nu: nu + mean(max(C - nu, 0)) / (1 - alpha), [E, k] -> [k].
+    """Return nu + mean(max(C - nu, 0)) / (1 - alpha), an upper bound on the CVaR, [E, k] -> [k].
 
     >>> tail_bound(np.array([[4.0], [1.0], [3.0], [2.0]]), np.array([2.5]), 0.5)
     array([3.5])
@@ -74,11 +75,11 @@ def tail_bound(costs: Floats, threshold: Floats, level: float) -> Floats:
 def tail_costs(
     costs: Floats, *, carried: Floats, ended: npt.NDArray[np.bool_], threshold: Floats, level: float
 ) -> Floats:
-    """The module's c'_t.
+    """Return the module's tail costs c'_t.
 
     Args:
         costs: of each step, at least 0, [T, B, k].
-        carried: S of the episodes under way before the first step, [B, k].
+        carried: S of the running episodes before the first step, [B, k].
         ended: the step ended an episode, [T, B].
         threshold: nu, [k].
         level: alpha in [0, 1).
@@ -108,10 +109,10 @@ def standard_errors(costs: Floats) -> Floats:
 
 
 class RecentEpisodes:
-    """The last finished episodes: those of the newest update, and of earlier ones until the window is full.
+    """Window of the last finished episodes: of the newest update, and of earlier ones until it is full.
 
     Args:
-        window: the fewest episodes that will do, at least 1; there are fewer only before as many finished.
+        window: the least number of episodes, at least 1; fewer are used only at the start.
         num_costs: k.
     """
 
@@ -128,7 +129,7 @@ class RecentEpisodes:
             lengths: steps, [E].
 
         Returns:
-            Costs and lengths of all episodes of the window; of none if E is 0, since then nothing is new.
+            Costs and lengths of all episodes of the window; empty if E is 0, since then nothing is new.
         """
         if not len(costs):
             return self._nothing
@@ -140,7 +141,7 @@ class RecentEpisodes:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The window's episodes, and how many of them finished in each of its updates."""
+        """Return the window's episodes, and the number of episodes of each of its updates."""
         return {
             "costs": np.concatenate([self._nothing[0], *(costs for costs, _ in self._updates)]),
             "lengths": np.concatenate([self._nothing[1], *(lengths for _, lengths in self._updates)]),
@@ -156,7 +157,7 @@ class RecentEpisodes:
 
 
 class MeanCost:
-    """The mean episode cost is constrained; nothing is kept."""
+    """Constraint on the mean episode cost; it has no state."""
 
     def constraint_costs(
         self, rollout: Rollout, episode_costs: Floats, limits: Floats
@@ -167,15 +168,15 @@ class MeanCost:
         return rollout.costs, episode_costs.mean(axis=0)
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
+        """Return an empty state."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Nothing to load."""
+        """Load nothing."""
 
 
 class TailCost:
-    """The CVaR of the episode cost is constrained.
+    """Constraint on the CVaR of the episode cost.
 
     Args:
         level: alpha in [0, 1).
@@ -189,16 +190,17 @@ class TailCost:
     def constraint_costs(
         self, rollout: Rollout, episode_costs: Floats, limits: Floats
     ) -> tuple[Floats, Floats]:
-        """The costs to learn from, and what the limits are compared with.
+        """Return the costs to learn from, and the values to compare with the limits.
 
         Args:
             rollout: the steps.
-            episode_costs: of the last finished episodes, [E, k]; with E = 0 the value at risk stays.
+            episode_costs: of the last finished episodes, [E, k]; with E = 0 the value at risk does not
+                change.
             limits: d, [k], possibly infinite.
 
         Returns:
-            Costs a step whose sums are to be lowered, [T, B, k]; and what is to be within the limits, [k]:
-            the CVaR where that is, else a bound on it; NaN if no episode finished.
+            Costs per step whose sums are constrained, [T, B, k]; and the values for comparison, [k]: the CVaR
+            if it is within the limit, else a bound on it; NaN if no episode finished.
         """
         values = np.full_like(limits, np.nan)
         if len(episode_costs):

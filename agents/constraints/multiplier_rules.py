@@ -1,16 +1,16 @@
-"""Rules that move Lagrange multipliers, each a pure function on a small state.
+"""Update rules of Lagrange multipliers, each a pure function on a small state.
 
 A constrained learner maximises J_r - sum_i lambda_i (J_i - d_i) over the policy and minimises it over
 lambda >= 0. A rule takes the *gaps* J_i - d_i (mean undiscounted episode cost minus limit, positive where
-the constraint is violated) and returns the next state. A dimension whose limit is infinite is no
-constraint: its multiplier is 0 and the rest of its state stands still.
+the constraint is violated) and returns the next state. A dimension with an infinite limit is no constraint:
+its multiplier is 0 and the rest of its state does not change.
 
-A state is a dict of float64 arrays [k], so that a checkpoint can hold it as it is; ``multipliers`` is in
-each. Notation: k costs.
+A state is a dict of float64 arrays [k], which a checkpoint stores directly; each has the key ``multipliers``.
+Notation: k costs.
 
-Which to use: ``projected_ascent`` alone is an integrator, and so it swings about the limit; the proportional
-term of ``pid`` damps it. Neither winds down below 0 nor remembers old violations, so both answer at once when
-the limit moves. ``softplus_adam`` winds down and remembers; it is kept because the paper's agents use it.
+Which to use: ``projected_ascent`` is an integrator, so the cost oscillates about the limit; the proportional
+term of ``pid`` damps this. Neither winds down below 0 nor accumulates old violations, so both respond
+immediately to a changed limit. ``softplus_adam`` does both; it is here because the paper's agents use it.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ LARGEST_RELATIVE_GAP = 10.0
 
 
 def start_projected_ascent(num_costs: int, initial: float) -> dict[str, Floats]:
-    """All multipliers at ``initial``, at least 0."""
+    """Return the initial state: all multipliers at ``initial``, at least 0."""
     return {"multipliers": np.full(num_costs, initial)}
 
 
 def projected_ascent(
     state: MultiplierState, gaps: Floats, *, step_size: float | Floats, maximum: float
 ) -> dict[str, Floats]:
-    """Projected dual ascent: lambda <- clip(lambda + step_size (J - d), 0, maximum).
+    """Take a step of projected dual ascent: lambda <- clip(lambda + step_size (J - d), 0, maximum).
 
     Args:
         state: ``multipliers``.
@@ -49,7 +49,7 @@ def projected_ascent(
 
 
 def start_softplus_adam(num_costs: int, initial: float) -> dict[str, Floats]:
-    """All multipliers at ``initial``, above 0: theta = log(e^initial - 1)."""
+    """Return the initial state: all multipliers at ``initial``, above 0: theta = log(e^initial - 1)."""
     zeros = np.zeros(num_costs)
     return {
         "multipliers": np.full(num_costs, initial),
@@ -61,10 +61,10 @@ def start_softplus_adam(num_costs: int, initial: float) -> dict[str, Floats]:
 
 
 def softplus_adam(state: MultiplierState, gaps: Floats, *, learning_rate: float) -> dict[str, Floats]:
-    """Softplus with Adam: lambda = softplus(theta), Adam on the loss -theta (J - d) (safety-starter-agents).
+    """Take an Adam step on the loss -theta (J - d), lambda = softplus(theta) (safety-starter-agents).
 
-    Its second moment remembers early violations for a thousand updates, and theta falls without bound while
-    the constraint holds, so it answers a moving limit late.
+    Adam's second moment retains early violations for a thousand updates, and theta falls without bound while
+    the constraint holds. So it responds late to a changing limit.
 
     Args:
         state: ``multipliers``, ``theta``, ``first_moment``, ``second_moment``, ``steps``.
@@ -97,7 +97,7 @@ def softplus_adam(state: MultiplierState, gaps: Floats, *, learning_rate: float)
 
 
 def start_pid(num_costs: int, initial: float) -> dict[str, Floats]:
-    """All multipliers and integrals at ``initial``, at least 0; no gap seen yet."""
+    """Return the initial state: all multipliers and integrals at ``initial``, at least 0; no gap yet."""
     return {
         "multipliers": np.full(num_costs, initial),
         "integral": np.full(num_costs, initial),
@@ -115,25 +115,25 @@ def pid(
     derivative: float | Floats,
     maximum: float,
 ) -> dict[str, Floats]:
-    """A PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
+    """Take a step of a PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
 
     I <- clip(I + K_I min(gap, largest), 0, maximum);
     lambda = clip(K_P gap + I + K_D max(0, gap - last gap), 0, maximum).
 
-    The derivative acts only on growing violations, as in the source. The integral is held within what the
-    multiplier itself can be, so that neither a long satisfied nor a long hopeless constraint winds it up; it
-    includes its gain, so that a changed K_I does not make lambda jump.
+    The derivative acts only on growing violations, as in the source. The integral is clipped to the
+    multiplier's range, so that neither a long satisfied nor a long infeasible constraint winds it up. It
+    includes the gain K_I, so that changing K_I does not make lambda jump.
 
-    The gap that is summed up is bounded, too. An episode costs at least 0, so it is never further than d
-    below the limit, but an untrained policy may be any distance above it: what ten updates of a cost of 50
-    sum up under a limit of 1, no 400 later ones can take back. So a violation counts no more than the best
-    that can undo it.
+    The gap in the integral is bounded, too. An episode costs at least 0, so the gap is at least -d, but an
+    untrained policy may exceed the limit by any amount. Ten updates with a cost of 50 under a limit of 1
+    would add more than 400 later ones can subtract. So a violation counts no more than the largest possible
+    slack.
 
     Args:
         state: ``multipliers``, ``integral``, ``last_gap``.
         gaps: J - d in any unit, [k]; -inf where there is no constraint.
-        largest: the largest violation that is summed up, in that unit, one number or [k].
-        proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k]; so are the
+        largest: the largest violation in the integral, in that unit, one number or [k].
+        proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k]; likewise the
             next two.
         integral: K_I.
         derivative: K_D.
@@ -152,11 +152,11 @@ def pid(
 
 
 def relative_gaps(gaps: Floats, limits: Floats, standard_errors: Floats) -> Floats:
-    """Divide gaps by what they are large or small against: (J - d) / sqrt(d^2 + s^2), [k].
+    """Return gaps relative to limit and standard error: (J - d) / sqrt(d^2 + s^2), [k].
 
-    A gap of 1 is nothing under a limit of 25, and everything under one of 1; and a gap of one standard error
-    s says little, however small the limit. The result has no unit, is at least -1, and is cut off at 10,
-    which matters where both d and s are 0.
+    A gap of 1 is small under a limit of 25 and large under a limit of 1. A gap of one standard error s is not
+    significant under any limit. The result has no unit, is at least -1, and is clipped at 10, which matters
+    if d and s are 0.
 
     Args:
         gaps: J - d, [k]; -inf where there is no constraint.
@@ -172,7 +172,7 @@ def relative_gaps(gaps: Floats, limits: Floats, standard_errors: Floats) -> Floa
     return np.where(active, quotient(np.where(active, gaps, 0.0), floors), -np.inf)
 
 
-# How each rule begins, by the name that an agent's options use.
+# Initial state by the value of the option ``multiplier_rule``.
 STARTS: dict[str, Callable[[int, float], dict[str, Floats]]] = {
     "projected": start_projected_ascent,
     "softplus-adam": start_softplus_adam,

@@ -1,15 +1,16 @@
 """The Lagrange multipliers of an agent: a rule of ``constraints.multiplier_rules``, its state, and its units.
 
-An update first moves the multipliers by the violations, then gives the advantages of reward and costs in
-units in which the multipliers apply: the agent climbs A_r - sum_i mu_i A_i.
+An update first changes the multipliers by the violations. Then it scales the advantages of reward and costs
+to the multipliers' units: the agent ascends A_r - sum_i mu_i A_i.
 
-``multiplier_unit: relative`` knows no unit of the task. Violations are relative (``relative_gaps``). A
-multiplier mu_i is counted in u_i = spread of the reward's advantages / spread of cost i's advantages, each a
-running root mean square over all updates; the CMDP's own, in reward per unit of cost, is lambda_i = mu_i u_i.
-``cost`` is the paper's: violations in episode cost, standardised reward advantages, raw cost advantages.
+``multiplier_unit: relative`` does not depend on the task's units. Violations are relative
+(``relative_gaps``). The unit of a multiplier mu_i is u_i = spread of the reward's advantages / spread of cost
+i's advantages, each a running root mean square over all updates. In reward per unit of cost, the multiplier
+of the CMDP is lambda_i = mu_i u_i. ``cost`` is the paper's: violations in episode cost, standardised reward
+advantages, raw cost advantages.
 
-If no episode finished, nothing is known about the constraints and the multipliers stay. A cost whose limit is
-infinite has the multiplier 0.
+If no episode finished, nothing is known about the constraints and the multipliers do not change. A cost with
+an infinite limit has the multiplier 0.
 
 Notation: N samples, k costs.
 """
@@ -42,13 +43,13 @@ MultiplierRule = Callable[[MultiplierState, Floats], MultiplierState]
 
 @dataclass(frozen=True, eq=False)
 class Penalty:
-    """Advantages and multipliers in one unit.
+    """Advantages and multipliers in common units.
 
     Attributes:
-        rewards: centred advantages in their standard deviations, [N].
+        rewards: standardised advantages, [N].
         costs: centred advantages in the multipliers' unit, [N, k].
         multipliers: mu, [k], at least 0.
-        task_multipliers: lambda, the multipliers as they are reported, [k].
+        task_multipliers: lambda, the reported multipliers, [k].
     """
 
     rewards: Floats
@@ -58,12 +59,12 @@ class Penalty:
 
     @property
     def advantages(self) -> Floats:
-        """Those of the Lagrangian, (A_r - sum_i mu_i A_i) / (1 + sum_i mu_i), [N]."""
+        """Advantages of the Lagrangian, (A_r - sum_i mu_i A_i) / (1 + sum_i mu_i), [N]."""
         return penalised_advantages(self.rewards, self.costs, self.multipliers)
 
 
 class Multipliers:
-    """One multiplier a cost, moved by the rule that the options name.
+    """One multiplier per cost, updated by the rule of the options.
 
     Args:
         config: the rule, its gains and its unit.
@@ -77,7 +78,7 @@ class Multipliers:
         self._spreads = RunningScale(1 + num_costs)
 
     def update(self, experience: Experience) -> Penalty:
-        """Move with the violations, unless they are unknown, and price the advantages."""
+        """Update the multipliers, unless the violations are unknown; return the scaled advantages."""
         multipliers = self.move(experience.constraints)
         centred = experience.advantages - experience.advantages.mean(axis=0)
         spread = reward_spread(centred)
@@ -89,7 +90,7 @@ class Multipliers:
         return Penalty(rewards, costs * (exchange / spread), multipliers, multipliers * exchange)
 
     def move(self, constraints: Constraints) -> Floats:
-        """Move with the violations, unless they are unknown; return the multipliers in force, mu, [k]."""
+        """Update the multipliers, unless the violations are unknown; return them, mu, [k]."""
         if constraints.known:
             gaps = constraints.gaps
             if self._is_relative:
@@ -98,7 +99,7 @@ class Multipliers:
         return np.where(np.isfinite(constraints.limits), self._state["multipliers"], 0.0)
 
     def state_dict(self) -> dict[str, Any]:
-        """The rule's state and the advantages' spreads."""
+        """Return the rule's state and the advantages' spreads."""
         return {
             "multipliers": {key: values.copy() for key, values in self._state.items()},
             "spreads": self._spreads.state_dict(),
@@ -111,7 +112,7 @@ class Multipliers:
 
 
 def multiplier_step(config: LagrangianConfig) -> MultiplierRule:
-    """The multiplier rule that the options name, as a function of state and gaps."""
+    """Return the multiplier rule of the options, as a function of state and gaps."""
     step, maximum = config.multiplier_step, config.multiplier_maximum
     if config.multiplier_rule == "softplus-adam":
         return lambda state, gaps: softplus_adam(state, gaps, learning_rate=step)

@@ -1,1 +1,1 @@
-"""What all algorithms share: actor and critics, networks, policies, advantages, batches, surrogates."""
+"""Common parts of all algorithms: actor and critics, networks, policies, advantages, batches, surrogates."""

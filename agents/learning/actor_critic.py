@@ -1,10 +1,10 @@
-"""What all agents here have in common: a policy, 1 + k critics, and the walk of an update.
+"""Common part of all agents: a policy, 1 + k critics, and the steps of an update.
 
 An agent is an ``ActorCritic`` with a *rule* that improves the policy; PPO-Lagrangian and CPO are rules. An
 update collapses the rollout, estimates advantages, lets the rule improve the policy, and fits the critics.
 
-An agent lives on the device that was PyTorch's default one when it was made (``with torch.device("cuda")``):
-there it learns, with equal initial parameters on all. Rollouts come, and actions go, as NumPy arrays.
+An agent learns on the device that was PyTorch's default when it was made (``with torch.device("cuda")``).
+Initial parameters are equal on all devices. Rollouts and actions are NumPy arrays.
 
 Notation: T steps, B environments, N = T B samples, k costs, C = 1 + k signals, U unique observations, M
 truncated steps, E finished episodes.
@@ -44,11 +44,11 @@ from recrl.environments.plugins import trusted_attribute
 
 
 class ActorCritic:
-    """An agent; see ``recrl.agents.agent.Agent`` for what its methods promise.
+    """An agent; see ``recrl.agents.agent.Agent`` for the contract of its methods.
 
     Args:
-        cmdp: what the task fixes.
-        config: the settings that agents share.
+        cmdp: the task's CMDP.
+        config: the common settings of agents.
         encoder: of the observations that policy and critics see.
         policy: of the encoded observations and the task's actions.
         average: of the policies after the updates.
@@ -101,7 +101,7 @@ class ActorCritic:
         return self._behaviour.act(observations, generator)
 
     def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """What ``act`` inverts at B observations [B, n], float64 [B, A]; for Discrete actions only."""
+        """Return the cumulative masses for ``act`` at B observations [B, n], float64 [B, A]."""
         return self._behaviour.cumulative_masses(observations)
 
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
@@ -212,9 +212,9 @@ class ActorCritic:
         return values * self._value_scale.values if self._config.value_scale == "running" else values
 
     def _scaled(self, targets: Floats) -> tuple[Floats, Floats]:
-        """Include the targets, [N, C], in their running scale; return them in it, and the scale, [C].
+        """Include the targets, [N, C], in their running scale; return the scaled targets and the scale, [C].
 
-        The critics' last layers change by as much as the scale, so that the values stay what they are.
+        The critics' last layers change by the same factor as the scale, so that the values do not change.
         """
         if self._config.value_scale == "none":
             return targets, np.ones(targets.shape[1])
@@ -225,13 +225,12 @@ class ActorCritic:
         return quotient(targets, scale), scale
 
     def _fit_critics(self, batch: LearningBatch, targets: Floats) -> dict[str, float]:
-        """Regress all critics on their targets, [N, C]; they share no parameter, so one loss serves all.
+        """Regress all critics on their targets, [N, C]; they share no parameter, so one loss is enough.
 
-        They take ``critic_steps`` steps, or as many as ``critic_passes`` passes over the samples need,
-        whichever is more.
+        They take ``critic_steps`` steps, but at least ``critic_passes`` epochs.
 
         Returns:
-            The mean squared errors over the last pass, each sample's before the step that it was part of.
+            The mean squared errors over the last epoch, measured before the step of each minibatch.
         """
         config = self._config
         targets, scale = self._scaled(targets)
@@ -259,7 +258,7 @@ class ActorCritic:
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
-        """Parameters, generator, and the state of every part."""
+        """Return the parameters, the generator, and the state of every part."""
         return {
             "policy": self._policy.parameters.to_numpy(),
             "critics": self._critics.parameters.to_numpy(),
@@ -277,7 +276,7 @@ class ActorCritic:
             part.load_state_dict(state[name])
 
     def _on_its_device(self) -> AbstractContextManager[Any]:
-        """New tensors are where the parameters are; on a CPU they are anyway, and asking costs time."""
+        """Make tensors on the device of the parameters; on a CPU this does nothing, which saves time."""
         device = self._policy.parameters.values.device
         return nullcontext() if device.type == "cpu" else device
 
@@ -288,10 +287,10 @@ def fresh_agent(
     seed: np.random.SeedSequence,
     make_rule: Callable[[StochasticPolicy], PolicyRule],
 ) -> ActorCritic:
-    """An agent before its first update; the same seed gives all with the same networks the same policy.
+    """Make an agent; with the same networks and seed, all agents have the same initial policy.
 
     Args:
-        cmdp: what the task fixes.
+        cmdp: the task's CMDP.
         config: the agent's settings.
         seed: of the initial parameters and of the order of minibatches.
         make_rule: the agent's rule for a policy.

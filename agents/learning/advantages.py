@@ -1,7 +1,7 @@
 """Generalised advantage estimation for the reward and every cost at once, and the units of the estimates.
 
 Notation: T steps, B environments, N = T B samples, C = 1 + k signals (the reward, then the k costs), M
-truncated steps, gamma the discount, lambda the trace decay.
+truncated steps, gamma the discount, lambda the GAE parameter.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ def next_values(
     final_values: Floats,
     last_values: Floats,
 ) -> Floats:
-    """The value of what truly followed each step.
+    """Return the value of the true successor of each step.
 
-    Inside an episode that is V(s_{t+1}); 0 after a termination; the value of the true last observation
-    after a time-out (not of the next episode's first, which is what row t + 1 holds); and at the rollout's
-    end the value of the observation that the policy would see next.
+    Inside an episode it is V(s_{t+1}), and 0 after a termination. After a time-out it is the value of the
+    true last observation, not that of the next episode in row t + 1. At the rollout's end it is the value of
+    the next observation.
 
     Args:
         values: V(s_t), [T, B, C].
@@ -60,7 +60,7 @@ def generalised_advantages(
     Args:
         signals: rewards and costs a step, [T, B, C].
         values: V(s_t), [T, B, C].
-        following: V(s_{t+1}) as ``next_values`` gives it, [T, B, C].
+        following: V(s_{t+1}) of ``next_values``, [T, B, C].
         ended: the step ended an episode, for good or by a time-out, [T, B].
         discount: gamma in [0, 1].
         trace_decays: lambda in [0, 1] of each signal, [C].
@@ -83,7 +83,7 @@ def reward_spread(advantages: Floats) -> float:
 def scaled_advantages(advantages: Floats) -> tuple[Floats, Floats]:
     """Centre all advantages and divide them by the standard deviation of the reward's.
 
-    Divided by the same number, rewards and costs trade as they do in the CMDP.
+    The common divisor preserves the trade-off between reward and costs of the CMDP.
 
     Args:
         advantages: raw, [N, 1 + k].

@@ -1,13 +1,16 @@
-"""From a rollout to what learning needs: repeated observations evaluated once, distinct ones by minibatches.
+"""Batches for learning: repeated observations are evaluated once, distinct ones in minibatches.
 
 On a tabular task a rollout of thousands of samples holds a few hundred distinct observations. Networks are
-then evaluated on the *unique observations* (rows), and everything that is summed over samples is summed by
-row, or by *pair* (unique pair of row and discrete action), beforehand. This is exact, not an approximation: a
-mean over samples of a function of the row is a weighted mean over rows; squared errors about several targets
-of one row are those about the targets' mean plus a constant; and a clipped surrogate, which depends on an
-advantage's sign, is linear in the positive and in the negative advantages of a pair. Where rows do not
-repeat, every sample is its own row and pair, and the same formulas hold; such a batch can be parted into
-minibatches.
+then evaluated on the *unique observations* (rows). Sums over samples are first taken by row, or by *pair*
+(unique pair of row and discrete action). This is exact, not an approximation:
+
+- A mean over samples of a function of the row is a weighted mean over rows.
+- Squared errors about several targets of one row are those about the targets' mean plus a constant.
+- A clipped surrogate depends on an advantage's sign; it is linear in the positive and in the negative
+  advantages of a pair.
+
+If rows do not repeat, every sample is its own row and pair, and the same formulas hold. Such a batch can be
+divided into minibatches.
 
 Notation: N samples of a rollout, U unique observations, D unique pairs, n observation components, k costs, C
 = 1 + k signals.
@@ -26,7 +29,7 @@ from torch import Tensor
 
 from recrl.environments.cmdp import Floats
 
-# Rows are only worth gathering if there are fewer than this share of the samples.
+# Rows are collapsed only if there are fewer than this fraction of the samples.
 WORTHWHILE_SHARE = 0.5
 
 Indices = npt.NDArray[np.int64]
@@ -39,12 +42,12 @@ def find_repeated(
 
     Args:
         observations: [N, n].
-        most: unique observations that are of use, at least 1; any number if None.
+        most: largest useful number of unique observations, at least 1; no bound if None.
 
     Returns:
-        The first sample of each distinct row, [U], and the row of each sample, [N]; or None if rows seldom
-        repeat (U > N / 2), are more than ``most``, or in the improbable case that two different rows have
-        one hash.
+        The first sample of each distinct row, [U], and the row of each sample, [N]. None if rows seldom
+        repeat (U > N / 2) or are more than ``most``, or if two different rows have the same hash, which is
+        improbable.
     """
     words = np.ascontiguousarray(observations).view(np.uint32).astype(np.uint64)
     factors = np.random.default_rng(0).integers(2**64, size=words.shape[1], dtype=np.uint64)
@@ -57,7 +60,7 @@ def find_repeated(
 
 
 def by_group(samples: Floats, group: Indices | None, num_groups: int) -> Floats:
-    """Sums of samples [N] or [N, C] over each group, divided by N: [G] or [G, C].
+    """Sum samples [N] or [N, C] over each group and divide by N: [G] or [G, C].
 
     The sum over groups is then the mean over samples.
 
@@ -77,7 +80,7 @@ def by_group(samples: Floats, group: Indices | None, num_groups: int) -> Floats:
 
 
 def to_tensor(values: Floats) -> Tensor:
-    """A tensor of float64 values, in the precision and on the device that learning uses."""
+    """Make a tensor of float64 values, in the precision and on the device of learning."""
     return torch.as_tensor(values, dtype=torch.get_default_dtype())
 
 
@@ -87,12 +90,12 @@ class LearningBatch:
 
     Attributes:
         unique_observations: distinct observations, float32 [U, n].
-        observation_weights: share of the samples at each, [U], summing to 1.
+        observation_weights: fraction of the samples at each, [U], summing to 1.
         actions: the action of each pair, int64 [D] or float32 [D, m].
         pair_observations: the row of each pair, int64 [D], or None if pair i is at row i.
         observation_of_sample: [N], or None if each sample is its own row.
         pair_of_sample: [N], or None if each sample is its own pair.
-        samples: of a minibatch, the samples of the rollout that it has, [U]; None if it has all.
+        samples: indices of the rollout's samples in a minibatch, [U]; None for all.
     """
 
     unique_observations: Tensor
@@ -117,8 +120,8 @@ class LearningBatch:
         Args:
             observations: [N, n].
             actions: int64 [N] or float32 [N, m].
-            compact: whether to look for repeated rows at all.
-            most_observations: leave the samples as they are if more rows than this are distinct.
+            compact: whether to look for repeated rows.
+            most_observations: do not collapse more distinct rows than this.
         """
         found = find_repeated(observations, most_observations) if compact else None
         if found is None:
@@ -135,17 +138,17 @@ class LearningBatch:
         return cls(rows, weights, taken, at, row, pair)
 
     def num_parts(self, size: int | None) -> int:
-        """How many minibatches of about ``size`` rows make a pass over the samples; one if rows repeat."""
+        """Return the number of minibatches of about ``size`` rows in an epoch; one if rows repeat."""
         if size is None or self.observation_of_sample is not None:
             return 1
         return -(-len(self.unique_observations) // size)
 
     def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[LearningBatch]:
-        """Minibatches without end: passes over the samples, each in a new random order.
+        """Yield minibatches without end: epochs over the samples, each in a new random order.
 
         Args:
             size: rows of a minibatch, at most; None for all.
-            generator: of the order; not used where the batch is one part, which then is the batch itself.
+            generator: for the order; not used if the batch is a single part.
         """
         num_parts = self.num_parts(size)
         while True:
@@ -156,7 +159,7 @@ class LearningBatch:
                 yield self.minibatch(chosen)
 
     def minibatch(self, samples: Indices) -> LearningBatch:
-        """Some samples, [U], of a batch in which each sample is its own row."""
+        """Return some samples, [U], of a batch in which each sample is its own row."""
         index = torch.as_tensor(samples)
         return LearningBatch(
             unique_observations=self.unique_observations.index_select(0, index),
@@ -169,11 +172,11 @@ class LearningBatch:
         )
 
     def thinned(self, most: int | None, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Rows and their weights: the batch's own, or those of ``most`` samples drawn at random.
+        """Return rows and their weights: of all samples, or of ``most`` samples drawn at random.
 
         Args:
             most: rows to keep, at most; None for all.
-            generator: of the draw; not used if all rows are kept.
+            generator: for the draw; not used if all rows are kept.
         """
         if most is None or len(self.unique_observations) <= most:
             return self.unique_observations, self.observation_weights
@@ -186,17 +189,17 @@ class LearningBatch:
         return self.unique_observations.index_select(0, torch.as_tensor(kept)), to_tensor(counts / most)
 
     def per_observation(self, samples: Floats) -> Floats:
-        """Sums over the samples of each row, divided by N: [N] or [N, C] -> [U] or [U, C]."""
+        """Sum over the samples of each row and divide by N: [N] or [N, C] -> [U] or [U, C]."""
         return by_group(self.own(samples), self.observation_of_sample, len(self.unique_observations))
 
     def per_pair(self, samples: Floats) -> Tensor:
-        """Sums over the samples of each pair, divided by N: [N] or [N, C] -> [D] or [D, C]."""
+        """Sum over the samples of each pair and divide by N: [N] or [N, C] -> [D] or [D, C]."""
         return to_tensor(by_group(self.own(samples), self.pair_of_sample, len(self.actions)))
 
     def per_sample(self, values: Floats) -> Floats:
-        """Hand each sample its row's values, [U, C] -> [N, C]."""
+        """Give each sample its row's values, [U, C] -> [N, C]."""
         return values if self.observation_of_sample is None else values[self.observation_of_sample]
 
     def own(self, samples: Floats) -> Floats:
-        """Those of the samples of a rollout, [N] or [N, C], that the batch has."""
+        """Select from a rollout's samples, [N] or [N, C], those in the batch."""
         return samples if self.samples is None else samples[self.samples]

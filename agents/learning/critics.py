@@ -32,7 +32,7 @@ class Critics:
         )
 
     def values(self, rows: Tensor) -> npt.NDArray[np.float64]:
-        """The values of every row, [U, n] -> float64 [U, 1 + k]."""
+        """Return the values of every row, [U, n] -> float64 [U, 1 + k]."""
         return self._stack.outputs(rows)[..., 0].numpy(force=True).T.astype(np.float64)
 
     def rescale(self, factors: npt.NDArray[np.float64]) -> None:
@@ -40,10 +40,10 @@ class Critics:
         self._stack.scale(torch.as_tensor(factors, dtype=torch.get_default_dtype()))
 
     def differentiate(self, rows: Tensor, observation_weights: Tensor, targets: Tensor) -> Tensor:
-        """The squared errors of each critic, and their sum's gradient, which the block then holds.
+        """Return the squared errors of each critic; write the gradient of their sum to the block.
 
-        L_c = sum_u w_u (V_c(u) - y_cu)^2. The critics share no parameter, so the gradient of the sum is each
-        one's own.
+        L_c = sum_u w_u (V_c(u) - y_cu)^2. The critics share no parameter, so the gradient of the sum consists
+        of their separate gradients.
 
         Args:
             rows: [U, n].

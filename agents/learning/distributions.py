@@ -1,7 +1,8 @@
 """Action distributions of a batch of observations: categorical and diagonal Gaussian.
 
-Each knows its log-probabilities, its Kullback-Leibler divergence from another, its entropy, and the Fisher
-metric on its network's outputs, which is the Hessian of that divergence at the distribution itself.
+Each has log-probabilities, the Kullback-Leibler divergence from another distribution, the entropy, and the
+Fisher metric on the network's outputs. The Fisher metric is the Hessian of that divergence at equal
+distributions.
 
 Notation: U unique observations, D unique pairs (of row and action; every sample is one if nothing
 repeats), A actions, m action components.
@@ -39,7 +40,7 @@ class Categorical:
         return torch.take(self.log_probs, rows * num_actions + actions)
 
     def at(self, rows: Tensor) -> Categorical:
-        """The same at some rows only, int64 [V]."""
+        """Return the distribution at some rows only, int64 [V]."""
         return Categorical(self.log_probs.index_select(0, rows))
 
     def divergence(self, other: Categorical) -> Tensor:
@@ -58,7 +59,7 @@ class Categorical:
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """Independent normal action components, their spread the same at all rows.
+    """Independent normal action components with one spread for all rows.
 
     Attributes:
         mean: [U, m].
@@ -83,7 +84,7 @@ class Gaussian:
         return -0.5 * standardised.square().sum(1) - constant
 
     def at(self, rows: Tensor) -> Gaussian:
-        """The same at some rows only, int64 [V]."""
+        """Return the distribution at some rows only, int64 [V]."""
         return Gaussian(self.mean.index_select(0, rows), self.log_std)
 
     def divergence(self, other: Gaussian) -> Tensor:
@@ -103,7 +104,10 @@ class Gaussian:
         return each.expand(len(self.mean))
 
     def fisher(self, change: Tensor) -> Tensor:
-        """A change of the means over the variances, [U, m] -> [U, m]; that of log_std is 2 a component."""
+        """Return a change of the means divided by the variances, [U, m] -> [U, m].
+
+        The Fisher metric of log_std is 2 per component.
+        """
         return change * torch.exp(-2.0 * self.log_std)
 
 
@@ -116,7 +120,7 @@ def mean_divergence(old: Distribution, new: Distribution, observation_weights: T
     Args:
         old: the policy that collected the samples.
         new: of the same family.
-        observation_weights: share of the samples at each row, [U], summing to 1.
+        observation_weights: fraction of the samples at each row, [U], summing to 1.
     """
     assert type(old) is type(new)
     return torch.dot(observation_weights, old.divergence(new))  # type: ignore[arg-type]

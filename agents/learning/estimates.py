@@ -1,4 +1,4 @@
-"""What a rollout says about reward and costs: advantages, the critics' targets, and their explained variance.
+"""Estimates from a rollout: advantages, the critics' targets, and explained variance.
 
 Notation: N samples, C = 1 + k signals, U distinct observations.
 """
@@ -18,14 +18,14 @@ from recrl.environments.cmdp import Floats
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What a rollout says about the signals, all [N, C].
+    """Estimates of the signals from a rollout, all [N, C].
 
     Attributes:
         advantages: generalised advantage estimates.
-        targets: what the critics learn.
-        values: what the critics said before they saw the rollout.
-        returns: discounted sums of the signals up to the episode's or the rollout's end, where the last value
-            stands for the rest.
+        targets: the critics' regression targets.
+        values: predictions of the critics before the update.
+        returns: discounted sums of the signals up to the end of the episode or the rollout, bootstrapped
+            there with the critics' value.
     """
 
     advantages: Floats
@@ -34,10 +34,10 @@ class Estimates:
     returns: Floats
 
     def explained_variances(self) -> dict[str, float]:
-        """The critics' explained variance of fresh returns, 1 - Var(returns - values) / Var(returns).
+        """Return the critics' explained variance of new returns, 1 - Var(returns - values) / Var(returns).
 
-        1 is perfect, 0 is no better than a constant, NaN where all returns are equal. The last value in the
-        returns is the critics' own, which flatters them a little.
+        1 is perfect, 0 is no better than a constant, NaN if all returns are equal. The bootstrap value in the
+        returns is the critics' own, which biases the result upwards a little.
         """
         spread = self.returns.var(axis=0)
         unexplained = (self.returns - self.values).var(axis=0)
@@ -48,10 +48,10 @@ class Estimates:
 
 
 def row_targets(batch: LearningBatch, targets: Floats) -> tuple[Tensor, Tensor]:
-    """What to regress on at each row so that the mean squared error over the samples is minimal.
+    """Return the regression target of each row that minimises the mean squared error over the samples.
 
-    The mean squared error over samples is that about the mean target of each row, weighted by the
-    row's share of the samples, plus the targets' spread about those means, which no critic can lower.
+    The error over samples is the error about the mean target of each row, weighted by its fraction of the
+    samples, plus the targets' variance. No critic can reduce the latter.
 
     Args:
         batch: the samples.

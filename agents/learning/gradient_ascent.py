@@ -1,9 +1,8 @@
-"""First-order improvement of a policy: Adam steps up an objective, until it has moved too far.
+"""First-order improvement of a policy: Adam steps on an objective, until the KL is too large.
 
-A step uses all rows of the batch, or a minibatch where they are many. The policy may take ``policy_steps``
-steps, or as many as ``policy_passes`` passes over the samples need, whichever is more. After each step the
-mean KL from the old policy is measured on the rows of the next, which need to be evaluated anyway: of a
-thousand rows it is known to a few per cent.
+A step uses all rows of the batch, or a minibatch if they are many. The policy may take ``policy_steps``
+steps, but at least ``policy_passes`` epochs. After each step the mean KL from the old policy is measured on
+the rows of the next step, which are evaluated anyway. With a thousand rows its error is a few per cent.
 
 Notation: N samples, D unique pairs, k costs.
 """
@@ -28,8 +27,8 @@ from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful
 from recrl.agents.shared_options import AscentConfig
 
-# What is climbed: a differentiable scalar of the policy's distributions at the rows of some samples, and of
-# the probability ratios pi(a | s) / pi_old(a | s) of their pairs, [D].
+# An objective: a differentiable scalar of the policy's distributions at the rows of some samples, and of the
+# probability ratios pi(a | s) / pi_old(a | s) of their pairs, [D].
 Objective = Callable[[Distribution, Tensor], Tensor]
 
 
@@ -37,11 +36,11 @@ AnyAscentConfig = TypeVar("AnyAscentConfig", bound=AscentConfig)
 
 
 class FirstOrderRule(Generic[AnyAscentConfig]):
-    """What the rules share that improve a policy by gradient ascent: the settings and the optimiser.
+    """Common part of first-order rules: the settings and the optimiser.
 
     Args:
         config: the agent's settings.
-        policy: whose parameters the optimiser changes.
+        policy: the optimiser changes its parameters.
     """
 
     def __init__(self, config: AnyAscentConfig, policy: StochasticPolicy) -> None:
@@ -53,7 +52,7 @@ class FirstOrderRule(Generic[AnyAscentConfig]):
 def with_entropy(
     surrogate_objective: Callable[[Tensor], Tensor], batch: LearningBatch, bonus: float
 ) -> Objective:
-    """A function of the ratios alone, plus ``bonus`` times the mean entropy in nats."""
+    """Make an objective of a function of the ratios, plus ``bonus`` times the mean entropy in nats."""
 
     def objective(now: Distribution, ratios: Tensor) -> Tensor:
         if bonus == 0.0:
@@ -64,16 +63,17 @@ def with_entropy(
 
 
 def with_prices(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
-    """A function of the ratios that also says what it charges for costs, over 1 + that price.
+    """Make an objective of a function of the ratios that also returns the total weight of its penalties.
 
-    A penalty's gradients are as long as its price. Adam, whose steps remember the length of past gradients,
-    would leave a violated constraint fast and come back to it slowly; divided by the price, all gradients are
-    of one length, and every point that was optimal still is.
+    The objective is divided by 1 + that weight, because the gradients of penalties are proportional to their
+    weights. Adam normalises by the size of past gradients, so the policy would leave a violated constraint
+    fast and return slowly. Division by the weight gives all gradients similar sizes and does not change the
+    optimum.
     """
 
     def objective(_: Distribution, ratios: Tensor) -> Tensor:
-        value, price = surrogate_objective(ratios)
-        return value / (1.0 + price)
+        value, weight = surrogate_objective(ratios)
+        return value / (1.0 + weight)
 
     return objective
 
@@ -87,15 +87,15 @@ def gradient_ascent(
     config: AscentConfig,
     generator: np.random.Generator,
 ) -> dict[str, float]:
-    """Climb an objective from the policy that collected the samples.
+    """Ascend an objective from the policy that collected the samples.
 
     Args:
         policy: changed in place.
         optimiser: of its parameters.
         experience: the samples.
-        objective_of: what to climb on some of the samples, or on all.
-        config: how far.
-        generator: of the minibatches.
+        objective_of: gives the objective of a minibatch or of all samples.
+        config: learning rate, steps and largest KL.
+        generator: for the minibatches.
 
     Returns:
         The number of steps taken, ``policy_steps``.
@@ -106,7 +106,7 @@ def gradient_ascent(
     size = config.minibatch_size
     steps = max(config.policy_steps, config.policy_passes * experience.batch.num_parts(size))
     largest_kl = config.stop_kl_factor * config.target_kl
-    objective_on = lru_cache(maxsize=1)(objective_of)  # the whole batch comes again and again
+    objective_on = lru_cache(maxsize=1)(objective_of)  # the whole batch is repeated without end
     taken, divergence = 0, 0.0
     for taken, part in enumerate(islice(experience.parts(size, generator), steps + 1)):
         now = policy.evaluate(part.batch.unique_observations)

@@ -1,8 +1,8 @@
-"""Networks of the user's own: any ``torch.nn.Module``, differentiated by PyTorch.
+"""Users' networks: any ``torch.nn.Module``, differentiated by PyTorch.
 
-``ModuleStack`` does for modules what ``TanhStack`` does for the standard perceptron, with the same methods:
-policies, critics, trust regions and checkpoints need not know which of them they have. The parameters of all
-modules are views into one flat block.
+``ModuleStack`` has the same methods for modules as ``TanhStack`` for the standard perceptron. Policies,
+critics, trust regions and checkpoints work with both. The parameters of all modules are views into one flat
+block.
 
 Notation: C networks, U rows, n inputs, P parameters.
 """
@@ -35,7 +35,7 @@ ACTIVATIONS: Mapping[str, type[nn.Module]] = {
 def perceptron(
     hidden_sizes: Sequence[int], activation: str, initialiser: Callable[[Tensor, torch.Generator], None]
 ) -> Callable[[torch.Generator], ModuleFactory]:
-    """Return what makes multi-layer perceptrons with an activation between the layers, seed by seed.
+    """Return a factory of multi-layer perceptrons with an activation between the layers.
 
     Args:
         hidden_sizes: widths of the hidden layers.
@@ -62,14 +62,14 @@ def perceptron(
 
 
 class ModuleStack:
-    """C separate modules of one kind, each followed by a factor that no gradient changes.
+    """C separate modules of one kind, each followed by a constant factor.
 
-    The factor stands for the last layer's scale: policies are made more random by it, critics are rescaled
-    by it (``scale``).
+    The factor is not learnt. It acts like the last layer's scale: it makes policies more random and rescales
+    critics (``scale``).
 
     Args:
         modules: C of them, without buffers, in evaluation mode.
-        parameters: the block whose first tensors, shaped as ``shapes`` says, it uses.
+        parameters: the block; the first tensors, with the shapes of ``shapes``, are used.
     """
 
     def __init__(self, modules: Sequence[nn.Module], parameters: FlatParameters) -> None:
@@ -104,7 +104,7 @@ class ModuleStack:
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def activations(self, rows: Tensor, scratch: object = None) -> list[Tensor]:
-        """The rows, the outputs with their graph, and the outputs alone, [C, U, out]."""
+        """Return the rows, the outputs with their graph, and the outputs alone, [C, U, out]."""
         del scratch
         with torch.enable_grad(), self._differentiable():
             outputs = self._forward(rows, self._values)
@@ -126,12 +126,12 @@ class ModuleStack:
         return moved
 
     def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
-        """The derivative of a loss by the parameters into the gradient block.
+        """Write the derivative of a loss by the parameters to the gradient block.
 
         Args:
-            activations: as ``activations`` gave them at the present parameters.
+            activations: the result of ``activations`` at the present parameters.
             slope: dL / d outputs, [C, U, out].
-            add: to what the gradient block holds; else replace.
+            add: add to the gradient block instead of replacing it.
         """
         places = [place for slopes in self._slopes for place in slopes.values()]
         with self._differentiable():
@@ -151,7 +151,7 @@ class ModuleStack:
 
     @contextmanager
     def _differentiable(self) -> Iterator[None]:
-        """Views of the block take part in graphs only while one is made: optimisers write to them."""
+        """Let views of the block require gradients only while a graph is made: optimisers write to them."""
         leaves = self._leaves()
         for leaf in leaves:
             leaf.requires_grad_(True)
@@ -171,7 +171,7 @@ class ModuleStack:
 
 
 def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int) -> nn.Module:
-    """Make a network and try it on two rows.
+    """Make a network and test it on two rows.
 
     Args:
         factory: the user's, or ``perceptron``'s.
@@ -179,7 +179,7 @@ def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int) ->
         num_outputs: actions, action components, or 1.
 
     Raises:
-        NetworkError: it is no module, has buffers or no parameters, fails, gives another shape or type, or
+        NetworkError: it is no module, has buffers or no parameters, fails, returns another shape or type, or
             its rows depend on one another.
     """
     name = getattr(factory, "__qualname__", "the network's factory")

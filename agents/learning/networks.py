@@ -1,16 +1,16 @@
 """Tanh multi-layer perceptrons, their parameters in one flat block, and Adam on it.
 
-Every network here is a *stack* of C separate networks of one shape, evaluated as one batched product: the
-1 + k critics of a CMDP cost hardly more than one. A policy is a stack of one.
+Every network here is a *stack* of C separate networks of one shape, evaluated as one batched product: 1 + k
+critics take hardly more time than one. A policy is a stack of one.
 
 All parameters of a stack are views into one contiguous vector, and so are their gradients. Adam is then a
 handful of operations on two vectors, a trust-region step is ``parameters += step``, and a checkpoint is a
-single array. With small networks and few rows the number of calls is what an update costs; with many rows the
-activations would be what it holds, so rows are evaluated in blocks.
+single array. With small networks and few rows the number of calls determines the time of an update. With many
+rows the activations determine its memory, so rows are evaluated in blocks.
 
-A layer's biases are the last row of its weights, and its inputs end in a column of ones. To add biases and to
-sum their slopes would each be a sweep over memory as large as the activations, and such sweeps are what a
-large update costs beside its products.
+A layer's biases are the last row of its weights, and its inputs end in a column of ones. Separate biases
+would need two more sweeps over memory of the size of the activations. Such sweeps take most of the time
+besides the products.
 
 Notation: C networks, U rows, n inputs, P parameters.
 """
@@ -28,21 +28,21 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-# Rows evaluated at once: so many, or more where that would make more blocks than these. A block's activations
-# are all that is held, but each block reads all weights and adds to the whole gradient: 30,000 rows of 256
-# units take an eighth longer in 30 blocks than in four.
+# Rows evaluated at once: this number, or more if there would otherwise be more than MOST_BLOCKS blocks. Only
+# one block's activations are in memory, but each block reads all weights and adds to the whole gradient. So
+# 30,000 rows of 256 units take an eighth longer in 30 blocks than in four.
 BLOCK_ROWS, MOST_BLOCKS = 1024, 4
-# Rows of activations begin at multiples of so many numbers, which is where products are fastest.
+# Rows of activations begin at multiples of this number of floats, where products are fastest.
 ALIGNMENT = 16
-# So few columns of a product are faster multiplied as rows.
+# Products with at most this number of columns are faster multiplied as rows.
 FEW_COLUMNS = 8
 
-# (1 - h^2) slope in one sweep over memory, into ``grad_input``; no public function does that.
+# Compute (1 - h^2) slope in one sweep over memory, to ``grad_input``; no public function does.
 tanh_backward = torch.ops.aten.tanh_backward.grad_input
 
 
 def add_product(into: Tensor, left: Tensor, right: Tensor, *, keep: bool) -> None:
-    """Write left^T right, [C, i, o], into memory, or add it to what the memory holds.
+    """Write left^T right, [C, i, o], to memory, or add it.
 
     A few columns (o is 1 for critics, the size of an action for policies) are multiplied as the rows
     right^T left: MKL takes two to three times as long for columns.
@@ -51,7 +51,7 @@ def add_product(into: Tensor, left: Tensor, right: Tensor, *, keep: bool) -> Non
         into: [C, i, o].
         left: [C, U, i].
         right: [C, U, o].
-        keep: whether to add.
+        keep: whether to add instead of replacing.
     """
     if right.shape[2] <= FEW_COLUMNS:
         product = torch.bmm(right.transpose(1, 2), left).transpose(1, 2)
@@ -63,7 +63,7 @@ def add_product(into: Tensor, left: Tensor, right: Tensor, *, keep: bool) -> Non
 
 
 def pull_through(slope: Tensor, weight: Tensor, out: Tensor) -> Tensor:
-    """Write slope weight^T, [C, U, i], into ``out``; an outer product where there is but one output.
+    """Write slope weight^T, [C, U, i], to ``out``; an outer product if there is one output.
 
     Args:
         slope: [C, U, o].
@@ -93,21 +93,21 @@ INITIALISERS: dict[str, Initialiser] = {"orthogonal": orthogonal, "xavier": xavi
 
 
 def blocks(num_rows: int) -> list[slice]:
-    """Consecutive slices that cover ``num_rows``: of ``BLOCK_ROWS``, or ``MOST_BLOCKS`` longer ones."""
+    """Return consecutive slices of ``num_rows``: of ``BLOCK_ROWS`` each, or ``MOST_BLOCKS`` longer ones."""
     size = max(BLOCK_ROWS, math.ceil(num_rows / MOST_BLOCKS))
     return [slice(start, start + size) for start in range(0, max(num_rows, 1), size)]
 
 
 @dataclass(frozen=True)
 class NetworkForm:
-    """How the networks of an agent are built.
+    """Architecture of an agent's networks.
 
     Attributes:
         hidden_sizes: widths of the hidden layers.
         initialiser: draws each weight matrix.
         activation: between the layers; a key of ``module_stack.ACTIVATIONS``.
-        factory: what makes a network of the user's own, from the numbers of inputs and outputs, or None; the
-            other attributes are then not used.
+        factory: makes a user's network from the numbers of inputs and outputs; with it the other attributes
+            are not used. None for the standard perceptron.
     """
 
     hidden_sizes: tuple[int, ...]
@@ -117,7 +117,7 @@ class NetworkForm:
 
 
 class FlatParameters:
-    """Tensors that are views into one vector, as their gradients are into another.
+    """Tensors that are views into one vector; their gradients are views into another.
 
     Args:
         shapes: of the tensors, in order.
@@ -139,7 +139,7 @@ class FlatParameters:
         self.gradients = [self.gradient[end - size : end].view(shape) for shape, size, end in places]
 
     def pieces(self, vector: Tensor) -> list[Tensor]:
-        """A vector of parameter changes, [P], as views of the parameters' shapes."""
+        """Return a vector of parameter changes, [P], as views of the parameters' shapes."""
         ends = itertools.accumulate(tensor.numel() for tensor in self.tensors)
         return [
             vector[end - tensor.numel() : end].view(tensor.shape)
@@ -147,19 +147,19 @@ class FlatParameters:
         ]
 
     def to_numpy(self, vector: Tensor | None = None) -> npt.NDArray[np.float32]:
-        """A copy of all parameters, or of a vector that belongs to them, as it is saved, [P].
+        """Return a copy of all parameters, or of a vector like them, in the saved order, [P].
 
-        Saved is layer by layer first the weights of all networks, then their biases.
+        The order is layer by layer: first the weights of all networks, then their biases.
         """
         pieces = self.pieces(self.values if vector is None else vector)
         parts = [part.reshape(-1) for piece in pieces for part in _saved_parts(piece)]
         return torch.cat(parts).numpy(force=True)
 
     def load(self, saved: npt.NDArray[np.float32], vector: Tensor | None = None) -> None:
-        """Take over what ``to_numpy`` gave, [P], as the parameters or into a vector that belongs to them.
+        """Restore a result of ``to_numpy``, [P], as the parameters or into a vector like them.
 
         Raises:
-            ValueError: they are of another network.
+            ValueError: the network has another size.
         """
         if saved.shape != tuple(self.values.shape):
             raise ValueError(
@@ -175,15 +175,15 @@ class FlatParameters:
 
 
 def _saved_parts(piece: Tensor) -> list[Tensor]:
-    """The views of a tensor that are saved one after the other: of a layer, its weights and biases."""
+    """Return the views of a tensor in the saved order: weights and biases of a layer."""
     return [piece[:, :-1], piece[:, -1:]] if piece.dim() == 3 else [piece]
 
 
 class Scratch:
-    """Memory that is used again and again.
+    """Reusable memory.
 
-    Asking the system for some megabytes anew costs as much as a product that fills them. A place is either
-    for ``tensor`` or for ``inputs``.
+    Allocating some megabytes takes as long as a product that fills them. A place is used either by ``tensor``
+    or by ``inputs``.
     """
 
     def __init__(self) -> None:
@@ -191,14 +191,14 @@ class Scratch:
         self._views: dict[int, Tensor] = {}
 
     def tensor(self, place: int, shape: tuple[int, ...]) -> Tensor:
-        """Uninitialised memory; what was handed out at the same place before is overwritten."""
+        """Return uninitialised memory; it overwrites the previous tensor of the same place."""
         view = self._views.get(place)
         if view is None or view.shape != shape:
             view = self._views[place] = self._memory(place, math.prod(shape)).view(shape)
         return view
 
     def inputs(self, place: int, num_networks: int, num_rows: int, width: int) -> Tensor:
-        """Uninitialised memory for a layer's inputs, [C, U, width + 1], but the last column holds ones."""
+        """Return memory for a layer's inputs, [C, U, width + 1]; only the last column is set, to ones."""
         view = self._views.get(place)
         if view is None or view.shape != (num_networks, num_rows, width + 1):
             length = math.ceil((width + 1) / ALIGNMENT) * ALIGNMENT
@@ -217,18 +217,18 @@ class Scratch:
 class TanhStack:
     """C separate multi-layer perceptrons with tanh between the layers and a linear last one.
 
-    Differentiated by hand, along a change of the parameters (``output_change``) and back to them
-    (``pull_back``): the two products with the Jacobian are the same few lines, and automatic differentiation
-    would spend more time on its book-keeping than these networks on their arithmetic.
+    The derivatives are explicit: forward along a change of the parameters (``output_change``) and backward
+    (``pull_back``). For networks this small the overhead of automatic differentiation would exceed the
+    arithmetic.
 
     Args:
-        parameters: the block whose first ``num_layers`` tensors, shaped as ``shapes`` says, it uses.
+        parameters: the block; the first ``num_layers`` tensors, with the shapes of ``shapes``, are used.
         num_layers: linear layers of each network.
 
     Attributes:
         layers: weights over biases, [C, in + 1, out], layer by layer.
-        weights: those rows of ``layers`` that are weights, [C, in, out].
-        biases: the others, [C, 1, out].
+        weights: the rows of ``layers`` with weights, [C, in, out].
+        biases: the last rows, [C, 1, out].
     """
 
     def __init__(self, parameters: FlatParameters, num_layers: int) -> None:
@@ -273,8 +273,8 @@ class TanhStack:
 
         Args:
             rows: [U, n], one block.
-            scratch: where the inputs of layers are kept; if None, in the stack's own, where the next
-                evaluation without one overwrites them.
+            scratch: memory for the inputs of layers; None for the stack's own, which the next evaluation
+                without ``scratch`` overwrites.
         """
         scratch = scratch or self._scratch
         num_networks, (num_rows, width) = len(self.layers[0]), rows.shape
@@ -294,7 +294,7 @@ class TanhStack:
         d h_{l+1} = (1 - h_{l+1}^2) (d h_l W_l + h_l dW_l + d b_l), from d h_0 = 0.
 
         Args:
-            activations: as ``activations`` gave them at the present parameters.
+            activations: the result of ``activations`` at the present parameters.
             change: dW over db of every layer in order, each of its layer's shape.
 
         Returns:
@@ -312,14 +312,15 @@ class TanhStack:
         return moved
 
     def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
-        """The derivative of a loss by the parameters, J^T times that by the outputs, into the gradient block.
+        """Write the derivative of a loss by the parameters, J^T slope, to the gradient block.
 
         dL/dW_l = h_l^T s_l,  dL/db_l = sum over rows of s_l,  s_{l-1} = (1 - h_l^2) (s_l W_l^T).
 
         Args:
-            activations: as ``activations`` gave them at the present parameters.
+            activations: the result of ``activations`` at the present parameters.
             slope: dL / d outputs, [C, U, out].
-            add: to what the gradient block holds, as for the second and later blocks of rows; else replace.
+            add: add to the gradient block, as for the second and later blocks of rows, instead of replacing
+                it.
         """
         for layer in range(len(self.layers) - 1, -1, -1):
             add_product(self._slopes[layer], activations[layer], slope, keep=add)
@@ -336,8 +337,8 @@ class Adam:
     m <- b1 m + (1 - b1) g;  v <- b2 v + (1 - b2) g^2;
     x <- x - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps).
 
-    Written out because PyTorch's costs four times as much a step as these five operations, and its state
-    would have to be taken apart for a checkpoint.
+    PyTorch's takes four times as long per step as these five operations, and its state is more difficult to
+    save.
 
     Args:
         parameters: the block to optimise.
@@ -355,7 +356,7 @@ class Adam:
         self._steps = 0
 
     def step(self) -> None:
-        """Descend along the block's gradient."""
+        """Take a step of descent along the block's gradient."""
         gradient = self._parameters.gradient
         self._steps += 1
         self._first_moment.lerp_(gradient, 1.0 - self.BETAS[0])
@@ -366,7 +367,7 @@ class Adam:
         self._parameters.values.addcdiv_(self._first_moment, scale, value=-rate)
 
     def state_dict(self) -> dict[str, Any]:
-        """Both moments, [P], and the number of steps taken."""
+        """Return both moments, [P], and the number of steps taken."""
         return {
             "first_moment": self._parameters.to_numpy(self._first_moment),
             "second_moment": self._parameters.to_numpy(self._second_moment),

@@ -1,12 +1,11 @@
-"""Adding exploration noise eps_pi to a policy (Algorithm 2, line 9), which the paper leaves open.
+"""Exploration noise eps_pi for a policy (Algorithm 2, line 9); the paper does not define it.
 
-The noise is put into the *parameters*, once, and the agent goes on learning on-policy from there. Mixing
-the policy with a uniform one instead would have to be carried through every later gradient, and does not
-free a saturated softmax: its gradients are about 1e-8.
+The *parameters* are changed once, and the agent continues on-policy from there. A mixture with a uniform
+policy would have to be part of every later gradient. It would not help a saturated softmax either: its
+gradients are about 1e-8.
 
-``match-mixture`` makes the policy as random as the mixture (1 - eps) pi + eps uniform would be, and no
-policy less random than it is. ``temperature`` divides the logits by 1 / (1 - eps), or multiplies the
-standard deviations by it.
+``match-mixture`` makes the policy as random as the mixture (1 - eps) pi + eps uniform, never less random.
+``temperature`` divides the logits by 1 / (1 - eps), or multiplies the standard deviations by it.
 
 Notation: U distinct observations, A actions, m action components, eps = eps_pi.
 """
@@ -18,7 +17,7 @@ import numpy as np
 from recrl.environments.cmdp import Floats
 
 BISECTIONS = 60
-# Off-greedy masses closer than this are equal; a uniform policy is then left as it is.
+# Off-greedy masses closer than this are equal; a uniform policy then does not change.
 ROUNDING = 1e-12
 
 
@@ -27,21 +26,21 @@ def off_greedy_mass(logits: Floats, weights: Floats) -> float:
 
     Args:
         logits: [U, A].
-        weights: share of the samples at each observation, [U], summing to 1.
+        weights: fraction of the samples at each observation, [U], summing to 1.
     """
     shifted = logits - logits.max(axis=1, keepdims=True)
     return float(weights @ (1.0 - 1.0 / np.exp(shifted).sum(axis=1)))
 
 
 def matching_scale(logits: Floats, weights: Floats, noise: float) -> float:
-    """The factor s in [0, 1] on the logits at which the policy is as random as the eps-mixture.
+    """Return the factor s in [0, 1] on the logits that makes the policy as random as the eps-mixture.
 
     Solves off_greedy_mass(s logits) = (1 - eps) off_greedy_mass(logits) + eps (1 - 1/A), by bisection. The
-    left side falls in s, so there is one solution, and s <= 1: noise never sharpens a policy.
+    left side decreases in s, so there is one solution, and s <= 1: noise never makes a policy less random.
 
     Args:
         logits: of the present policy, [U, A].
-        weights: share of the samples at each observation, [U], summing to 1.
+        weights: fraction of the samples at each observation, [U], summing to 1.
         noise: eps in (0, 1].
     """
     num_actions = logits.shape[1]
@@ -57,11 +56,11 @@ def matching_scale(logits: Floats, weights: Floats, noise: float) -> float:
 
 
 def matching_log_std(log_std: Floats, half_ranges: Floats, noise: float) -> Floats:
-    """log_std at which each action component varies as much as the eps-mixture around the same mean.
+    """Return the log_std that gives each action component the variance of the eps-mixture around the mean.
 
     sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + eps h^2 / 3): h^2 / 3 is the variance of a uniform action on
-    an interval of half-range h. (The mixture's own greater spread, from the distance between the mean and
-    the interval's middle, is left out: it would depend on the observation.)
+    an interval of half-range h. (The distance between the mean and the interval's middle, which adds to the
+    mixture's variance, is left out: it depends on the observation.)
 
     Args:
         log_std: of the present policy, [m].

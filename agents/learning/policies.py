@@ -1,8 +1,8 @@
 """Stochastic policies: a tanh network with a categorical or a diagonal Gaussian head.
 
-Acting is plain NumPy, on a CPU on the parameters' own memory: at 16 observations, PyTorch's overhead would
-cost more than the arithmetic. Learning is PyTorch. The probabilities that learning compares with are computed
-by PyTorch too, at the start of an update, so that the ratio of an unchanged policy is exactly 1.
+Acting uses NumPy, on a CPU on the parameters' own memory: at 16 observations PyTorch's overhead exceeds the
+arithmetic. Learning uses PyTorch, also for the old policy's probabilities at the start of an update. So the
+ratio of an unchanged policy is exactly 1.
 
 Notation: U rows, B observations, n observation components, A actions, m action components, P parameters.
 """
@@ -28,14 +28,14 @@ from recrl.agents.learning.stacks import make_stack
 from recrl.agents.spaces import action_size
 from recrl.environments.cmdp import Floats
 
-# safety-starter-agents' and the usual start of a Gaussian policy's spread.
+# Usual initial log standard deviation of a Gaussian policy, also that of safety-starter-agents.
 INITIAL_LOG_STD = -0.5
-# Noise 1 would make a tempered Gaussian infinitely wide; it becomes a thousand times wider.
+# Noise 1 would make a tempered Gaussian infinitely wide; this bound makes it a thousand times wider.
 SMALLEST_TEMPERING = 1e-3
 
 
 class StochasticPolicy:
-    """pi(a | s); categorical for Discrete actions, diagonal Gaussian for Box.
+    """The policy pi(a | s): categorical for Discrete actions, diagonal Gaussian for Box.
 
     The Gaussian's log_std does not depend on the state; it is the last m of the parameters.
 
@@ -87,7 +87,7 @@ class StochasticPolicy:
         self._latest: _Latest | None = None
 
     def publish(self) -> None:
-        """Let acting know of changed parameters; on a CPU it always does."""
+        """Copy changed parameters for acting; on a CPU acting shares them."""
         self._acting.copy_(self.parameters.values)
 
     @property
@@ -113,7 +113,7 @@ class StochasticPolicy:
     def sample(
         self, observations: npt.NDArray[np.float32], generator: np.random.Generator
     ) -> npt.NDArray[Any]:
-        """Draw actions for B observations [B, n]: int64 [B] by inversion, or float32 [B, m]."""
+        """Sample actions for B observations [B, n]: int64 [B] by inversion, or float32 [B, m]."""
         outputs = self.outputs(observations)
         if not self.is_categorical:
             spread = np.exp(self._acting_log_std)
@@ -121,12 +121,12 @@ class StochasticPolicy:
             return outputs
         cumulative = _cumulative(outputs)
         thresholds = generator.random(len(outputs)) * cumulative[:, -1]
-        # A threshold may round up to the whole mass, so the last action is what is left.
+        # A threshold may round up to the whole mass: then the last action is taken.
         actions: npt.NDArray[np.int64] = (cumulative[:, :-1] <= thresholds[:, None]).sum(axis=1)
         return actions
 
     def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """What ``sample`` inverts: cumulative masses, not normalised, of B observations, float64 [B, A].
+        """Return the cumulative, unnormalised masses for ``sample`` at B observations, float64 [B, A].
 
         Raises:
             ValueError: actions are continuous.
@@ -136,7 +136,7 @@ class StochasticPolicy:
         return _cumulative(self.outputs(observations))
 
     def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
-        """The most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
+        """Return the most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
         outputs = self.outputs(observations)
         return outputs.argmax(axis=1) if self.is_categorical else outputs
 
@@ -154,20 +154,20 @@ class StochasticPolicy:
         return probabilities
 
     def distribution(self, rows: Tensor) -> Distribution:
-        """The action distributions at U rows, [U, n]; not differentiable, see ``evaluate``.
+        """Return the action distributions at U rows, [U, n]; not differentiable, see ``evaluate``.
 
-        Asked again for the same rows at the same parameters, it gives what it gave: what a line search has
-        accepted is not evaluated anew to be measured.
+        The last result is cached: after a line search, the accepted policy is not evaluated again for the
+        metrics.
         """
         latest = self._latest
         if latest is None or not latest.is_of(rows, self.parameters.values):
-            kept = self.log_std.clone()  # the policy will move
+            kept = self.log_std.clone()  # the policy will change
             distribution = self.head(self.stack.outputs(rows)[0], kept)
             self._latest = latest = _Latest(ref(rows), self.parameters.values.clone(), distribution)
         return latest.distribution
 
     def evaluate(self, rows: Tensor) -> PolicyEvaluation:
-        """The action distributions at U rows, [U, n], of which a loss can be differentiated."""
+        """Return the action distributions at U rows, [U, n], for differentiating a loss."""
         pieces = blocks(len(rows))
         self._scratch += [Scratch() for _ in pieces[len(self._scratch) :]]
         activations = [
@@ -184,23 +184,23 @@ class StochasticPolicy:
         return PolicyEvaluation(self, activations, leaves, self.head(outputs, leaves[-1]))
 
     def head(self, outputs: Tensor, log_std: Tensor) -> Distribution:
-        """The distributions that outputs, [U, A] or [U, m], stand for; only a Gaussian has a log_std."""
+        """Return the distributions of outputs, [U, A] or [U, m]; only a Gaussian has a log_std."""
         if self.is_categorical:
             return Categorical(torch.log_softmax(outputs, dim=1))
         return Gaussian(outputs, log_std)
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
-        """Make the policy more random, once; ``recrl.agents.learning.noise`` says how.
+        """Make the policy more random, once; see ``recrl.agents.learning.noise``.
 
         Args:
             noise: eps_pi in (0, 1].
-            observations: where its randomness is measured, [N, n].
+            observations: for measuring its randomness, [N, n].
             form: ``match-mixture`` or ``temperature``.
 
         Returns:
             ``noise_scale``, the factor on the last layer (categorical) or on the mean standard deviation
-            (Gaussian), and ``randomness_before`` and ``_after``, the mean off-greedy mass or the mean
-            standard deviation.
+            (Gaussian). ``randomness_before`` and ``_after``, the mean off-greedy mass or the mean standard
+            deviation.
         """
         if self.is_categorical:
             return self._soften(noise, observations, form)
@@ -209,7 +209,7 @@ class StochasticPolicy:
     def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
         distinct = find_repeated(observations)
         weights = np.full(len(observations), 1.0 / len(observations))
-        if distinct is not None:  # on a tabular task a sixteenth of them
+        if distinct is not None:  # on a tabular task a sixteenth of the rows
             first, row = distinct
             observations, weights = observations[first], np.bincount(row) / len(observations)
         logits = self.outputs(observations).astype(np.float64)
@@ -238,12 +238,12 @@ class StochasticPolicy:
 
 @dataclass(frozen=True, eq=False)
 class _Latest:
-    """What a policy was asked for last.
+    """Last evaluation of a policy.
 
     Attributes:
-        rows: where; not kept alive.
-        parameters: with which, a copy, [P].
-        distribution: what came out.
+        rows: the observations; a weak reference.
+        parameters: a copy, [P].
+        distribution: the result.
     """
 
     rows: ref[Tensor]
@@ -251,27 +251,27 @@ class _Latest:
     distribution: Distribution
 
     def is_of(self, rows: Tensor, parameters: Tensor) -> bool:
-        """Whether it is what these rows, as long as nobody writes to them, and parameters give."""
+        """Whether the result is that of these rows, if unchanged, and parameters."""
         return self.rows() is rows and torch.equal(self.parameters, parameters)
 
 
 def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:
-    """The softmax of logits [B, A], but for its normalisation, summed up over the actions."""
+    """Return the cumulative sums of the unnormalised softmax of logits [B, A]."""
     masses: Floats = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
     return masses
 
 
 @dataclass(frozen=True, eq=False)
 class PolicyEvaluation:
-    """A policy evaluated at some rows; valid until its parameters change or it is evaluated again.
+    """Evaluation of a policy at some rows; valid until its parameters change or it is evaluated again.
 
-    The part between the network's outputs and a loss is differentiated automatically, so that an agent may
-    write any loss of the distribution; the network itself is ``TanhStack``'s to differentiate.
+    PyTorch differentiates from a loss to the network's outputs, so an agent may use any loss of the
+    distribution. ``TanhStack`` differentiates the network.
 
     Attributes:
-        policy: what was evaluated.
+        policy: the evaluated policy.
         activations: of its network, block by block of the rows.
-        leaves: the outputs, and a Gaussian's log_std: what losses are differentiated by.
+        leaves: the outputs, and a Gaussian's log_std; losses are differentiated by them.
         distribution: at the rows; a differentiable function of the leaves.
     """
 
@@ -281,7 +281,7 @@ class PolicyEvaluation:
     distribution: Distribution
 
     def gradient(self, loss: Tensor, *, retain_graph: bool = False) -> Tensor:
-        """The gradient of a scalar loss by all parameters, [P]: the policy's gradient block."""
+        """Return the gradient of a scalar loss by all parameters, [P], a view of the gradient block."""
         slopes = torch.autograd.grad(loss, self.leaves, retain_graph=retain_graph)
         for block, activations in zip(blocks(len(slopes[0])), self.activations, strict=True):
             self.policy.stack.pull_back(activations, slopes[0][None, block], add=block.start > 0)
@@ -294,14 +294,14 @@ class FisherMetric:
     """The metric of the trust region: the Hessian of the mean KL at the present parameters, plus damping.
 
     H v = J^T F J v + damping v, with J the Jacobian of the network's outputs and F the Fisher metric on
-    them, averaged over the samples. At the parameters that collected the samples this *is* the Hessian of
-    the mean KL: the term it leaves out has the gradient of the KL as a factor, which is 0 there. It costs
-    one forward and one backward sweep a product, a third of differentiating twice.
+    them, averaged over the samples. At the parameters that collected the samples this *is* the Hessian of the
+    mean KL: the missing term is proportional to the gradient of the KL, which is 0 there. A product takes one
+    forward and one backward sweep, a third of the time of double differentiation.
 
     Args:
         policy: at the parameters of the metric; they must not change while it is used.
         rows: the distinct observations, [U, n].
-        observation_weights: share of the samples at each row, [U], summing to 1.
+        observation_weights: fraction of the samples at each row, [U], summing to 1.
         damping: multiple of the identity added, at least 0.
     """
 
@@ -317,7 +317,7 @@ class FisherMetric:
             self._blocks.append((activations, distribution, observation_weights[block, None]))
 
     def __call__(self, vector: Tensor) -> Tensor:
-        """H times a vector of parameter changes, [P] -> [P]; overwrites the policy's gradient block."""
+        """Return H times a vector of parameter changes, [P] -> [P]; overwrites the gradient block."""
         stack, parameters = self._policy.stack, self._policy.parameters
         change = parameters.pieces(vector)
         for number, (activations, distribution, weights) in enumerate(self._blocks):

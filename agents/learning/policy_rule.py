@@ -1,4 +1,4 @@
-"""What an algorithm adds to an actor-critic: a rule that improves the policy, and what is measured of it.
+"""The rule by which an algorithm improves the policy of an actor-critic, and its metrics.
 
 Notation: N samples, k costs.
 """
@@ -19,10 +19,10 @@ from recrl.agents.learning.surrogates import surrogate
 
 
 class Stateful(Protocol):
-    """Something that is saved and restored with an agent."""
+    """An object that is saved and restored with an agent."""
 
     def state_dict(self) -> dict[str, Any]:
-        """All it has learnt and adapted: a tree of dicts, lists, JSON scalars and NumPy arrays."""
+        """Return all learnt and adapted state: a tree of dicts, lists, JSON scalars and NumPy arrays."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -31,11 +31,11 @@ class Stateful(Protocol):
 
 
 class PolicyRule(Protocol):
-    """How an agent's policy gets better: what tells the algorithms apart."""
+    """Rule that improves an agent's policy; the part that differs between algorithms."""
 
     @property
     def parts(self) -> Mapping[str, Stateful]:
-        """What the rule keeps from one update to the next, by name."""
+        """State that the rule keeps between updates, by name."""
         ...
 
     def improve(
@@ -44,32 +44,32 @@ class PolicyRule(Protocol):
         """Change the policy once.
 
         Args:
-            policy: the one that collected the samples; changed in place.
-            experience: the samples, raw advantages, and how the constraints stand.
+            policy: the policy that collected the samples; changed in place.
+            experience: the samples, raw advantages, and the constraints.
             generator: the agent's own randomness.
 
         Returns:
-            Metrics, the same keys every time: ``policy_steps``, ``multiplier_i``, and the rule's own.
+            Metrics with constant keys: ``policy_steps``, ``multiplier_i``, and the rule's own.
         """
         ...
 
 
 def indexed(name: str, values: npt.NDArray[np.floating]) -> dict[str, float]:
-    """One metric a cost, [k]: ``name_0``, ``name_1``, ...; infinite values are NaN, as metrics must be."""
+    """Return one metric per cost, [k]: ``name_0``, ``name_1``, ...; infinite values become NaN."""
     return {
         f"{name}_{i}": float(value) if np.isfinite(value) else float("nan") for i, value in enumerate(values)
     }
 
 
 def no_steps(constraints: Constraints) -> dict[str, float]:
-    """Metrics of a first-order update that leaves the policy, as nothing is known about the constraints."""
+    """Return the metrics of a first-order update that is skipped, as the constraints are unknown."""
     return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
 
 
 def improve_and_measure(
     rule: PolicyRule, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
 ) -> dict[str, float]:
-    """Let a rule improve the policy; its metrics, and how far the policy has come.
+    """Let a rule improve the policy; return its metrics and those of the change.
 
     Returns:
         The rule's metrics; ``kl``, the mean KL from the old policy in nats; the mean ``entropy``; and

@@ -1,11 +1,11 @@
-"""The sizes of quantities whose unit is the task's own, so that no setting of an agent has to know that unit.
+"""Running scales of quantities in the task's units, so that no setting of an agent depends on those units.
 
-Critics learn targets divided by their running root mean square; multipliers are counted in the ratio of the
-running spreads of reward and cost advantages. Multiply a task's rewards by 1,000, or its costs and limits,
-and the policies stay what they were (van Hasselt et al. 2016; Stooke et al. 2020).
+Critics learn targets divided by their running root mean square. The unit of multipliers is the ratio of the
+running spreads of reward and cost advantages. If a task's rewards, or its costs and limits, are multiplied by
+1,000, the policies are the same (van Hasselt et al. 2016; Stooke et al. 2020).
 
-Every update counts the same, however long ago it was: a scale that forgets would move for as long as the
-policy does, and what is counted in it with it. Notation: m quantities.
+Every update has the same weight: with a moving average the unit would change as long as the policy does.
+Notation: m quantities.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from recrl.environments.cmdp import Floats
 
 
 class RunningScale:
-    """The root of the mean over all updates of m mean squares.
+    """Root of the mean over all updates of m mean squares.
 
     Args:
         size: m.
@@ -31,7 +31,7 @@ class RunningScale:
 
     @property
     def values(self) -> Floats:
-        """The scales, [m]; 0 of what has been 0 so far."""
+        """The scales, [m]; 0 for a quantity that has always been 0."""
         scales: Floats = np.sqrt(self._mean_squares)
         return scales
 
@@ -56,7 +56,7 @@ class RunningScale:
 
 
 def quotient(dividend: Floats, divisor: Floats) -> Floats:
-    """``dividend`` / ``divisor``, element by element; 0 where the divisor is 0.
+    """Return ``dividend`` / ``divisor``, element by element; 0 where the divisor is 0.
 
     >>> quotient(np.array([6.0, 1.0]), np.array([3.0, 0.0]))
     array([2., 0.])

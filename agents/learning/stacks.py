@@ -1,4 +1,4 @@
-"""Make the networks of a policy or of critics as the agent's options say: the fast perceptron, or modules."""
+"""Networks of a policy or of critics, by the agent's options: the fast perceptron, or modules."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Stack(Protocol):
         ...
 
     def activations(self, rows: Tensor, scratch: Scratch | None = None) -> list[Tensor]:
-        """What differentiating needs, for one block of rows; the outputs, [C, U, out], come last."""
+        """Return the data for differentiating, for one block of rows; the outputs, [C, U, out], come last."""
         ...
 
     def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
@@ -32,7 +32,7 @@ class Stack(Protocol):
         ...
 
     def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
-        """The derivative of a loss by the parameters into the gradient block."""
+        """Write the derivative of a loss by the parameters to the gradient block."""
         ...
 
 
@@ -49,7 +49,7 @@ def make_stack(
     """Make C networks with their parameters.
 
     Args:
-        form: which networks.
+        form: their architecture.
         num_networks: C.
         num_inputs: n.
         num_outputs: of each.
@@ -58,7 +58,7 @@ def make_stack(
         others: shapes of further parameters at the end of the block.
 
     Raises:
-        NetworkError: a network of the user's own does not fit.
+        NetworkError: a user's network does not meet the requirements.
     """
     if form.factory is None and form.activation == "tanh":
         sizes = (num_inputs, *form.hidden_sizes, num_outputs)
@@ -67,7 +67,7 @@ def make_stack(
         stack.initialise(form.initialiser, last_scale, generator)
         return parameters, stack
     factory = form.factory or perceptron(form.hidden_sizes, form.activation, form.initialiser)(generator)
-    with torch.random.fork_rng(devices=[]):  # a user's module draws from PyTorch's own generator
+    with torch.random.fork_rng(devices=[]):  # a user's module draws from PyTorch's global generator
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
         modules = [checked_module(factory, num_inputs, num_outputs) for _ in range(num_networks)]
     parameters = FlatParameters([*ModuleStack.shapes(modules), *others])

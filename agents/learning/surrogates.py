@@ -1,8 +1,8 @@
 """Surrogate objectives of policy gradient methods, over the pairs of a batch.
 
-A surrogate is a mean over samples of something that depends on a sample only through its pair's
-probability ratio and, linearly, its advantage; so advantages are summed by pair first
-(``recrl.agents.learning.batch``). Notation: N samples, D unique pairs, k costs.
+A surrogate is a mean over samples. Each term depends only on the probability ratio of the sample's pair and,
+linearly, on its advantage. So advantages are summed by pair first (``recrl.agents.learning.batch``).
+Notation: N samples, D unique pairs, k costs.
 """
 
 from __future__ import annotations
@@ -70,15 +70,15 @@ def clipped_surrogate(ratios: Tensor, advantages: SignedAdvantages, clip: float)
 
 
 def pessimistic_relief(ratios: Tensor, relief: Sequence[SignedAdvantages], clip: float) -> Tensor:
-    """How far each cost's surrogate has fallen since ratios of 1, at least, [j].
+    """Return a lower bound on the decrease of each cost's surrogate since ratios of 1, [j].
 
-    The pessimistic surrogate of a cost, the mean of max(ratio A, clip(ratio) A), is minus PPO's of -A. A
-    plain one promises ever more relief for going ever further, and a policy that is charged a lot for a
-    violation goes there in one update, whatever it does to the reward.
+    The pessimistic surrogate of a cost, the mean of max(ratio A, clip(ratio) A), is minus PPO's of -A. The
+    decrease of a plain surrogate is unbounded. With a large penalty weight the policy would move far in one
+    update, at the expense of the reward.
 
     Args:
         ratios: pi(a | s) / pi_old(a | s), [D].
-        relief: minus the advantages of each cost, by sign.
+        relief: negative advantages of each cost, by sign.
         clip: e in (0, 1).
     """
     if not relief:

@@ -7,30 +7,29 @@ step by a trust region:
 
 with g minus the gradient of the reward surrogate, b_i the gradient of cost surrogate i, H the Hessian of the
 mean KL and c_i how far constraint i is violated. **c is in the unit of the surrogates, cost per step**:
-c_i = (mean episode cost i - limit i) / mean episode length. Putting episode units beside b is a mistake of
-two well-known libraries.
+c_i = (mean episode cost i - limit i) / mean episode length. Two well-known libraries wrongly combine episode
+units with b.
 
 The optimum is x = -(v + sum_i nu_i w_i) / lam with v = H^-1 g, w_i = H^-1 b_i, so only the products
 q = g.v, r_i = g.w_i, S_ij = b_i.w_j matter. The paper and safety-starter-agents solve k = 1 by distinguishing
-cases; here the cases are the sets of binding constraints, for any small k. With the set A binding, x is the
-shortest step that meets A exactly, plus the rest of the trust region along the part of the gradient that
-leaves A alone:
+cases. Here the cases are the sets of binding constraints, for any small k. With the set A binding, x is the
+shortest step that meets A exactly, plus the rest of the trust region along the projected gradient:
 
     m = c_A.S_AA^-1 c_A                 squared length of the shortest step that meets A,
     p = q - r_A.S_AA^-1 r_A             squared length of the remaining gradient,
     lam = sqrt(p / (2 delta - m)),  nu_A = S_AA^-1 (lam c_A - r_A).
 
-Each of the at most 2^k candidates is the best point of its face. Those that also meet the constraints outside
-A are feasible, and the optimum is among them: the best feasible candidate is the solution. For k = 1 that is
-nu = 0 or nu = (lam c - r) / s, lam = sqrt((q - r^2 / s) / (2 delta - c^2 / s)), as in the paper.
+Each of the at most 2^k candidates is the best point of its face. Candidates that also meet the constraints
+outside A are feasible; the best of them is the solution. For k = 1 that is nu = 0 or nu = (lam c - r) / s,
+lam = sqrt((q - r^2 / s) / (2 delta - c^2 / s)), as in the paper.
 
-If no candidate is feasible, no step within the trust region meets all constraints, and the step recovers:
-towards the nearest point that meets them all, x = -sum_i nu_i w_i with nu >= 0 and S nu >= c where nu_i > 0
-binds, as far as the trust region goes. Every violated cost falls on the way, and none that holds is broken.
-For k = 1 that is the paper's equation 14, -w sqrt(2 delta / s). Going straight down the cost that is violated
-most, in turns, a policy goes to and fro between two costs that must fall together, and stays above both
-limits. Only where the constraints contradict one another is the most violated one lowered alone; "most" is
-measured by the length c_i / sqrt(S_ii) of the step that would mend it, whatever the costs' units.
+If no candidate is feasible, no step within the trust region meets all constraints, and the step recovers. It
+goes towards the nearest point that meets them all, x = -sum_i nu_i w_i with nu >= 0 and S nu >= c (equality
+where nu_i > 0), as far as the trust region allows. Every violated cost falls on the way, and no other
+constraint becomes violated. For k = 1 that is the paper's equation 14, -w sqrt(2 delta / s). If only the most
+violated cost were decreased each time, a policy could alternate between two costs and stay above both limits.
+Only if the constraints contradict one another, the most violated one is decreased alone. This is measured by
+the length c_i / sqrt(S_ii) of the step that corrects it, independent of the costs' units.
 
 Notation: k constraints.
 """
@@ -45,20 +44,21 @@ import numpy as np
 
 from recrl.environments.cmdp import Floats
 
-# A step of length 1 changes a cost surrogate by at most sqrt(S_ii); below this square, by next to nothing.
+# A step of length 1 changes a cost surrogate by at most sqrt(S_ii); below this square the effect is
+# negligible.
 NO_INFLUENCE = 1e-12
-# Squared lengths below this share of q are rounding errors of it.
+# Squared lengths below this fraction of q are rounding errors.
 NO_GRADIENT = 1e-10
-# How far a constraint may be missed by rounding, as a share of what the trust region can change.
+# Tolerance of a constraint for rounding, as a fraction of what the trust region can change.
 FEASIBILITY_TOLERANCE = 1e-9
 
 
 class StepCase(IntEnum):
-    """Which problem the step solved."""
+    """Case that the step solved."""
 
     UNCONSTRAINED = 0  # no constraint binds: the trust-region policy optimisation step
     CONSTRAINED = 1  # at least one constraint binds
-    RECOVERY = 2  # the trust region holds no feasible point
+    RECOVERY = 2  # the trust region contains no feasible point
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +80,12 @@ class StepProblem:
     radius: float
 
     def objective(self, solution: DualSolution) -> float:
-        """g.x of a step; the reward surrogate rises by -g.x, to first order."""
+        """Return g.x of a step; to first order, the reward surrogate rises by -g.x."""
         mixed = float(solution.constraint_weights @ self.mixed)
         return -(solution.gradient_weight * self.squared_gradient + mixed)
 
     def after(self, solution: DualSolution) -> Floats:
-        """b_i.x + c_i, how far each constraint is violated after a step, to first order, [k]."""
+        """Return b_i.x + c_i, the violation of each constraint after a step, to first order, [k]."""
         return (
             self.violations - solution.gradient_weight * self.mixed - self.gram @ solution.constraint_weights
         )
@@ -96,11 +96,11 @@ class DualSolution:
     """A step x = -(gradient_weight v + sum_i constraint_weights_i w_i).
 
     Attributes:
-        case: which problem was solved.
+        case: the solved case.
         gradient_weight: of v; 1 / lam, or 0 in recovery.
         constraint_weights: of the w_i, [k]; nu_i / lam.
         multipliers: nu, [k], at least 0; NaN where lam is infinite and in recovery.
-        recovered: the violated constraints that recovery lowers; none in the other cases.
+        recovered: the violated constraints that recovery decreases; none in the other cases.
     """
 
     case: StepCase
@@ -111,7 +111,7 @@ class DualSolution:
 
 
 def solve_dual(problem: StepProblem) -> DualSolution:
-    """The best step of the module's problem, or the recovery step.
+    """Return the optimal step of the module's problem, or the recovery step.
 
     A constraint that no step can influence (S_ii about 0) is left out, whether it is met or not.
     """
@@ -130,7 +130,7 @@ def solve_dual(problem: StepProblem) -> DualSolution:
 
 
 def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolution | None:
-    """The best step that meets the ``binding`` constraints exactly, or None if the trust region has none."""
+    """Return the best step that meets the ``binding`` constraints exactly, or None if there is none."""
     index = list(binding)
     block = problem.gram[np.ix_(index, index)]
     bound, mixed = problem.violations[index], problem.mixed[index]
@@ -147,7 +147,7 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
     weights[index] = to_meet - gradient_weight * along
     if not has_gradient:
         multipliers[index] = -along  # lam = 0
-    else:  # lam is infinite where the face has only one point
+    else:  # lam is infinite if the face is a single point
         multipliers[index] = to_meet / gradient_weight - along if gradient_weight > 0.0 else np.nan
     case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
     return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), ())
@@ -161,7 +161,7 @@ def _meets(problem: StepProblem, solution: DualSolution, constraints: set[int]) 
 
 
 def _recovery(problem: StepProblem, usable: tuple[int, ...]) -> DualSolution:
-    """Towards the nearest point that meets all constraints, to the edge of the trust region."""
+    """Return the step towards the nearest feasible point, to the edge of the trust region."""
     weights = projection_weights(problem.gram, problem.violations)
     recovered = tuple(i for i in usable if problem.violations[i] > 0.0)
     if weights is None:
@@ -176,7 +176,7 @@ def _recovery(problem: StepProblem, usable: tuple[int, ...]) -> DualSolution:
 
 
 def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
-    """The weights nu of the module's complementarity problem, by trying every set of binding constraints.
+    """Return the weights nu of the module's complementarity problem, by enumeration of the binding sets.
 
     Args:
         gram: S, [k, k], symmetric and positive semidefinite.

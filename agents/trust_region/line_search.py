@@ -13,9 +13,9 @@ from torch import Tensor
 from recrl.agents.learning.networks import FlatParameters
 from recrl.agents.shared_options import TrustRegionConfig
 
-# Of a system scaled to a right-hand side of length 1.
+# For a system scaled to a right-hand side of length 1.
 CONVERGED_SQUARED_RESIDUAL = 1e-10
-# A right-hand side shorter than this is nothing but rounding.
+# A right-hand side shorter than this is a rounding error.
 VANISHED = 1e-15
 
 
@@ -25,7 +25,7 @@ def conjugate_gradient(metric: Callable[[Tensor], Tensor], target: Tensor, *, it
     Args:
         metric: v -> H v, with H symmetric and positive definite.
         target: b, [P].
-        iterations: the most to do; fewer if the residual becomes small beside b.
+        iterations: upper bound; fewer if the residual becomes small relative to b.
 
     Returns:
         x, [P].
@@ -34,7 +34,7 @@ def conjugate_gradient(metric: Callable[[Tensor], Tensor], target: Tensor, *, it
     solution = torch.zeros_like(target)
     if length < VANISHED:
         return solution
-    residual = target / length  # squares of a saturated policy's gradients leave the range of float32
+    residual = target / length  # squares of a saturated policy's gradients underflow in float32
     direction = residual.clone()
     squared = float(torch.dot(residual, residual))
     for _ in range(iterations):
@@ -57,14 +57,14 @@ def backtrack(
     ratio: float,
     tries: int,
 ) -> int | None:
-    """Move along ``step``, and ever less far, until the new policy is acceptable.
+    """Move along ``step`` and shorten it until the new policy is acceptable.
 
     Args:
-        parameters: moved in place; as they were if nothing is acceptable.
+        parameters: changed in place; restored if no try is acceptable.
         step: the full step, [P].
-        is_acceptable: judges the policy at the parameters as they are now.
+        is_acceptable: checks the policy at its present parameters.
         ratio: factor in (0, 1) on the step from one try to the next.
-        tries: the most to make, at least 1.
+        tries: largest number of tries, at least 1.
 
     Returns:
         j, the number of times the step was shortened (it is then ``ratio ** j`` times the full one), or
@@ -86,7 +86,7 @@ def line_search(
 
     Returns:
         Metrics: ``policy_steps``, 1 or 0; ``line_search_steps``, how often the step was shortened; and
-        ``step_norm``, the length of what was taken.
+        ``step_norm``, the length of the step taken.
     """
     shortened = backtrack(
         parameters, step, is_acceptable, ratio=config.backtrack_ratio, tries=config.backtrack_tries

@@ -2,7 +2,7 @@
 
 A zip archive of plain text, so that any tool can open it:
 
-    sweep.json         name, notes, grid file, the trials (spec, standing, provenance), digests of the tables
+    sweep.json         name, notes, grid file, the trials (spec, status, provenance), digests of the tables
     phases.csv, ...    the other frames of ``recrl.analysis.data.sweep_data`` but KEY: ``trial`` is the
     position of the
                        trial in sweep.json

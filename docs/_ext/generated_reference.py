@@ -1,4 +1,4 @@
-"""Pages of the reference that are made from the code itself, whenever the documentation is built.
+"""Generate pages of the reference from the code, whenever the documentation is built.
 
     reference/generated/command-line.md   every command and option of recrl-sweep, from its parser
     reference/generated/grid-file.md      every key of a grid file
@@ -7,7 +7,7 @@
     reference/generated/tasks.md          every option of every task
     reference/generated/presets.md        the options whose value differs between the presets
 
-Options are pydantic models: name, type, default and description are theirs.
+Options are fields of pydantic models, with name, type, default and description.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from recrl.orchestrator.grid.grid_file import Entry, Exclusion, GridFile, Resour
 from recrl.teachers.registry import TEACHERS
 
 NOTE = "<!-- made from the code by docs/_ext/generated_reference.py; changes here are lost -->\n\n"
-# Of fields that read themselves, so that no schema knows what may be written.
+# Fields with validators of their own, whose types are not in the schema.
 WRITTEN = {
     "train_limits": "`auto`, number, or list of numbers",
     "deploy_limits": "number, or list of numbers",
@@ -55,7 +55,7 @@ SHOWN_NAMES = 12
 
 
 def pages() -> dict[str, str]:
-    """Every page by its file name."""
+    """Return every page by its file name."""
     return {
         "command-line.md": command_line(),
         "grid-file.md": grid_file(),
@@ -70,7 +70,7 @@ def pages() -> dict[str, str]:
 
 
 def command_line() -> str:
-    """Every command with its options."""
+    """Return the page of all commands with their options."""
     top = parser()
     (commands,) = (it for it in top._actions if isinstance(it, argparse._SubParsersAction))
     summaries = {it.dest: it.help or "" for it in commands._choices_actions}
@@ -89,18 +89,18 @@ def command_line() -> str:
 
 
 def usage(command: argparse.ArgumentParser) -> str:
-    """The line that shows how a command is written."""
+    """Return the usage line of a command."""
     text = " ".join(command.format_usage().removeprefix("usage: ").split())
     return f"```text\n{text}\n```\n"
 
 
 def arguments_of(command: argparse.ArgumentParser) -> list[argparse.Action]:
-    """What a command takes, but for ``--help``."""
+    """Return a command's arguments, except ``--help``."""
     return [it for it in command._actions if not isinstance(it, argparse._HelpAction)]
 
 
 def argument(action: argparse.Action) -> str:
-    """One row."""
+    """Return one row of a command's table."""
     value = action.metavar or ("|".join(map(str, action.choices)) if action.choices else action.dest.upper())
     shown = value if isinstance(value, str) else " ".join(value)
     takes_none = action.nargs == 0
@@ -115,12 +115,13 @@ def argument(action: argparse.Action) -> str:
 
 
 def grid_file() -> str:
-    """Every key of a grid file."""
+    """Return the page of all keys of a grid file."""
     lines = [
         NOTE,
         "# Grid file\n",
         "A grid is a product: every task x agent x method x seed, less what `exclude` names.",
-        "All mistakes are reported at once, each with its line. Nothing starts before the file is right.\n",
+        "All mistakes are reported at once, each with its line. No trial starts before the file "
+        "is correct.\n",
         "## Top level\n",
         *option_table(GridFile),
         "\n## An entry of `tasks`\n",
@@ -142,7 +143,7 @@ def grid_file() -> str:
 
 
 def agents() -> str:
-    """Every option of every agent: first those that all share."""
+    """Return the page of all agents' options: first the common ones."""
     models = {name: entry.config for name, entry in AGENTS.items()}
     shared = common_options(models.values())
     lines = [
@@ -161,7 +162,7 @@ def agents() -> str:
 
 
 def curricula() -> str:
-    """Every option of every curriculum."""
+    """Return the page of all curricula's options."""
     lines = [
         NOTE,
         "# Curricula\n",
@@ -175,7 +176,7 @@ def curricula() -> str:
 
 
 def tasks() -> str:
-    """Every option of every task, tasks with the same options together."""
+    """Return the page of all tasks' options; tasks with the same options share a table."""
     families: dict[type[BaseModel], list[str]] = {}
     for name, task in TASKS.items():
         model = load_attribute(task.options) if isinstance(task.options, str) else task.options
@@ -196,18 +197,17 @@ def tasks() -> str:
 
 
 def presets_page() -> str:
-    """The table of the presets."""
+    """Return the page of the presets."""
     return (
-        f"{NOTE}# Presets\n\n"
-        "`recommended` is every option's default. `preset: paper` sets the options below to the values of\n"
-        "safety-starter-agents, which the paper took over unchanged. For `focops` and `ipo` some values are\n"
-        "those of their own papers. An option given beside `preset` overrides it. The table is complete.\n\n"
-        f"{presets.table()}\n"
+        f"{NOTE}# Presets\n\n`recommended` is every option's default. `preset: paper` sets the "
+        "options below to the values of\nsafety-starter-agents, which the paper took over "
+        "unchanged. For `focops` and `ipo` some values are\nthose of their own papers. An option "
+        f"given together with `preset` overrides it. The table is complete.\n\n{presets.table()}\n"
     )
 
 
 def common_options(models: Iterable[type[BaseModel]]) -> list[str]:
-    """The options that all models have, with the same default and description."""
+    """Return the options that all models have, with the same default and description."""
     first, *others = models
     return [
         name
@@ -222,7 +222,7 @@ def common_options(models: Iterable[type[BaseModel]]) -> list[str]:
 
 
 def option_table(model: type[BaseModel], *, only: Iterable[str] | None = None) -> list[str]:
-    """The options of a model as rows of a Markdown table."""
+    """Return the options of a model as rows of a Markdown table."""
     schema = model.model_json_schema()
     wanted = list(model.model_fields) if only is None else list(only)
     if not wanted:
@@ -239,14 +239,14 @@ def option_table(model: type[BaseModel], *, only: Iterable[str] | None = None) -
 
 
 def type_text(name: str, field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
-    """What may be written for an option, in words."""
+    """Return the allowed values of an option, in words."""
     if name in WRITTEN and "enum" not in field:
         return WRITTEN[name]
     return words(field, schema)
 
 
 def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
-    """A JSON schema in words."""
+    """Describe a JSON schema in words."""
     if "$ref" in field:
         return words(schema["$defs"][field["$ref"].rsplit("/", 1)[1]], schema)
     if "anyOf" in field:
@@ -261,7 +261,7 @@ def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
 
 
 def default_text(field: Mapping[str, Any], *, required: bool) -> str:
-    """An option's default."""
+    """Return an option's default."""
     if required:
         return "required"
     if "default" not in field or isinstance(field["default"], dict):
@@ -270,21 +270,21 @@ def default_text(field: Mapping[str, Any], *, required: bool) -> str:
 
 
 def cell(text: str | None) -> str:
-    """Text for a table: one line, without what Markdown would take for markup."""
+    """Format text for a table: one line, with Markdown's special characters escaped."""
     line = " ".join((text or "").split())
-    if re.match(r"[a-z]{2,}\b(?!_)", line):  # a symbol such as d_t or W stays as it is
+    if re.match(r"[a-z]{2,}\b(?!_)", line):  # a symbol such as d_t or W does not change
         line = line[:1].upper() + line[1:]
     line = re.sub(r"([|<>*_\[\]$])", r"\\\1", line)
     return line if not line or line.endswith((".", "?", "!")) else f"{line}."
 
 
 def anchor(name: str) -> str:
-    """The anchor of a heading that is a name."""
+    """Return the anchor of a heading that is a name."""
     return re.sub(r"[^a-z0-9-]", "", name.lower())
 
 
 def write_pages(app: Sphinx) -> None:
-    """Write those pages that have changed, so that the others need not be built again."""
+    """Write changed pages only, so that the others are not built again."""
     folder = Path(app.srcdir) / "reference" / "generated"
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in pages().items():
@@ -294,6 +294,6 @@ def write_pages(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Tell Sphinx."""
+    """Register the extension."""
     app.connect("builder-inited", write_pages)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,10 +1,10 @@
-"""The directive ``solved-table``: counts of solved trials, made from a committed ``outcomes.csv``.
+"""The directive ``solved-table``: counts of solved trials from a committed ``outcomes.csv``.
 
     ```{solved-table} results/rivergrid/fresh/outcomes.csv
     :methods: none, linear, dynamic
     ```
 
-What solved means, and its one tolerance, is defined in recrl.analysis.statistics.feasibility.
+``recrl.analysis.statistics.feasibility`` defines "solved" and its tolerance.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MEASURES = {
 
 
 def solved_table(path: Path, methods: list[str]) -> str:
-    """A Markdown table with a row a task, agent and curriculum.
+    """Return a Markdown table with one row per task, agent and curriculum.
 
     Args:
         path: an ``outcomes.csv``.
@@ -58,7 +58,7 @@ class SolvedTable(SphinxDirective):
     option_spec: ClassVar = {"methods": directives.unchanged}
 
     def run(self) -> list[nodes.Node]:
-        """Make the table."""
+        """Return the nodes of the table."""
         path = ROOT / self.arguments[0]
         self.env.note_dependency(str(path))
         methods = [it.strip() for it in self.options.get("methods", "").split(",") if it.strip()]
@@ -68,6 +68,6 @@ class SolvedTable(SphinxDirective):
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Tell Sphinx."""
+    """Register the extension."""
     app.add_directive("solved-table", SolvedTable)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

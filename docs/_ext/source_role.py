@@ -1,10 +1,9 @@
-"""The role ``src``: a file of the repository, or a name in it, that must be there.
+"""The role ``src``: a file of the repository, or a name in it, which must exist.
 
     {src}`teachers/dynamic.py`                  the file
     {src}`teachers/dynamic.py:has_converged`    a function, class, method or constant that it defines
 
-A file or a name that is not there is a warning, and so an error of the build. Pages cannot fall behind the
-code.
+A missing file or name is a warning, and so an error of the build.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 @cache
 def names_in(path: Path) -> frozenset[str]:
-    """Everything that a module defines at its top, and ``Class.member`` of its classes."""
+    """Return all top-level names of a module, and ``Class.member`` of its classes."""
     found = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         found |= _defined(node)
@@ -45,7 +44,7 @@ def _defined(node: ast.stmt) -> set[str]:
 
 
 def mistake_in(reference: str) -> str:
-    """What is wrong with ``path`` or ``path:name``; empty if both are there."""
+    """Return the problem with ``path`` or ``path:name``; empty if both exist."""
     file, _, name = reference.partition(":")
     path = ROOT / file
     if not path.exists():
@@ -58,7 +57,7 @@ def mistake_in(reference: str) -> str:
 def source(
     role: str, rawtext: str, text: str, line: int, inliner: Inliner, *_: Any
 ) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-    """The role: the file in code type, the name first where there is one."""
+    """Return the role's nodes: the file in code type, preceded by the name, if any."""
     if mistake := mistake_in(text):
         location = (inliner.document.settings.env.docname, line)
         logger.warning("src role: %s", mistake, location=location)
@@ -70,6 +69,6 @@ def source(
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Tell Sphinx."""
+    """Register the extension."""
     app.add_role("src", source)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

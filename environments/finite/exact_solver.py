@@ -4,12 +4,12 @@ Two independent solvers of
 
     J*(d) = max_pi J(pi)    such that    C_i(pi) <= d_i for all i,
 
-over all policies, time-dependent and random ones included, undiscounted over a finite horizon:
-``solve_by_linear_program`` states it over occupation measures (Altman 1999, chapter 3) and is for small
-horizons and for tests; ``solve_by_lagrangian`` solves RiverGrid's 200 steps in some 0.1 s. They agree under
-test.
+over all policies, time-dependent and random ones included, undiscounted over a finite horizon.
+``solve_by_linear_program`` optimises over occupation measures (Altman 1999, chapter 3); it is for small
+horizons and for tests. ``solve_by_lagrangian`` solves RiverGrid's 200 steps in about 0.1 s. A test checks
+that they agree.
 
-J* bounds what an agent can reach from above: an agent's policy sees no clock.
+J* is an upper bound on an agent's return, because an agent's policy does not see the time.
 
 Notation: H horizon, S states, A actions, k costs, t a time step, x an occupation measure, lambda the
 multipliers [k].
@@ -34,12 +34,12 @@ MAX_POLICIES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class PolicyValue:
-    """What a policy is worth over an episode.
+    """Expected return, costs and visits of a policy over an episode.
 
     Attributes:
         episode_return: expected undiscounted return.
         costs: expected undiscounted episode costs, [k].
-        visits: expected number of times that each pair is left, [S, A]; sums to the expected length.
+        visits: expected number of visits of each (state, action) pair, [S, A]; sums to the expected length.
     """
 
     episode_return: float
@@ -54,7 +54,8 @@ class ConstrainedOptimum:
     Attributes:
         episode_return: J*(d).
         costs: expected undiscounted episode costs of ``policy``, [k].
-        multipliers: lambda_i = dJ*/dd_i >= 0, what raising a limit by 1 is worth, [k]; 0 for infinite ones.
+        multipliers: lambda_i = dJ*/dd_i >= 0, the gain in return per unit of each limit, [k]; 0 for infinite
+            limits.
         policy: an optimal policy, pi_t(a | s), [H, S, A].
     """
 
@@ -65,7 +66,7 @@ class ConstrainedOptimum:
 
 
 def evaluate_policy(model: FiniteCMDP, policy: Floats) -> PolicyValue:
-    """The exact value of a policy, by carrying the state distribution forward.
+    """Compute the exact value of a policy by propagating the state distribution forward.
 
     mu_0 = start, x_t(s, a) = mu_t(s) pi_t(a | s), mu_{t+1}(s') = sum_{s, a} x_t(s, a) T(s' | s, a).
 
@@ -87,24 +88,25 @@ def evaluate_policy(model: FiniteCMDP, policy: Floats) -> PolicyValue:
 
 
 def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOptimum:
-    """J*(d) by its dual, min_{lambda >= 0} max_pi J(pi) - lambda . (C(pi) - d).
+    """Solve for J*(d) by the dual, min_{lambda >= 0} max_pi J(pi) - lambda . (C(pi) - d).
 
-    For a fixed lambda backward induction gives a best deterministic policy; a small linear program mixes the
-    policies found so far within the limits and its duals are the next lambda (the dual's cutting planes,
-    Dantzig-Wolfe). It ends when no policy beats the mixture at its own prices: then the two bounds meet. A
-    first round does the same to the smallest total excess over the limits, to know whether they can be kept.
+    For a fixed lambda, backward induction finds an optimal deterministic policy. A small linear program mixes
+    the policies found so far within the limits. Its dual variables are the next lambda (cutting planes of the
+    dual, Dantzig-Wolfe). The iteration ends when no policy improves on the mixture under its own multipliers:
+    then the two bounds meet. A first phase minimises the total excess over the limits in the same way, to
+    find out whether they are feasible.
 
     Raises:
         InfeasibleLimitsError: no policy keeps the limits.
     """
     constrained = np.array(limits.finite)
     bounds = _checked_limits(model, limits)[constrained]
-    found = [_backward_induction(model, reward_weight=1.0, prices=np.zeros(model.num_costs))]
+    found = [_backward_induction(model, reward_weight=1.0, multipliers=np.zeros(model.num_costs))]
     for reward_weight in (0.0, 1.0):
         for _ in range(MAX_POLICIES):
-            weights, prices, bound = _mixture(found, bounds, constrained, reward_weight)
-            candidate = _backward_induction(model, reward_weight=reward_weight, prices=prices)
-            value = reward_weight * candidate.episode_return - prices @ candidate.costs
+            weights, multipliers, bound = _mixture(found, bounds, constrained, reward_weight)
+            candidate = _backward_induction(model, reward_weight=reward_weight, multipliers=multipliers)
+            value = reward_weight * candidate.episode_return - multipliers @ candidate.costs
             if value <= bound + TOLERANCE * (1.0 + abs(bound)):
                 break
             found.append(candidate)
@@ -116,7 +118,7 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
             raise InfeasibleLimitsError(
                 f"no policy keeps the limits {limits.to_json()}, the smallest total excess is {excess:.6g}"
             )
-        bounds = np.maximum(bounds, costs[constrained])  # rounding must not make the next round infeasible
+        bounds = np.maximum(bounds, costs[constrained])  # rounding must not make the next phase infeasible
     used = [(weight, policy) for weight, policy in zip(weights, found, strict=False) if weight > 0.0]
     one_hot = np.eye(model.num_actions)
     occupation = np.sum(
@@ -125,20 +127,20 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
     return ConstrainedOptimum(
         episode_return=float(sum(weight * policy.episode_return for weight, policy in used)),
         costs=np.asarray(costs, np.float64),
-        multipliers=prices,
+        multipliers=multipliers,
         policy=_conditional(occupation),
     )
 
 
 def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOptimum:
-    """J*(d) by linear programming over occupation measures x_t(s, a) >= 0 (HiGHS).
+    """Solve for J*(d) by linear programming over occupation measures x_t(s, a) >= 0 (HiGHS).
 
     maximise    sum_{t, s, a} x_t(s, a) R(s, a)
     subject to  sum_a x_0(s, a) = start(s),
                 sum_a x_t(s', a) = sum_{s, a} x_{t-1}(s, a) T(s' | s, a)    for every s' that is not terminal,
                 sum_{t, s, a} x_t(s, a) C_i(s, a) <= d_i,
 
-    and pi_t(a | s) is proportional to x_t(s, a). Only states that can be reached at time t get variables.
+    and pi_t(a | s) is proportional to x_t(s, a). Only states that are reachable at time t have variables.
 
     Raises:
         InfeasibleLimitsError: no policy keeps the limits.
@@ -156,7 +158,7 @@ def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> Constraine
     occupation = np.zeros((model.horizon, model.num_states, model.num_actions))
     occupation[times, states] = np.maximum(solution.x, 0.0).reshape(-1, model.num_actions)
     multipliers = np.zeros(model.num_costs)
-    multipliers[constrained] = solution.prices
+    multipliers[constrained] = solution.multipliers
     return ConstrainedOptimum(
         episode_return=float(np.sum(occupation * model.rewards)),
         costs=np.einsum("tsa,sak->k", occupation, model.costs),
@@ -167,20 +169,22 @@ def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> Constraine
 
 @dataclass(frozen=True, eq=False)
 class _DeterministicPolicy:
-    """One vertex of the set of (return, costs) that policies reach; ``actions`` is [H, S]."""
+    """One vertex of the set of attainable (return, costs); ``actions`` is [H, S]."""
 
     actions: npt.NDArray[np.int8]
     episode_return: float
     costs: Floats
 
 
-def _backward_induction(model: FiniteCMDP, *, reward_weight: float, prices: Floats) -> _DeterministicPolicy:
-    """A policy that maximises reward_weight J - prices . C, with its own J and C.
+def _backward_induction(
+    model: FiniteCMDP, *, reward_weight: float, multipliers: Floats
+) -> _DeterministicPolicy:
+    """Return a policy that maximises reward_weight J - multipliers . C, with its own J and C.
 
     V_H = 0,  Q_t(s, a) = [R, C](s, a) + sum_s' T(s' | s, a) V_{t+1}(s'),
-    V_t(s) = Q_t(s, argmax_a [reward_weight, -prices] . Q_t(s, a)).
+    V_t(s) = Q_t(s, argmax_a [reward_weight, -multipliers] . Q_t(s, a)).
     """
-    weights = np.concatenate([[reward_weight], -prices])
+    weights = np.concatenate([[reward_weight], -multipliers])
     immediate = np.concatenate([model.rewards[:, :, None], model.costs], axis=2)
     going_on = ~model.terminal[:, None]
     values = np.zeros((model.num_states, 1 + model.num_costs))
@@ -201,37 +205,38 @@ def _mixture(
     constrained: npt.NDArray[np.bool_],
     reward_weight: float,
 ) -> tuple[Floats, Floats, float]:
-    """The best mixture of the policies found: weights, the prices of the limits [k], the bound to beat.
+    """Return the best mixture of the policies found: its weights, the multipliers [k] and its value.
 
-    reward_weight 1: maximise the return within the limits. 0: minimise the total excess over them.
+    With reward_weight 1 it maximises the return within the limits. With 0 it minimises the total excess over
+    them.
     """
     costs = np.array([policy.costs for policy in found])[:, constrained]
     returns = np.array([policy.episode_return for policy in found])
-    # Excess over the limits is allowed, and the objective, only where the return is not.
+    # With reward_weight 0, excess over the limits is allowed and minimised.
     slacks = 0 if reward_weight else len(bounds)
     solution = _minimise(
         np.concatenate([-reward_weight * returns, np.ones(slacks)]),
         at_most=(np.hstack([costs.T, -np.eye(len(bounds), slacks)]), bounds),
         equal=(np.concatenate([np.ones(len(found)), np.zeros(slacks)])[None], np.ones(1)),
     )
-    assert solution is not None, "the first round leaves a mixture that keeps the limits"
-    prices = np.zeros(len(constrained))
-    prices[constrained] = solution.prices
-    return solution.x[: len(found)], prices, -float(solution.equality_marginals[0])
+    assert solution is not None, "the first phase finds a mixture that keeps the limits"
+    multipliers = np.zeros(len(constrained))
+    multipliers[constrained] = solution.multipliers
+    return solution.x[: len(found)], multipliers, -float(solution.equality_marginals[0])
 
 
 @dataclass(frozen=True, eq=False)
 class _LinearSolution:
-    """A minimiser, and what a unit of right-hand side is worth.
+    """Solution of a linear program: the minimiser and the dual variables.
 
     Attributes:
         x: the minimiser.
-        prices: how far the minimum falls per unit of each upper bound, >= 0.
-        equality_marginals: how far it rises per unit of each equality.
+        multipliers: decrease of the minimum per unit of each upper bound, >= 0.
+        equality_marginals: increase of the minimum per unit of each equality.
     """
 
     x: Floats
-    prices: Floats
+    multipliers: Floats
     equality_marginals: Floats
 
 
@@ -247,7 +252,7 @@ def _minimise(
         raise RuntimeError(f"the linear program was not solved: {solution.message}")
     return _LinearSolution(
         x=np.asarray(solution.x),
-        prices=np.maximum(-np.asarray(solution.ineqlin.marginals), 0.0),
+        multipliers=np.maximum(-np.asarray(solution.ineqlin.marginals), 0.0),
         equality_marginals=np.asarray(solution.eqlin.marginals),
     )
 
@@ -266,7 +271,7 @@ def _occupation(model: FiniteCMDP, policy: Floats) -> Floats:
 
 
 def _conditional(occupation: Floats) -> Floats:
-    """pi_t(a | s) = x_t(s, a) / sum_a x_t(s, a); uniform where nobody gets."""
+    """pi_t(a | s) = x_t(s, a) / sum_a x_t(s, a); uniform in states that are never visited."""
     mass = occupation.sum(axis=2, keepdims=True)
     policy: Floats = np.full_like(occupation, 1.0 / occupation.shape[2])
     np.divide(occupation, mass, out=policy, where=mass > 1e-12)
@@ -274,7 +279,7 @@ def _conditional(occupation: Floats) -> Floats:
 
 
 def _flow_constraints(model: FiniteCMDP) -> tuple[Integers, Integers, coo_array, Floats]:
-    """The variables' times and states (each with A actions), and the flow equations on them."""
+    """Return the times and states of the variables (each with A actions), and their flow equations."""
     reachable = np.zeros((model.horizon, model.num_states), np.bool_)
     reachable[0] = model.start > 0.0
     for step in range(1, model.horizon):

@@ -1,8 +1,7 @@
-"""Finite constrained Markov decision processes as tables, and an environment that steps any of them.
+"""Finite constrained Markov decision processes as tables, and a batch environment that steps them.
 
-A finite CMDP with a known model is worth having: its constrained optimum is known exactly
-(``recrl.environments.finite.exact_solver``), so a learner is scored against the truth, and a batch of it is
-stepped by table look-ups.
+The constrained optimum of a finite CMDP is known exactly (``recrl.environments.finite.exact_solver``), so
+learners can be compared with it. A batch is stepped by table look-ups.
 
 Notation: S states, A actions, m successors that a (state, action) pair can have, k costs, B environments,
 n observation components.
@@ -35,7 +34,7 @@ class FiniteCMDP:
     """The tables of a finite CMDP with a finite horizon (Altman 1999, chapter 2).
 
     An episode starts in a state drawn from ``start``, ends for good on *entering* a terminal state, and is
-    truncated after ``horizon`` steps. Rewards and costs belong to the (state, action) pair that is left.
+    truncated after ``horizon`` steps. Rewards and costs belong to the current (state, action) pair.
 
     Attributes:
         successors: the states that can follow, [S, A, m]; padding repeats any state with probability 0.
@@ -102,12 +101,12 @@ class FiniteSteps:
     """T steps of B environments of a finite CMDP, all [T, B] unless said otherwise.
 
     Attributes:
-        states: the states that were left.
-        actions: what was done in them.
+        states: the states before the step.
+        actions: the actions taken in them.
         rewards: float64.
         costs: float64, [T, B, k].
         terminated: the step entered a terminal state.
-        truncated: the step was the episode's last by the horizon, and no terminal state was entered.
+        truncated: the step reached the horizon without entering a terminal state.
         successors: the states that were entered, before any reset.
     """
 
@@ -140,7 +139,10 @@ class FiniteVectorEnv(CMDPVectorEnv):
         if num_envs < 1:
             raise ValueError(f"{name}: num_envs must be at least 1, got {num_envs}")
         if len(observations) != model.num_states:
-            raise ValueError(f"{name}: {model.num_states} states need as many observations")
+            raise ValueError(
+                f"{name}: {model.num_states} states need {model.num_states} "
+                f"observations, got {len(observations)}"
+            )
         self.num_envs = num_envs
         self.observations = observations
         self.single_observation_space = Box(
@@ -169,13 +171,13 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self._elapsed: Integers | None = None
 
     def finite_cmdp(self) -> FiniteCMDP:
-        """The model that is stepped, for exact solutions."""
+        """The model, for exact solutions."""
         return self._model
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start B episodes; ``seed`` restarts the one generator that they share."""
+        """Start B episodes; ``seed`` restarts the generator that they share."""
         super().reset(seed=seed, options=options)
         self.states = self._first_states(self.num_envs)
         self._elapsed = np.zeros(self.num_envs, np.int64)
@@ -205,25 +207,24 @@ class FiniteVectorEnv(CMDPVectorEnv):
         """Begin new episodes in some environments; see ``recrl.environments.vector``."""
         if self._elapsed is None:
             raise ValueError(f"{self.cmdp.name}: call reset before restart")
-        self.states = self.states.copy()  # what step returned may still be held
+        self.states = self.states.copy()  # the caller may still hold the last returned array
         self.states[index] = self._first_states(len(index))
         self._elapsed[index] = 0
         return self.observations[self.states]
 
     @property
     def follows_tables(self) -> bool:
-        """Whether ``step`` is this class's own, so that ``follow`` is the same."""
+        """Whether ``step`` is not overridden, so that ``follow`` gives the same results."""
         return type(self).step is FiniteVectorEnv.step and "step" not in vars(self)
 
     def follow(self, masses: Floats, draws: Floats) -> FiniteSteps:
-        """Take T steps under a policy that is a table: many times as fast as ``step``, with equal results.
+        """Take T steps under a tabular policy, with the results of ``step`` but many times as fast.
 
-        The policy acts by inversion: in state s it takes the first action a with
-        u masses[s, -1] < masses[s, a]. To be called only where ``follows_tables``: elsewhere ``step`` does
-        something else.
+        The policy acts by inversion: in state s it takes the first action a with u masses[s, -1] < masses[s,
+        a]. Call it only if ``follows_tables``: otherwise ``step`` is overridden.
 
         Args:
-            masses: each state's action probabilities, summed up over the actions, in any unit, [S, A].
+            masses: cumulative sums of each state's action probabilities, not necessarily normalised, [S, A].
             draws: the policy's uniform numbers u on [0, 1), [T, B].
         """
         if self._elapsed is None:
@@ -236,7 +237,7 @@ class FiniteVectorEnv(CMDPVectorEnv):
         )
         states, elapsed, whole = self.states, self._elapsed, masses[:, -1]
         for step, drawn in enumerate(draws):
-            # A threshold may round up to the whole mass, so the last action is what is left.
+            # A threshold may round up to the whole mass: then the last action is taken.
             actions = (bounds[states] <= (drawn * whole[states])[:, None]).sum(axis=1)
             pairs[step] = taken = states * model.num_actions + actions
             successors[step] = states = self._next_states(taken)
@@ -259,7 +260,7 @@ class FiniteVectorEnv(CMDPVectorEnv):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The states, the steps taken in each episode, and the generator."""
+        """Return the states, the steps taken in each episode, and the generator."""
         if self._elapsed is None:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
         return {
@@ -272,8 +273,8 @@ class FiniteVectorEnv(CMDPVectorEnv):
         """Continue exactly where ``state_dict`` was taken."""
         if np.shape(state["states"]) != (self.num_envs,):
             raise ValueError(
-                f"{self.cmdp.name}: the saved state is of {np.size(state['states'])} environments, "
-                f"these are {self.num_envs}"
+                f"{self.cmdp.name}: the saved state has {np.size(state['states'])} environments, "
+                f"expected {self.num_envs}"
             )
         self.states = np.array(state["states"], np.int64)
         self._elapsed = np.array(state["elapsed"], np.int64)
@@ -287,7 +288,7 @@ class FiniteVectorEnv(CMDPVectorEnv):
                 f"got {actions.dtype} of shape {actions.shape}"
             )
         actions = actions.astype(np.int64, copy=False)
-        # Seen as unsigned, a negative action is a huge one: one comparison checks both ends.
+        # As an unsigned integer a negative action is huge, so one comparison checks both ends.
         if actions.view(np.uint64).max() >= self._model.num_actions:
             raise ValueError(
                 f"{self.cmdp.name}: actions must be 0 to {self._model.num_actions - 1}, "

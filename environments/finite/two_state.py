@@ -1,10 +1,9 @@
-"""The smallest CMDPs with a closed-form constrained optimum: on these, learners are tested.
+"""Two small CMDPs with a closed-form constrained optimum, for testing learners.
 
-Two states, a camp and a mine. An episode starts in the camp, where nothing is earned; the way to the mine
-takes steps that bring nothing either, so an agent must look ahead. In the mine a careful step earns 1; a
-hasty step earns 2 and wears the tools; a reckless step earns 3, wears the tools and makes noise. All of them
-stay in the mine. ``two-state`` has the first two and the cost ``wear``; ``two-state-2`` has all three and the
-costs ``wear`` and ``noise``.
+There are two states, a camp and a mine. An episode starts in the camp, where the reward is 0, also on the way
+to the mine: an agent must look ahead. In the mine a careful step earns 1. A hasty step earns 2 and wears the
+tools. A reckless step earns 3, wears the tools and makes noise. All of them stay in the mine. ``two-state``
+has the first two and the cost ``wear``; ``two-state-2`` has all three and the costs ``wear`` and ``noise``.
 
 Observation: one-hot state (camp, mine), float32 [2].
 Action: Discrete(2) or Discrete(3). In the camp 0 waits and any other goes; in the mine 0 is careful, 1 hasty
@@ -14,13 +13,13 @@ Cost: ``wear`` 1 a hasty or reckless step in the mine, ``noise`` 1 a reckless st
 Termination: never; truncated after ``horizon`` steps.
 Source: ours.
 
-With n the expected number of steps in the mine when an agent goes at once,
+With n the expected number of steps in the mine of an agent that goes at once,
 
     J*(d) = n + min(d_wear, n) + min(d_wear, d_noise, n),    n = sum_{t=1}^{H-1} (1 - (1 - p)^t),
 
-where p is the chance that a step towards the mine arrives: n = H - 1 for p = 1. It is reached by a
-*stationary* policy: go; be reckless with probability min(d_wear, d_noise, n) / n and hasty with the rest of
-min(d_wear, n) / n.
+where p is the chance that a step towards the mine arrives: n = H - 1 for p = 1. A *stationary* policy is
+optimal: go; be reckless with probability min(d_wear, d_noise, n) / n and hasty with the rest of min(d_wear,
+n) / n.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class TwoStateOptions(BaseModel):
 
 
 def two_state_cmdp(options: TwoStateOptions, num_costs: int) -> FiniteCMDP:
-    """The tables: A = k + 1 actions, k = ``num_costs`` of 1 (``wear``) or 2 (``wear``, ``noise``)."""
+    """Return the tables: A = k + 1 actions, k = ``num_costs`` of 1 (``wear``) or 2 (``wear``, ``noise``)."""
     num_actions = num_costs + 1
     to_mine = np.full((2, num_actions), options.arrival)
     to_mine[CAMP, 0] = 0.0
@@ -71,7 +70,7 @@ def two_state_cmdp(options: TwoStateOptions, num_costs: int) -> FiniteCMDP:
 
 
 def expected_steps_in_mine(options: TwoStateOptions) -> float:
-    """The expected steps in the mine of an agent that sets off at once, n = sum_{t<H} (1 - (1 - p)^t).
+    """Expected steps in the mine of an agent that goes at once, n = sum_{t<H} (1 - (1 - p)^t).
 
     >>> expected_steps_in_mine(TwoStateOptions(horizon=10))
     9.0
@@ -81,7 +80,7 @@ def expected_steps_in_mine(options: TwoStateOptions) -> float:
 
 
 def two_state_optimum(name: str, options: TwoStateOptions, limits: CostLimits) -> float:
-    """J*(d) for the task's one or two limits; the module's docstring states it.
+    """Return J*(d) for the task's one or two limits, by the formula of the module's docstring.
 
     >>> two_state_optimum("two-state", TwoStateOptions(horizon=10), CostLimits((3.0,)))
     12.0

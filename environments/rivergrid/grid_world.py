@@ -1,19 +1,19 @@
-"""RiverGrid (paper, section 5 and figure 1): a grid world in which the short way leads through a river.
+"""RiverGrid (paper, section 5 and figure 1): a grid world whose shortest path leads through a river.
 
 Observation: one-hot x, one-hot y, one-hot heading (east, south, west, north), float32 [width + height + 4];
     with ``observation: joint`` one-hot (x, y, heading) as a whole, float32 [4 width height].
 Action: Discrete(3), MiniGrid's first three: 0 turn left, 1 turn right, 2 forward (into a wall: stay).
 Reward: -0.1 a step; +10 instead on the step that reaches a goal.
-Cost: ``river`` 1 for every time step that ends on a river tile, turning and bumping there included; on demand
-    ``turns`` 1 for every turn, and ``mud`` 1 for every time step that ends on a muddy tile, which make tasks
-    with two and three constraints whose optimum is still exact.
+Cost: ``river`` is 1 for every time step that ends on a river tile, turning and bumping there included.
+Optional are ``turns``, 1 for every turn, and ``mud``, 1 for every time step that ends on a mud tile. The
+optimum is exact with two and three constraints, too.
 Termination: at a goal; truncated after ``horizon`` steps (200).
-Source: the paper's section 5 for the idea, the limits and the cost (time steps in the water). It gives
-    neither maps (its figure is not in its text) nor rewards nor a horizon: those are ours, such that every
-    statement of the paper about the two instances holds (``recrl.environments.rivergrid.maps``).
+Source: the paper's section 5 for the idea, the limits and the cost (time steps in the water). Maps, rewards
+and horizon are ours, because the paper's text does not give them. With them every statement of the paper
+about the two instances holds.
 
-Deterministic: seeding is accepted and changes nothing. ``RiverGridVectorEnv`` steps tables;
-``recrl.environments.rivergrid.minigrid_env`` is the same CMDP on MiniGrid, step for step equal under test.
+Deterministic: a seed changes nothing. ``RiverGridVectorEnv`` steps tables.
+``recrl.environments.rivergrid.minigrid_env`` is the same CMDP on MiniGrid; a test compares them step by step.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ ObservationName = Literal["factored", "joint"]
 
 
 class RiverGridOptions(BaseModel):
-    """Settings of ``rivergrid-1a`` and ``rivergrid-1b``, and of the other maps besides their own."""
+    """Options of ``rivergrid-1a`` and ``rivergrid-1b``, and common options of the other RiverGrid tasks."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -69,8 +69,9 @@ class RiverGridOptions(BaseModel):
     )
     observation: ObservationName = Field(
         default="factored",
-        description="What agents see: x, y and heading, each one-hot, so that what is learnt of a tile "
-        "carries over to its row and column; or the joint state, one-hot as a whole, as in a table (ours).",
+        description="What agents observe. `factored`: x, y and heading, each one-hot, so that "
+        "learning about a tile generalises to its row and column. `joint`: the joint "
+        "state, one-hot, as in a table (ours).",
     )
 
     @field_validator("costs")
@@ -82,20 +83,20 @@ class RiverGridOptions(BaseModel):
 
 
 class RiverGridMapOptions(RiverGridOptions):
-    """Settings of ``rivergrid``: a map of one's own, or a random one."""
+    """Options of ``rivergrid``: a map of your own, or a random one."""
 
     map: str | None = Field(
         default=None,
-        description="The drawing itself, or the path of a text file that holds it; the drawing is kept.",
+        description="The map as text, or the path of a text file with it; the map itself is stored.",
     )
-    generate: MapGenerator | None = Field(default=None, description="What to draw a random map from.")
+    generate: MapGenerator | None = Field(default=None, description="Settings of a random map.")
 
     @field_validator("map")
     @classmethod
     def _drawn(cls, text: str | None) -> str | None:
         if text is None:
             return None
-        # The drawing, not the path, is what a trial depends on, so it is what the options keep.
+        # A trial depends on the map and not on its path, so the options store the map.
         return str(parse_map(text) if "\n" in text else read_map(Path(text)))
 
     @field_validator("generate")
@@ -112,12 +113,12 @@ class RiverGridMapOptions(RiverGridOptions):
         return self
 
     def river_map(self) -> RiverMap:
-        """The map that the settings stand for."""
+        """The map of these settings."""
         return generate_map(self.generate) if self.generate is not None else parse_map(self.map or "")
 
 
 class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):
-    """Settings of ``rivergrid-generated``: an instance like the paper's two, drawn at random."""
+    """Options of ``rivergrid-generated``: a random instance with the properties of the paper's two."""
 
     @model_validator(mode="after")
     def _can_be_drawn(self) -> Self:
@@ -125,17 +126,17 @@ class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):
         return self
 
     def river_map(self) -> RiverMap:
-        """The map that the settings stand for."""
+        """The map of these settings."""
         return draw_instance(self)
 
 
 def state_index(river_map: RiverMap, x: int, y: int, heading: int) -> int:
-    """The number of state (x, y, heading): (x * height + y) * 4 + heading."""
+    """Index of the state (x, y, heading): (x * height + y) * 4 + heading."""
     return (x * river_map.height + y) * HEADINGS + heading
 
 
 def river_observations(river_map: RiverMap, observation: ObservationName) -> npt.NDArray[np.float32]:
-    """What an agent sees in each state, float32 [S, width + height + 4], or [S, S] with ``joint``."""
+    """Return the observation of each state, float32 [S, width + height + 4], or [S, S] with ``joint``."""
     shape = (river_map.width, river_map.height, HEADINGS)
     if observation == "joint":
         return np.eye(math.prod(shape), dtype=np.float32)
@@ -146,7 +147,7 @@ def river_observations(river_map: RiverMap, observation: ObservationName) -> npt
 
 
 def river_cmdp(river_map: RiverMap, *, costs: Sequence[CostName], horizon: int) -> FiniteCMDP:
-    """The tables of RiverGrid: S = 4 width height states, walls included though nobody gets there."""
+    """Return the tables of RiverGrid: S = 4 width height states, unreachable ones (walls) included."""
     num_states = river_map.width * river_map.height * HEADINGS
     successors: Integers = np.zeros((num_states, 3), np.int64)
     tiles = np.full(num_states, WALL)
@@ -203,7 +204,7 @@ class RiverGridVectorEnv(FiniteVectorEnv):
         self.river_map = river_map
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
-        """One RGB frame per environment, uint8 [height * 32, width * 32, 3], as MiniGrid draws it."""
+        """Render one RGB frame per environment, uint8 [height * 32, width * 32, 3], with MiniGrid."""
         render_frame = load_attribute("recrl.environments.rivergrid.minigrid_env:render_frame")
         frames = []
         for state in self.states.tolist():
@@ -213,20 +214,20 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
 
 def task_map(name: str, options: RiverGridOptions) -> RiverMap:
-    """The map of ``rivergrid`` and ``rivergrid-generated`` (from their options) or of one of the paper's."""
+    """Return the map of a task: one of the paper's, or that of the options."""
     if isinstance(options, RiverGridMapOptions | RiverGridGeneratedOptions):
         return options.river_map()
     return parse_map(MAPS[name.removeprefix("rivergrid-")])
 
 
 def make_river_grid(name: str, num_envs: int, options: RiverGridOptions) -> RiverGridVectorEnv:
-    """B environments of a RiverGrid task."""
+    """Make B environments of a RiverGrid task."""
     return RiverGridVectorEnv(name, task_map(name, options), options, num_envs=num_envs)
 
 
 def river_grid_optimum(name: str, options: RiverGridOptions, limits: CostLimits) -> float:
-    """J*(d), exact to about 1e-9; -inf where no policy keeps the limits."""
-    # Loaded here because it needs SciPy, which takes half a second to import and which no trial uses.
+    """Return J*(d), exact to about 1e-9; -inf if no policy keeps the limits."""
+    # Imported here because SciPy takes half a second to import and trials do not use it.
     solve = load_attribute("recrl.environments.finite.exact_solver:solve_by_lagrangian")
     model = river_cmdp(task_map(name, options), costs=options.costs, horizon=options.horizon)
     try:

@@ -1,18 +1,23 @@
-"""RiverGrid instances like the paper's two, drawn at random by rules that know no agent.
+"""Random RiverGrid instances with the properties of the paper's two, by rules independent of agents.
 
-A river of changing width runs through the whole map, from north to south or from west to east; the start is
-drawn on one bank and the goal on the other. There is a dry way round as on 1b, or there is none as on 1a.
+A river of varying width runs through the whole map, from north to south or from west to east. The start is on
+one bank and the goal on the other. Either there is a safe path around the river, as on 1b, or there is none,
+as on 1a.
 
-One attempt draws, in this order: the direction of the river; its width and place in the first row and, row by
-row, a change of each by -1, 0 or 1; with a dry way round, the row in which the river can be walked through
-dry; a wall on each inner tile with probability ``wall_share``; on which bank the start lies; the start, the
-goal and the heading. Attempts are repeated until one is an instance (``is_instance``). Equal settings give
-equal maps on every machine: all draws are floor(n u) of the raw 64-bit numbers u of PCG64, which NumPy keeps
-the same for ever (its distributions it may change).
+One attempt draws, in this order:
 
-What makes an instance, and which limit d_d goes with it (``suggested_limit``), is counted on the map, so that
-nothing about it can have been tuned on an agent. Steps are a route's actions, turns included; its cost is
-its time steps in the river.
+- the direction of the river;
+- its width and place in the first row, and row by row a change of each by -1, 0 or 1;
+- with a safe path, the row in which the river has a dry ford;
+- a wall on each inner tile with probability ``wall_share``;
+- the bank of the start; the start, the goal and the heading.
+
+Attempts are repeated until one is an instance (``is_instance``). Equal settings give equal maps on every
+machine: all draws are floor(n u) of the raw 64-bit numbers u of PCG64, which NumPy guarantees not to change.
+It does not guarantee this for its distributions.
+
+Whether a map is an instance, and its limit d_d (``suggested_limit``), follow from the map alone, so nothing
+can be tuned to an agent. Steps are a path's actions, turns included. Its cost is its time steps in the river.
 """
 
 from __future__ import annotations
@@ -37,15 +42,15 @@ from recrl.environments.rivergrid.maps import (
     enclosed,
 )
 
-LEAST_DETOUR = 5  # steps that a dry way round takes more than the quickest way; on 1b 11 against 6
-LIMIT_PARTS = 5  # with a dry way round, d_d lets one crossing in so many through; on 1b 1 of 5
+LEAST_DETOUR = 5  # steps that a safe path takes more than the shortest path; on 1b 11 against 6
+LIMIT_PARTS = 5  # with a safe path, d_d allows one crossing in this number of episodes; on 1b 1 of 5
 
 Tiles = list[list[str]]
 Pose = tuple[int, int, int]  # x, y, heading
 
 
 class InstanceSettings(BaseModel):
-    """What an instance is drawn from."""
+    """Settings of a generated instance."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,7 +66,8 @@ class InstanceSettings(BaseModel):
     )
     dry_route: bool | None = Field(
         default=None,
-        description="Whether there is a dry way round, as on 1b, or not, as on 1a; null lets a coin decide.",
+        description="Whether a safe path around the river exists, as on 1b, or not, as on 1a; "
+        "null draws it at random.",
     )
 
     @model_validator(mode="after")
@@ -78,7 +84,7 @@ class InstanceSettings(BaseModel):
 
 @dataclass(frozen=True)
 class Route:
-    """A way from the start to a goal.
+    """A path from the start to a goal.
 
     Attributes:
         steps: its actions, turns included.
@@ -90,25 +96,25 @@ class Route:
 
 
 def quickest_route(river_map: RiverMap) -> Route | None:
-    """The cheapest among the ways with the fewest steps; None if there is no way."""
+    """Return the cheapest of the shortest paths, or None if there is no path."""
     length = _shortest(river_map, step=(1, 0), wet=(0, 1))
     return Route(steps=length[0], cost=length[1]) if length else None
 
 
 def cheapest_route(river_map: RiverMap) -> Route | None:
-    """The quickest among the ways with the least cost; None if there is no way."""
+    """Return the shortest of the cheapest paths, or None if there is no path."""
     length = _shortest(river_map, step=(0, 1), wet=(1, 0))
     return Route(steps=length[1], cost=length[0]) if length else None
 
 
 def _shortest(river_map: RiverMap, *, step: tuple[int, int], wet: tuple[int, int]) -> tuple[int, int] | None:
-    """The length of a shortest way to a goal (Dijkstra 1959); None if there is none.
+    """Return the length of a shortest path to a goal (Dijkstra 1959), or None if there is none.
 
-    Lengths are pairs, compared by their first numbers and, where those are equal, by their second.
+    Lengths are pairs in lexicographic order.
 
     Args:
         river_map: the map.
-        step: what every step adds to a way's length.
+        step: what every step adds to a path's length.
         wet: what a step that ends in the river adds to it.
     """
     frontier: list[tuple[int, int, Pose]] = [(0, 0, (*river_map.start, river_map.heading))]
@@ -132,16 +138,16 @@ def _shortest(river_map: RiverMap, *, step: tuple[int, int], wet: tuple[int, int
 
 
 def is_instance(river_map: RiverMap, settings: InstanceSettings, *, dry_route: bool) -> bool:
-    """Whether a map asks of an agent what the paper's two ask.
+    """Whether a map has the properties of the paper's two.
 
     - The goal can be reached.
-    - The quickest way leads through the river and costs at least the river's least width: without a limit,
-      the optimum is in the water.
-    - ``dry_route``: there is a dry way round, of at least ``LEAST_DETOUR`` steps more, so that staying dry
-      costs at least 0.5 of return. Otherwise there is none: the river must be crossed.
+    - The shortest path leads through the river and costs at least the river's least width, so the
+      unconstrained optimum enters the river.
+    - With ``dry_route`` there is a safe path with at least ``LEAST_DETOUR`` more steps, so that it loses at
+      least 0.5 of return. Without it no zero-cost path exists.
 
-    Both kinds bind at ``suggested_limit``: with a dry way J*(d_d) < J*(inf); without one no smaller limit
-    lets every episode reach the goal.
+    The constraint binds at ``suggested_limit``. With a safe path, J*(d_d) < J*(inf). Without one, under no
+    smaller limit every episode can reach the goal.
     """
     quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
     if quickest is None or cheapest is None or quickest.cost < settings.river_width[0]:
@@ -152,26 +158,26 @@ def is_instance(river_map: RiverMap, settings: InstanceSettings, *, dry_route: b
 
 
 def suggested_limit(river_map: RiverMap) -> float:
-    """The limit d_d that a map is to be learnt under, by the rule that gives 5 on 1a and 1 on 1b.
+    """Return the limit d_d of a map, by a rule that gives 5 on 1a and 1 on 1b.
 
-    Without a dry way, what the cheapest way costs: then it can be taken in every episode, and only it. With
-    one, a fifth of what the quickest way costs: then the optimum goes that way in at most one episode of
+    Without a safe path it is the cost of the cheapest path, which then can be taken in every episode. With
+    one it is a fifth of the cost of the shortest path, which the optimum then takes in at most one episode of
     five.
 
     Raises:
-        MapError: the quickest way is dry, so that no limit changes anything.
+        MapError: the shortest path has no cost, so no limit makes a difference.
     """
     quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
     if quickest is None or cheapest is None or quickest.cost == 0:
-        raise MapError("map: the quickest way leads through no river, so no limit makes a difference")
+        raise MapError("map: the shortest path does not cross the river, so no limit makes a difference")
     return float(cheapest.cost) if cheapest.cost else quickest.cost / LIMIT_PARTS
 
 
 def draw_instance(settings: InstanceSettings) -> RiverMap:
-    """The first attempt that is an instance.
+    """Generate the map of the first attempt that is an instance.
 
     Raises:
-        MapError: nothing fitting was drawn in ``GENERATION_ATTEMPTS`` attempts.
+        MapError: no instance was found in ``GENERATION_ATTEMPTS`` attempts.
     """
     draws = _Draws(settings.map_seed)
     dry_route = bool(draws.below(2)) if settings.dry_route is None else settings.dry_route
@@ -186,13 +192,13 @@ def draw_instance(settings: InstanceSettings) -> RiverMap:
 
 
 class _Draws:
-    """Draws from the raw numbers of PCG64, which are uniform on 0 to 2^64 - 1."""
+    """Random integers from the raw numbers of PCG64, which are uniform on 0 to 2^64 - 1."""
 
     def __init__(self, seed: int) -> None:
         self._bits = np.random.PCG64(seed)
 
     def below(self, number: int) -> int:
-        """One of 0 to ``number`` - 1."""
+        """Draw one of 0 to ``number`` - 1."""
         return int(self._bits.random_raw()) * number >> 64
 
     def happens(self, probability: float) -> bool:
@@ -200,10 +206,10 @@ class _Draws:
 
 
 def _attempt(draws: _Draws, settings: InstanceSettings, dry_route: bool) -> RiverMap | None:
-    """One map as the module describes it; None where a bank has no room for a start or a goal."""
+    """Draw one map by the module's rules; None if a bank has no room for a start or a goal."""
     across, along = settings.width - 2, settings.height - 2
     eastward = draws.below(2) == 1
-    if eastward:  # drawn as if it ran south, then mirrored
+    if eastward:  # drawn as running south, then reflected
         across, along = along, across
     course = _course(draws, across, along, settings.river_width)
     ford = draws.below(along) if dry_route else None
@@ -228,7 +234,7 @@ def _attempt(draws: _Draws, settings: InstanceSettings, dry_route: bool) -> Rive
 
 
 def _course(draws: _Draws, across: int, along: int, river_width: tuple[int, int]) -> list[tuple[int, int]]:
-    """The river's first tile and width in each row; a dry tile at least stays on either side."""
+    """Draw the river's first tile and width in each row; at least one dry tile remains on either side."""
     least, largest = river_width
     width = least + draws.below(largest - least + 1)
     first = 1 + draws.below(across - 1 - width)
@@ -241,5 +247,5 @@ def _course(draws: _Draws, across: int, along: int, river_width: tuple[int, int]
 
 
 def _dry(tiles: Tiles, columns: list[range]) -> list[tuple[int, int]]:
-    """The dry cells (x, y) among each row's columns, row by row."""
+    """Return the dry cells (x, y) among each row's columns, row by row."""
     return [(x, y) for y, row in enumerate(columns) for x in row if tiles[y][x] == DRY]

@@ -1,9 +1,9 @@
-"""Which limit to learn a generated RiverGrid instance under: map, J*(d) and d_d, as lines for a grid file.
+"""Print generated RiverGrid instances as lines for a grid file: map, J*(d) and limit d_d.
 
     python -m recrl.environments.rivergrid.limits 0 1 2
     python -m recrl.environments.rivergrid.limits 7 --options '{"width": 12, "river_width": [1, 3]}'
 
-What is printed can be pasted below ``tasks:``; the rule for the limit is ``river_instances.suggested_limit``.
+Paste the output below ``tasks:``. The limit is that of ``instances.suggested_limit``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ TASK = "rivergrid-generated"
 
 
 def grid_entry(options: Mapping[str, Any]) -> str:
-    """One entry for ``tasks:`` in a grid file, the map and its optimum above it as a comment.
+    """Return an entry for ``tasks:`` in a grid file, with the map and its optimum in a comment above it.
 
     Args:
         options: of ``rivergrid-generated``, with the river as the only cost.
@@ -36,8 +36,8 @@ def grid_entry(options: Mapping[str, Any]) -> str:
         for value in sorted({*range(quickest.cost + 1), limit})
     }
     comments = [
-        f"Map {seed}: the quickest way takes {_words(quickest)}, "
-        f"{'the dry way' if cheapest.cost == 0 else 'the cheapest'} {_words(cheapest)}.",
+        f"Map {seed}: the shortest path takes {_words(quickest)}, "
+        f"{'the safe path' if cheapest.cost == 0 else 'the cheapest'} {_words(cheapest)}.",
         *str(river_map).split("\n"),
         ", ".join(f"J*({value:g}) = {optimum:.2f}" for value, optimum in optima.items()),
     ]

@@ -1,12 +1,12 @@
-"""Maps of RiverGrid as drawings: the paper's two, a reader for a user's own, a generator of random ones.
+"""Maps of RiverGrid as text: the paper's two, a parser, and a generator of random ones.
 
 A map is a rectangle of characters, enclosed by walls:
 
     ``#`` wall, ``.`` dry ground, ``~`` river, ``%`` mud, ``G`` goal (at least one),
-    ``>`` ``v`` ``<`` ``^`` the start (exactly one, on dry ground), heading east, south, west or north.
+    ``>`` ``v`` ``<`` ``^`` the start and its heading (exactly one, on dry ground).
 
-Cells are addressed (x, y) with x the column and y the row, both from 0 at the top left; error messages count
-lines and columns from 1, as an editor does.
+A cell is (x, y), the column and the row, both from 0 at the top left. Error messages count lines and columns
+from 1, like an editor.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from pydantic import BaseModel, ConfigDict, Field
 Cell = tuple[int, int]
 
 WALL, DRY, RIVER, MUD, GOAL = "#", ".", "~", "%", "G"
-GROUND = DRY + RIVER + MUD  # what can be crossed
+GROUND = DRY + RIVER + MUD  # tiles that can be entered
 STARTS = ">v<^"  # in the order of MiniGrid's headings: 0 east, 1 south, 2 west, 3 north
 TILES = WALL + GROUND + GOAL + STARTS
-STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # forward, by heading; y grows downwards
+STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # step forward by heading; y grows downwards
 
 GENERATION_ATTEMPTS = 2_000
 
-# The paper's figure 1: it is crossed at a cost of 5 (1a), or also walked round at a cost of 0 (1b).
+# The paper's figure 1: the river is crossed at a cost of 5 (1a), or also bypassed at a cost of 0 (1b).
 MAPS = {
     "1a": """
         #########
@@ -65,7 +65,7 @@ class RiverMap:
     """A valid map.
 
     Attributes:
-        rows: the drawing, top row first; all of one length.
+        rows: the characters, top row first; all of one length.
     """
 
     rows: tuple[str, ...]
@@ -94,18 +94,18 @@ class RiverMap:
         return STARTS.index(self.tile(self.start))
 
     def tile(self, cell: Cell) -> str:
-        """The character drawn at (x, y)."""
+        """Return the character at (x, y)."""
         return self.rows[cell[1]][cell[0]]
 
     def cells(self, tiles: str) -> tuple[Cell, ...]:
-        """All cells whose character is one of ``tiles``, row by row."""
+        """Return all cells whose character is in ``tiles``, row by row."""
         return tuple((x, y) for y, row in enumerate(self.rows) for x, tile in enumerate(row) if tile in tiles)
 
     def shortest_route(self, *, through: str) -> int | None:
-        """The fewest steps, turns counted, from the start to a goal; None if there is no way.
+        """Return the fewest steps from the start to a goal, turns included; None if there is no path.
 
         Args:
-            through: tiles that may be crossed; start and goals always may.
+            through: tiles that may be entered; start and goals always may.
         """
         crossable = {self.start, *self.cells(through + GOAL)}
         seen = {(*self.start, self.heading)}
@@ -131,11 +131,11 @@ class RiverMap:
 
 
 def parse_map(text: str, *, source: str = "map") -> RiverMap:
-    """The map that ``text`` draws; a common indentation and empty lines around it are ignored.
+    """Parse a map; a common indentation and empty lines around it are ignored.
 
     Args:
-        text: the drawing, one line a row.
-        source: what to call it in an error, for example a file's name.
+        text: the map, one line a row.
+        source: its name in errors, for example a file's name.
 
     Raises:
         MapError: it is not a map; the message names the first offending line and column.
@@ -151,7 +151,7 @@ def parse_map(text: str, *, source: str = "map") -> RiverMap:
 
 
 def read_map(path: Path) -> RiverMap:
-    """The map drawn in a text file.
+    """Read a map from a text file.
 
     Raises:
         MapError: the file cannot be read or is not a map.
@@ -189,7 +189,7 @@ def _check_drawing(rows: tuple[str, ...], source: str, first_line: int) -> None:
 
 
 class MapGenerator(BaseModel):
-    """What a random map is drawn from: every tile independently, until the map is as wanted."""
+    """Settings of a random map: every tile is drawn independently, until the map meets the conditions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -204,17 +204,18 @@ class MapGenerator(BaseModel):
     )
     dry_route: bool | None = Field(
         default=None,
-        description="Whether a way round the river must (true), must not (false) or may (null) exist (ours).",
+        description="Whether a path around the river must (true), must not (false) or may (null) "
+        "exist (ours).",
     )
 
 
 def generate_map(settings: MapGenerator) -> RiverMap:
-    """A random map that can be solved, and most quickly through the river: so the constraint matters.
+    """Generate a random solvable map whose shortest path leads through the river, so the constraint matters.
 
     Start, heading and goal are drawn uniformly.
 
     Raises:
-        MapError: nothing fitting was drawn in ``GENERATION_ATTEMPTS`` attempts.
+        MapError: no such map was found in ``GENERATION_ATTEMPTS`` attempts.
     """
     generator = np.random.default_rng(settings.seed)
     shares = [settings.wall_share, settings.river_share, 1.0 - settings.wall_share - settings.river_share]
@@ -243,7 +244,7 @@ def generate_map(settings: MapGenerator) -> RiverMap:
 
 
 def enclosed(rows: Iterable[str]) -> RiverMap:
-    """The map of the inner tiles with a border of wall around them; nothing is checked."""
+    """Return the map of the inner tiles with a border of wall around them, without any check."""
     inner = [WALL + row + WALL for row in rows]
     border = WALL * len(inner[0])
     return RiverMap((border, *inner, border))

@@ -1,7 +1,7 @@
 """RiverGrid on MiniGrid, for Gymnasium; ``recrl.environments.rivergrid.grid_world`` defines the CMDP.
 
-It is for people: to look at, to wrap, to compare with. Training uses ``RiverGridVectorEnv``, which a test
-holds equal to this one, step for step.
+It is for rendering, wrapping and comparison. Training uses ``RiverGridVectorEnv``; a test compares the two
+step by step.
 
 Its names are ``recrl/RiverGrid-1a-v0``, ``recrl/RiverGrid-1b-v0`` and, with the keyword ``drawing`` for a map
 of your own, ``recrl/RiverGrid-v0``:
@@ -48,12 +48,12 @@ OBJECTS: dict[str, Callable[[], WorldObj]] = {
 
 
 def mission() -> str:
-    """What MiniGrid shows below the grid; a named function, because MiniGrid pickles it."""
+    """Return MiniGrid's mission text; a named function, because MiniGrid pickles it."""
     return "reach the goal, mind the river"
 
 
 def river_minigrid(river_map: RiverMap) -> Grid:
-    """The map as MiniGrid's objects."""
+    """Return the map as MiniGrid's objects."""
     grid = Grid(river_map.width, river_map.height)
     for x in range(river_map.width):
         for y in range(river_map.height):
@@ -65,19 +65,19 @@ def river_minigrid(river_map: RiverMap) -> Grid:
 def render_frame(
     river_map: RiverMap, cell: Cell, heading: int, *, tile_pixels: int = TILE_PIXELS
 ) -> npt.NDArray[np.uint8]:
-    """A picture of the map with the agent in ``cell``, uint8 [height tile_pixels, width tile_pixels, 3]."""
+    """Render the map with the agent in ``cell``, uint8 [height tile_pixels, width tile_pixels, 3]."""
     frame: npt.NDArray[np.uint8] = river_minigrid(river_map).render(tile_pixels, cell, heading)
     return frame
 
 
 class RiverGridEnv(MiniGridEnv):
-    """One RiverGrid.
+    """One RiverGrid environment.
 
     Args:
         drawing: the map, see ``recrl.environments.rivergrid.maps``.
         max_steps: H, steps after which an episode is truncated.
         costs: the cost functions, in order.
-        observation: what is seen, ``factored`` or ``joint``.
+        observation: ``factored`` or ``joint``.
         **minigrid: MiniGrid's own, such as ``render_mode``.
     """
 
@@ -112,7 +112,7 @@ class RiverGridEnv(MiniGridEnv):
         return observation, reward, terminated, truncated and not terminated, {"cost": self._costs(action)}
 
     def gen_obs(self) -> npt.NDArray[np.float32]:
-        """What is seen from where the agent is, a new array."""
+        """Return the current observation, a new array."""
         x, y = self.agent_pos
         seen: npt.NDArray[np.float32] = self._observations[
             state_index(self.river_map, int(x), int(y), int(self.agent_dir))
@@ -130,7 +130,7 @@ class RiverGridEnv(MiniGridEnv):
 
 
 def draw_river_grid(name: str, options: RiverGridOptions) -> RiverGridEnv:
-    """A RiverGrid task that draws itself, for the registry of tasks."""
+    """Make a rendering RiverGrid environment, for the registry of tasks."""
     return RiverGridEnv(
         str(task_map(name, options)),
         max_steps=options.horizon,

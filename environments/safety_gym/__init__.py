@@ -1,1 +1,1 @@
-"""Safety Gym's tasks: what they are, their MuJoCo model, one environment and a batch of them."""
+"""Safety Gym's tasks: their definitions, their MuJoCo model, one environment and a batch."""

@@ -1,12 +1,12 @@
 """Safety Gym's tasks: B environments of one task, stepped together.
 
-Observation: float32, the parts sorted by name (``SafetyTask.components``): the robot's sensors, and 16 bins
-    of pseudo-lidar for every kind of object that can be seen. CarGoal2 has 72 numbers.
+Observation: float32, the parts sorted by name (``SafetyTask.components``): the robot's sensors, and 16
+pseudo-lidar bins for every kind of visible object. CarGoal2 has 72 numbers.
 Action: two numbers in [-1, 1]; Car: the motors of the left and right wheel; Point: force forwards, turning
     speed.
-Reward: metres by which the robot came nearer to the goal in this step; in Push, by which it came nearer to
-    the box, plus those by which the box came nearer to the goal. Clipped to +-10. Plus 1 when the goal is
-    reached, after which there is a new goal.
+Reward: decrease in this step of the distance from the robot to the goal, in metres. In Push: decrease of the
+distance to the box, plus decrease of the distance from the box to the goal. Clipped to +-10. Plus 1 when the
+goal is reached; then there is a new goal.
 Cost: the indicator of each term of ``SafetyTask.cost_terms``: the robot is over a hazard; touches a vase,
     pillar, gremlin or wrong button; a vase moves.
 Termination: when there is no room for a new goal, or when the physics breaks down (reward -10). Truncated
@@ -27,8 +27,8 @@ import numpy.typing as npt
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.native.environment_step import (
+    ENVIRONMENT,
     NOT_YET,
-    WORLD,
     acceptable,
     perceive,
     review,
@@ -46,7 +46,7 @@ _NOBODY = np.zeros(0, np.intp)
 
 
 class Outcome(NamedTuple):
-    """What one step brought.
+    """Result of one step.
 
     Attributes:
         rewards: [B].
@@ -55,7 +55,7 @@ class Outcome(NamedTuple):
         goal_met: [B].
         terminated: [B].
         truncated: [B].
-        broken: the physics broke down in this step, [B]; None if it did so nowhere.
+        broken: whether the physics diverged in this step, [B]; None if it did in no environment.
         finished: environments whose episode is over.
     """
 
@@ -88,18 +88,18 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         qpos, qvel: coordinates and velocities, live views, [B, ...].
         group: for each kind of object that the lidar sees, its slice of P.
 
-    The rest are live views of the records. After writing there call ``refresh``, and before it, if
-    ``qpos`` or ``qvel`` were written, ``simulations.forward``.
-        points: (x, y) of everything that the lidar sees, metres, [B, P, 2]; ``group`` tells which is which.
+    The rest are live views of the records. After writing to them call ``refresh``. After writing to ``qpos``
+    or ``qvel`` call ``simulations.forward`` first.
+        points: (x, y) of everything that the lidar sees, metres, [B, P, 2], in the order of ``group``.
         steps: taken in this episode, [B].
-        distances: those that the reward compares with, metres, [B, 1 or 2].
-        measured: the same as they are now. Goal and Button: from the robot to the goal, seen from above.
-            Push: from the robot to the box and from the box to the goal, in space.
+        distances: distances before the step, for the reward, metres, [B, 1 or 2].
+        measured: the same distances now. Goal and Button: from the robot to the goal, horizontally. Push:
+        from the robot to the box and from the box to the goal, in three dimensions.
         terms: the indicator of each cost term, [B, terms].
         goal_met: whether the goal is reached, [B].
         goal_button: index of the button to press, [B].
-        button_timer: steps until buttons are seen and felt again, [B].
-        circles: middles of the gremlins' circles, metres, [B, gremlins, 2].
+        button_timer: steps until buttons are visible and active again, [B].
+        circles: centres of the gremlins' circles, metres, [B, gremlins, 2].
         gremlin_yaws: radians, [B, gremlins].
         embodied: the gremlin that is a body, or a negative number, [B].
         acceleration: the robot's, in the world's frame, m/s^2, [B, 3].
@@ -138,7 +138,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         self._renew_goals(ids)
 
     def set_actions(self, actions: npt.NDArray[Any]) -> bool:
-        """Take the actions of the next step; False if an action, [B, 2], is no number within [-1, 1]."""
+        """Set the actions of the next step, [B, 2]; return False if one is not a number within [-1, 1]."""
         self._action[...] = actions
         return acceptable(self._address)
 
@@ -166,15 +166,15 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         return Outcome(rewards, costs, terms, goal_met, terminated, truncated, failed, finished)
 
     def observations(self) -> Observations:
-        """What the robots perceived last, [B, size]."""
+        """The last observations, [B, size]."""
         return self._memory.observations.copy()
 
     def refresh(self, ids: npt.NDArray[np.intp] | None = None) -> None:
-        """Find everything in some environments, or all, as the simulations and the records have it now."""
+        """Recompute distances, costs and observations of some environments, or all."""
         self.simulations.apply(review, self._address, ids)
 
     def perceive(self) -> None:
-        """Observe everything as the simulations and the records have it now."""
+        """Recompute the observations from the simulations and the records."""
         self.simulations.apply(perceive, self._address)
 
     def pressed(self) -> Booleans:
@@ -182,22 +182,22 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         return self.touching[:, self.scene.touchable["buttons"]].copy()
 
     def _own_state(self) -> dict[str, Any]:
-        """Physics, layout, goals and counters."""
+        """State of physics, layout, goals and counters."""
         return {
             "physics": self.simulations.save(),
-            "worlds": {name: self._memory.worlds[name].copy() for name in WORLD.names or ()},
+            "worlds": {name: self._memory.environments[name].copy() for name in ENVIRONMENT.names or ()},
             "observations": self.observations(),
         }
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
         self.simulations.load(state["physics"])
-        for name in WORLD.names or ():
-            self._memory.worlds[name] = state["worlds"][name]
+        for name in ENVIRONMENT.names or ():
+            self._memory.environments[name] = state["worlds"][name]
         self._memory.observations[...] = state["observations"]
 
     def _view_records(self) -> None:
-        """Name the parts of the environments' records, without the room that this task does not need."""
-        records, task = self._memory.worlds, self.task
+        """Name the parts of the environments' records, cut to the sizes of this task."""
+        records, task = self._memory.environments, self.task
         self._action: Floats = records["action"]
         self.points: Floats = records["points"][:, : max(places.stop for places in self.group.values())]
         distances = 2 if task.goal == "Push" else 1
@@ -215,7 +215,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         self.touching: Booleans = records["touching"].view(np.bool_)[:, : self.scene.model.nbody]
 
     def _put_down(self, index: int, layout: dict[str, Floats]) -> None:
-        """Write one environment's layout into its simulation, everything turned at random."""
+        """Write one environment's layout into its simulation, with random orientations."""
         task, scene, generator = self.task, self.scene, self.generators[index]
         yaw = generator.uniform(0.0, 2.0 * np.pi)
         if task.robot == "Car":
@@ -238,7 +238,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         self.gremlin_yaws[index] = generator.uniform(0.0, 2.0 * np.pi, task.gremlins.number)
 
     def _renew_goals(self, ids: npt.NDArray[np.intp]) -> Booleans:
-        """Choose new goals in some environments; False where there is no room for one."""
+        """Sample new goals in some environments; return False if there is no room for one."""
         found = np.array([self._renew_goal(index) for index in ids])
         self.refresh(ids)
         self.distances[ids] = self.measured[ids]

@@ -4,11 +4,11 @@
     environment = gymnasium.make("recrl.environments.registration:recrl/CarGoal2-v0")
     environments = gymnasium.make_vec("recrl.environments.registration:recrl/CarGoal2-v0", num_envs=16)
 
-The eighteen tasks are ``recrl/CarGoal0-v0`` to ``recrl/PointPush2-v0``. What is observed, done, earned and
-paid: ``recrl.environments.safety_gym.batch``.
+The eighteen tasks are ``recrl/CarGoal0-v0`` to ``recrl/PointPush2-v0``. Observations, actions, rewards and
+costs: see ``recrl.environments.safety_gym.batch``.
 
 ``info`` of a step holds ``cost`` (the k costs), the indicator of every cost term (``cost_hazards``,
-``cost_vases_contact``, ...), ``goal_met``, and ``cost_exception`` if the physics broke down.
+``cost_vases_contact``, ...), ``goal_met``, and ``cost_exception`` if the physics diverged.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class SafetyGymOptions(BaseModel):
     )
     out_of_range: Literal["error", "clip"] = Field(
         default="error",
-        description="Refuse actions outside [-1, 1], or clip them as Safety Gym does; agents clip theirs.",
+        description="Raise an error for actions outside [-1, 1], or clip them as Safety Gym does; "
+        "agents clip theirs.",
     )
     num_threads: int = Field(
         default=1, ge=1, le=256, description="Threads for the physics (ours); results do not depend on it."
@@ -53,7 +54,7 @@ def cost_names(task: SafetyTask, options: SafetyGymOptions) -> tuple[str, ...]:
     """The names of the k costs.
 
     Raises:
-        ValueError: one cost per term is wanted of a task in which nothing costs.
+        ValueError: one cost per term is requested of a task without cost terms.
     """
     if options.cost == "indicator":
         return ("cost",)
@@ -71,7 +72,7 @@ def _find(task: str) -> SafetyTask:
 
 
 def observation_components(task: SafetyTask) -> tuple[ObservationComponent, ...]:
-    """The parts of a task's observation: the robot's sensors, and a lidar for each kind of object."""
+    """Return the parts of a task's observation: the robot's sensors, and a lidar for each kind of object."""
     return tuple(
         ObservationComponent(name, size, LIDAR_RANGE if name.endswith("_lidar") else None)
         for name, size in task.components
@@ -94,12 +95,12 @@ def _renderer(batch: SafetyGymBatch) -> Renderer:
 
 
 def frames_per_second(task: SafetyTask) -> int:
-    """Environment steps in a second of the task's time: 25 for the Car, 50 for the Point."""
+    """Environment steps per second of simulated time: 25 for the Car, 50 for the Point."""
     return round(1.0 / (task.timestep * SUBSTEPS))
 
 
 def _made(task: str, number: int, options: SafetyGymOptions) -> tuple[Description, SafetyGymBatch]:
-    """A task's description and environments; only this waits for MuJoCo and Numba."""
+    """Description and batch of a task; only this function imports MuJoCo and Numba."""
     from recrl.environments.safety_gym.batch import SafetyGymBatch  # noqa: PLC0415
 
     found = _find(task)
@@ -155,10 +156,10 @@ class SafetyGymEnv(MujocoEnv):
 
 
 def make_safety_gym(name: str, num_envs: int, options: SafetyGymOptions) -> SafetyGymVectorEnv:
-    """B environments of a task by its name, for the registry of tasks."""
+    """Make B environments of a task by its name, for the registry of tasks."""
     return SafetyGymVectorEnv(name, num_envs, **options.model_dump())
 
 
 def draw_safety_gym(name: str, options: SafetyGymOptions) -> SafetyGymEnv:
-    """A task that draws itself, by its name, for the registry of tasks."""
+    """Make a rendering environment of a task by its name, for the registry of tasks."""
     return SafetyGymEnv(name, render_mode="rgb_array", **options.model_dump())

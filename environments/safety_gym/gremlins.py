@@ -1,18 +1,18 @@
-"""Gremlins: boxes that are led around small circles, of which only the one near the robot is a body.
+"""Gremlins: boxes that move on small circles; only the one near the robot is simulated as a body.
 
-Each gremlin is welded, softly, to a point that runs around a circle of radius 0.35 m, once in 2 pi seconds,
-all in phase. Undisturbed, all of them move alike: f(t) from the middle of the circle. The circles keep
-apart, so that the robot meets one gremlin at a time. The gremlin that the robot may meet next is a body; the
-others follow f(t). The body becomes another gremlin when that one is nearer, or none when none is near, once
-nothing touches it and it is back on its course. While it is none it hovers, untied, where nothing is.
+Each gremlin is softly welded to a point on a circle of radius 0.35 m, with a period of 2 pi seconds, all in
+phase. An undisturbed gremlin moves along f(t), relative to the centre of its circle. The circles keep apart,
+so that the robot meets one gremlin at a time. The gremlin that the robot may meet next is a body; the others
+follow f(t). The body becomes another gremlin when that one is nearer, or none when none is near. Before, it
+must be untouched and back on f(t). While it is none, it hovers untied at a place without objects.
 
-This halves the cost of a step, and robots cannot tell: over encounters of 120 steps the robot ends within
-1e-15 m of where it ends among six bodies.
+This halves the computing time of a step and does not affect the robot. Over encounters of 120 steps it ends
+within 1e-15 m of its place among six bodies.
 
 Notation: B environments, G gremlins.
 
-Source: openai/safety-gym ``engine.py``, ``set_mocaps``. Its gremlins hover at 0.2 m and set out from their
-circle's middle at 0.1 m: kept.
+Source: openai/safety-gym ``engine.py``, ``set_mocaps``. Its gremlins hover at 0.2 m and start at their
+circle's centre at 0.1 m: so do ours.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from recrl.environments.safety_gym.scene import gremlin_xml
 from recrl.environments.safety_gym.tasks import GREMLIN_HEIGHT, GREMLIN_TRAVEL, HORIZON, SUBSTEPS, SafetyTask
 
 ON_COURSE = 0.005
-"""How near f(t) the body must be, metres, before it may become another gremlin."""
+"""Distance to f(t), metres, within which the body may become another gremlin."""
 ALERT = 0.1
-"""A gremlin becomes a body when it is less than this, metres, from where the robot could touch it: in one
-environment step the two come nearer by two thirds of this at most."""
+"""A gremlin becomes a body within this distance, metres, from where the robot could touch it. In one
+environment step they approach each other by at most two thirds of it.
+"""
 IDLE_PLACE = (0.0, 0.0, 20.0)
-"""Where the body hovers while it is no gremlin, metres."""
+"""Place of the body while it represents no gremlin, metres."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """f(t): how an undisturbed gremlin moves about the middle of its circle.
+    """f(t): motion of an undisturbed gremlin relative to the centre of its circle.
 
     Attributes:
         positions: offset after each step of an episode, metres, [HORIZON + 1, 3]; the height is absolute.
@@ -50,14 +51,14 @@ class Course:
 
 
 def leads(timestep: float, first_substep: Floats) -> Floats:
-    """Where gremlins are led in each physics step of an environment step: 0.35 (sin t, cos t) at 0.2 m.
+    """Return the target of gremlins in each physics step: 0.35 (sin t, cos t) at a height of 0.2 m.
 
     Args:
         timestep: seconds in one physics step.
         first_substep: physics steps since the episode began, [B].
 
     Returns:
-        offsets from the middle of the circle, metres, [B, SUBSTEPS, 3]; the height is absolute.
+        offsets from the centre of the circle, metres, [B, SUBSTEPS, 3]; the height is absolute.
     """
     time = timestep * (first_substep[:, None] + np.arange(SUBSTEPS))
     return np.stack(
@@ -72,7 +73,7 @@ def leads(timestep: float, first_substep: Floats) -> Floats:
 
 @functools.lru_cache(maxsize=4)
 def gremlin_course(task: SafetyTask) -> Course:
-    """f(t) for one episode, found by simulating one gremlin alone."""
+    """Compute f(t) for one episode by simulating one gremlin alone."""
     model = mujoco.MjModel.from_xml_string(gremlin_xml(task))
     data = mujoco.MjData(model)
     data.qpos[2] = task.gremlins.size

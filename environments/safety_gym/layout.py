@@ -1,8 +1,8 @@
-"""Where a Safety Gym episode begins: objects thrown down at random, none within another's keepout.
+"""Random initial layouts of Safety Gym: no object lies within another's keepout.
 
-Objects are placed one after the other: robot, goal, box, buttons, hazards, vases, pillars, gremlins. Each
-is drawn uniformly from the square, shrunk by its own keepout, until it is at least the sum of the two
-keepouts away from all placed before; after 100 draws the whole layout is begun anew.
+Objects are placed one after the other: robot, goal, box, buttons, hazards, vases, pillars, gremlins. Each is
+drawn uniformly from the square, shrunk by its own keepout. The draw is repeated until the distance to all
+placed objects is at least the sum of the keepouts. After 100 draws the layout starts anew.
 
 Source: openai/safety-gym ``engine.py``, ``sample_layout`` and ``sample_goal_position``.
 """
@@ -16,14 +16,14 @@ from recrl.environments.safety_gym.tasks import ROBOT_KEEPOUT, SafetyTask
 from recrl.environments.simulation.machine_code import compiled_for_arrays
 
 TRIES = 100
-"""Draws for one object before the whole layout is begun anew."""
+"""Draws for one object before the layout starts anew."""
 LAYOUTS = 10_000
-"""Layouts that are begun before giving up."""
+"""Layouts to try before an error."""
 GOAL_TRIES = 10_000
-"""Draws for a new goal within an episode before the episode is ended."""
+"""Draws for a new goal within an episode before the episode ends."""
 
 Layout = dict[str, Floats]
-"""(x, y) of all objects of a kind, metres, [number, 2]; kinds without objects are there, with [0, 2]."""
+"""(x, y) of all objects by kind, metres, [number, 2]; kinds without objects have [0, 2]."""
 
 
 def keepouts(task: SafetyTask) -> dict[str, tuple[int, float]]:
@@ -41,7 +41,7 @@ def keepouts(task: SafetyTask) -> dict[str, tuple[int, float]]:
 
 
 def sample_layout(task: SafetyTask, generator: np.random.Generator) -> Layout:
-    """Draw one layout.
+    """Sample one layout.
 
     Raises:
         RuntimeError: none was found in 10,000 attempts.
@@ -59,7 +59,7 @@ def sample_layout(task: SafetyTask, generator: np.random.Generator) -> Layout:
 def sample_goal(
     task: SafetyTask, others: Floats, other_keepouts: Floats, generator: np.random.Generator
 ) -> Floats | None:
-    """Draw a new goal area that keeps away from where everything is now.
+    """Sample a new goal area away from all other objects.
 
     Args:
         task: gives the square and the goal's keepout.
@@ -96,9 +96,9 @@ def _attempt(extent: float, radii: Floats, generator: np.random.Generator) -> Fl
 
 @compiled_for_arrays
 def _first_free(drawn: Floats, others: Floats, apart: Floats) -> int:
-    """The first of the points drawn, [n, 2], whose squared distance to each other point is large enough.
+    """Return the index of the first drawn point, [n, 2], that is far enough from each other point.
 
-    Where there is none: n.
+    It is n if there is none. Distances are compared as squares.
     """
     for place in range(len(drawn)):
         free = True

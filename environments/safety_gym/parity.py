@@ -1,9 +1,9 @@
-"""Are our environments Safety Gym's? A check against recorded episodes of another implementation.
+"""Compare our environments with recorded episodes of another implementation of Safety Gym.
 
-A recording holds, for every step of an episode, the state of the physics, what was observed, the reward,
-the cost terms and the goal. Here our environments are put into the recorded states. What they then observe,
-earn and pay must be equal but for rounding, or something is defined differently. How physics moves between
-two states is not compared: it is chaotic, and engines differ in the last digits.
+A recording holds, for every step of an episode, the state of the physics, the observation, the reward, the
+cost terms and the goal. Here our environments are set to the recorded states. Their observations, rewards and
+costs must be equal up to rounding. Transitions are not compared: they are chaotic, and engines differ in the
+last digits.
 
 The recordings' format is described in ``tests/parity/README.md``.
 
@@ -28,21 +28,21 @@ from recrl.environments.safety_gym.tasks import SAFETY_TASKS, SafetyTask
 CHUNK = 128
 TOLERANCE = 1e-5
 _COMPONENTS = {"push_box_lidar": "box_lidar"}
-"""The recordings' names for parts of an observation, where they are not Safety Gym's."""
+"""The recordings' names for parts of an observation, if they differ from Safety Gym's."""
 Integers = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far our environments are from one recorded episode.
+    """Differences between our environments and one recorded episode.
 
     Attributes:
         task: the task's name.
-        policy: who acted.
-        states: compared, T + 1.
+        policy: the recorded policy's name.
+        states: number of compared states, T + 1.
         observation: greatest difference of any observed number.
         reward: greatest difference of a reward.
-        costs: for each cost term, and ``cost`` for all together: steps in which our indicator differs.
+        costs: for each cost term, and ``cost`` for their maximum: steps in which our indicator differs.
         costly: for the same, steps in which the recording has a cost.
         goals: steps in which we differ on whether the goal was met.
     """
@@ -58,7 +58,7 @@ class Comparison:
 
     @property
     def equal(self) -> bool:
-        """Whether everything agrees within 1e-5, and costs and goals in every step."""
+        """Whether observations and rewards agree within 1e-5, and costs and goals in every step."""
         agrees = self.observation <= TOLERANCE and self.reward <= TOLERANCE
         return agrees and not any(self.costs.values()) and not self.goals
 
@@ -120,7 +120,7 @@ def _put_into(
     at: Integers,
     pursuing: Integers,
 ) -> None:
-    """Put environment b into the state ``at[b]``, with the goal and button timer of ``pursuing[b]``."""
+    """Set environment b to the state ``at[b]``, with the goal and button timer of ``pursuing[b]``."""
     scene, task = batch.scene, batch.task
     batch.simulations.reset(np.arange(batch.number))
     qpos, qvel = _robot_state(task, meta, episode, at)
@@ -153,7 +153,7 @@ def _put_into(
 def _robot_state(
     task: SafetyTask, meta: dict[str, Any], episode: dict[str, Any], at: Integers
 ) -> tuple[Floats, Floats]:
-    """Coordinates and velocities of the robot, [B, ...], in full precision where they were recorded so."""
+    """Coordinates and velocities of the robot, [B, ...], in full precision if they were recorded so."""
     qpos = episode["qpos_robot"][:, at].T.astype(np.float64)
     qvel = episode["qvel_robot"][:, at].T.astype(np.float64)
     if "qpos_robot64" in episode:
@@ -161,7 +161,7 @@ def _robot_state(
         qpos[precise] = episode["qpos_robot64"][:, at[precise] // 5].T
         qvel[precise] = episode["qvel_robot64"][:, at[precise] // 5].T
     if task.robot == "Point":
-        # The recordings' slides run along the axes in which the robot began, ours along the world's.
+        # The recordings' slides are relative to the robot's initial axes, ours to the world frame.
         pose = episode["robot_pose"][:, at].T
         yaw = np.arctan2(pose[:, 6], pose[:, 3])
         qvel = _turned(qvel, yaw - qpos[:, 2])
@@ -228,7 +228,7 @@ def _static_places(meta: dict[str, Any], episode: dict[str, Any], kind: str) -> 
 def _observation_difference(
     task: SafetyTask, meta: dict[str, Any], episode: dict[str, Any], ours: npt.NDArray[np.float32]
 ) -> float:
-    """Greatest difference, part by part: the recordings have them in another order."""
+    """Return the greatest difference, part by part: the recordings have them in another order."""
     every = meta["obs_every"]
     recorded, start, greatest = episode["obs"].T, 0, 0.0
     for name, size in meta["obs_layout"]:

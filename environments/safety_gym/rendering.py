@@ -1,7 +1,7 @@
-"""Pictures of the Safety Gym tasks, drawn off-screen: robot, objects, goals, hazards and lidar.
+"""Off-screen rendering of the Safety Gym tasks: robot, objects, goals, hazards and lidar.
 
-Goals and hazards are no part of the physics' model; they are added to the picture, and so are the lidar's
-readings: one ring of 16 spheres above the robot for each kind of object, brighter where something is near.
+Goals, hazards and the lidar's readings are no part of the physics' model; they are added to the frame. The
+lidar is one ring of 16 spheres above the robot for each kind of object, brighter where something is near.
 
 Source of colours and places of the spheres: openai/safety-gym ``engine.py``.
 """
@@ -33,14 +33,14 @@ COLOURS: dict[str, Colour] = {
     "gremlins": (0.5, 0.0, 1.0),
 }
 SHADE = 0.25
-"""Opacity of goals and hazards, which one can drive through."""
+"""Opacity of goals and hazards, which a robot can drive through."""
 HAZARD_HEIGHT = 0.02
 LIDAR_RADIUS, LIDAR_HEIGHT, LIDAR_RISE, LIDAR_SPHERE = 0.15, 0.5, 0.06, 0.025
 FAINTEST = 0.1
 MAX_GEOMS = 1000
 CAMERA_DISTANCE, CAMERA_ELEVATION, CAMERA_AZIMUTH = 6.5, -50.0, 90.0
 
-# Without a graphics card, smoothed edges and finer spheres are four fifths of the time of a picture.
+# Without a graphics card, smoothed edges and finer spheres take four fifths of the time of a frame.
 _ROOM = """
 <visual>
   <headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5" specular="0 0 0"/>
@@ -57,15 +57,15 @@ _ROOM = """
 
 
 class SafetyRenderer:
-    """Draws single environments of a batch.
+    """Renderer for single environments of a batch.
 
     Args:
-        batch: what is drawn.
-        width: of a picture, pixels, at most 1,920.
-        height: of a picture, pixels, at most 1,080.
+        batch: the environments.
+        width: of a frame, pixels, at most 1,920.
+        height: of a frame, pixels, at most 1,080.
 
     Raises:
-        RenderingUnavailableError: there is neither EGL nor OSMesa, or MUJOCO_GL names one that is missing.
+        RenderingUnavailableError: EGL and OSMesa are missing, or the library in MUJOCO_GL is.
     """
 
     def __init__(self, batch: SafetyGymBatch, width: int = 480, height: int = 360) -> None:
@@ -83,7 +83,7 @@ class SafetyRenderer:
         self._camera.elevation, self._camera.azimuth = CAMERA_ELEVATION, CAMERA_AZIMUTH
 
     def frame(self, index: int) -> Frame:
-        """World ``index`` as it is now, [height, width, 3]."""
+        """Render the present state of environment ``index``, [height, width, 3]."""
         batch = self._batch
         row = batch.simulations.rows[index]
         mujoco.mj_setState(self._model, self._data, row, mujoco.mjtState.mjSTATE_INTEGRATION.value)
@@ -108,7 +108,7 @@ class SafetyRenderer:
         return np.flipud(picture).copy()  # OpenGL counts rows from below
 
     def close(self) -> None:
-        """Free what the graphics driver holds."""
+        """Free the memory of the graphics driver."""
         self._drawing.free()
         self._context.free()
 
@@ -126,7 +126,7 @@ class SafetyRenderer:
                 self._add_cylinder((*place, HAZARD_HEIGHT), task.hazards.size, 0.01, COLOURS["hazards"])
 
     def _add_gremlins(self, index: int) -> None:
-        """The gremlins that are no bodies just now."""
+        """Gremlins that are not simulated as a body at present."""
         batch, task = self._batch, self._batch.task
         if not task.gremlins.number:
             return
@@ -182,7 +182,7 @@ class SafetyRenderer:
 
 
 def _coloured_model(batch: SafetyGymBatch) -> mujoco.MjModel:
-    """The task's model with colours and a floor to look at; its state is that of the plain one."""
+    """The task's model with colours and a visible floor; its state has the layout of the plain model."""
     xml = scene_xml(batch.task).replace("<option", f"{_ROOM}<option", 1)
     model = mujoco.MjModel.from_xml_string(xml.replace('name="floor"', 'name="floor" material="tiled"', 1))
     for geom in range(model.ngeom):

@@ -1,19 +1,19 @@
 """The physics of Safety Gym's tasks as one MuJoCo model per task.
 
-One model serves every episode: a reset moves bodies. Goals and hazards cannot be touched, so they are no part
-of the model; buttons and pillars never move within an episode, and are mocap bodies, because with sleeping on
-MuJoCo computes the poses of static bodies only once.
+One model is used in every episode: a reset moves bodies. Goals and hazards cannot be touched, so they are no
+part of the model. Buttons and pillars do not move within an episode. They are mocap bodies, because with
+sleeping enabled MuJoCo computes positions of static bodies only once.
 
-What makes it fast without changing the tasks' statistics:
+Optimisations that do not change the tasks' statistics:
 
 - Vases and the box may sleep. The tolerance, 5e-5 m/s in each component, is below the speed from which a
   moving vase costs (1e-4 m/s), so sleep never hides a cost.
-- Button: of the gremlins only one at a time is a body, the one near the robot
+- Button: only the gremlin near the robot is a body
 (``recrl.environments.safety_gym.gremlins``).
 - The sensors of the robots are computed from the state
 (``recrl.environments.safety_gym.native.environment_step``).
 
-MuJoCo's newer colliders (``nativeccd``, ``multiccd``) are off: Safety Gym was made with the older ones.
+MuJoCo's newer colliders (``nativeccd``, ``multiccd``) are off: Safety Gym used the older ones.
 
 Source: openai/safety-gym ``world.py`` and its robots; friction, softness and solver are MuJoCo's defaults.
 """
@@ -32,12 +32,13 @@ from recrl.environments.safety_gym.tasks import GREMLIN_HEIGHT, ROBOT_HEIGHT, Sa
 
 SLEEP_TOLERANCE = 5e-5
 VASE_SINK = 4e-5
-"""How far a resting vase sinks into the soft floor, metres."""
+"""Depth by which a resting vase sinks into the soft floor, metres."""
 VASE_DENSITY = GREMLIN_DENSITY = 0.001
 PILLAR_HALF_HEIGHT = 0.5
 PARKED = 4.0
-"""Where things are before they are put somewhere, metres from the robot: MuJoCo goes back there when the
-physics breaks down, and must not find everything in one place."""
+"""Place of objects before they are placed, metres from the robot. MuJoCo returns to it when the physics
+diverges, and objects must not overlap there.
+"""
 
 _CAR = """
 <default>
@@ -109,22 +110,22 @@ _LEAD = '<equality><weld body1="gremlin_lead" body2="gremlin" solref="0.02 1.5"/
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A task's model and where things are in it.
+    """A task's model and the addresses of its objects.
 
     Attributes:
-        task: what the scene is of.
+        task: the task of the scene.
         model: the compiled model; never written to.
         robot_body: the robot's body.
-        robot_qpos, robot_qvel: sizes of the robot's coordinates and velocities, which come first.
+        robot_qpos, robot_qvel: numbers of the robot's coordinates and velocities, which come first.
         vase_qpos, vase_qvel: first address of each vase, [vases].
         box_qpos, gremlin_qpos, gremlin_qvel: first address of the box and of the gremlin that is a body;
             -1 where there is none.
         button_mocap, pillar_mocap: mocap index of each, [buttons] and [pillars].
-        gremlin_mocap: mocap index of what leads the gremlin, or -1.
+        gremlin_mocap: mocap index of the body that leads the gremlin, or -1.
         gremlin_reach: the distance between the robot's and a gremlin's middle, metres, beyond which they
             cannot touch; 0 where there is none.
-        touchable: for each kind of object of which it matters whether the robot touches it, the bodies, which
-            have consecutive numbers.
+        touchable: bodies of each kind of object whose contacts with the robot matter; their numbers are
+            consecutive.
     """
 
     task: SafetyTask
@@ -145,7 +146,7 @@ class Scene:
 
 
 def scene_xml(task: SafetyTask) -> str:
-    """The task's model as MJCF."""
+    """Return the task's model as MJCF."""
     objects = [
         *(_vase(index, task.vases.size) for index in range(task.vases.number)),
         *([_box(task)] if task.box.number else []),
@@ -158,7 +159,7 @@ def scene_xml(task: SafetyTask) -> str:
                 parked=PARKED, height=GREMLIN_HEIGHT, size=task.gremlins.size, density=GREMLIN_DENSITY
             )
         )
-    # Gremlins never rest, and everything else in Button is fixed: nothing could sleep.
+    # Gremlins never rest, and all other objects in Button are fixed: nothing could sleep.
     sleep = "disable" if task.goal == "Button" else "enable"
     robot = _ROBOTS[task.robot].format(height=ROBOT_HEIGHT, objects="".join(objects))
     return f"""
@@ -173,7 +174,7 @@ def scene_xml(task: SafetyTask) -> str:
 
 
 def gremlin_xml(task: SafetyTask) -> str:
-    """One gremlin alone on the floor, as MJCF."""
+    """Return one gremlin alone on the floor, as MJCF."""
     gremlin = _GREMLIN.format(
         parked=0.0, height=GREMLIN_HEIGHT, size=task.gremlins.size, density=GREMLIN_DENSITY
     )
@@ -190,7 +191,7 @@ def gremlin_xml(task: SafetyTask) -> str:
 
 @functools.lru_cache(maxsize=32)
 def make_scene(task: SafetyTask) -> Scene:
-    """The task's compiled scene; the same object every time, and read-only."""
+    """Return the task's compiled scene; always the same object, and read-only."""
     model = mujoco.MjModel.from_xml_string(scene_xml(task))
     vases = [model.body(f"vase{index}") for index in range(task.vases.number)]
     has_gremlin = bool(task.gremlins.number)
@@ -218,14 +219,14 @@ def make_scene(task: SafetyTask) -> Scene:
 
 
 def upright(yaw: npt.ArrayLike) -> Floats:
-    """Quaternions [..., 4] (w, x, y, z) of turns by ``yaw`` [...] radians about the vertical."""
+    """Return quaternions [..., 4] (w, x, y, z) of rotations by ``yaw`` [...] radians about the vertical."""
     half = np.asarray(yaw, np.float64) / 2.0
     zero = np.zeros_like(half)
     return np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
 
 
 def rotation_matrices(quaternions: Floats) -> Floats:
-    """The rotation matrix of each unit quaternion (w, x, y, z): [..., 4] -> [..., 3, 3]."""
+    """Return the rotation matrix of each unit quaternion (w, x, y, z): [..., 4] -> [..., 3, 3]."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     entries = (
         (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -1,7 +1,7 @@
-"""What Safety Gym's tasks are: which objects lie where, what is wanted, what costs, what is seen.
+"""Definitions of Safety Gym's tasks: objects, goals, costs and observations.
 
-Eighteen tasks, ``CarGoal0`` to ``PointPush2``: two robots, three things to do, three levels. The numbers are
-those of Safety Gym's benchmark suite. Lengths are in metres, densities in kg/m^3, times in seconds.
+Eighteen tasks, ``CarGoal0`` to ``PointPush2``: two robots, three goals, three levels. The numbers are those
+of Safety Gym's benchmark suite. Lengths are in metres, densities in kg/m^3, times in seconds.
 
 Source: Ray, Achiam and Amodei, "Benchmarking Safe Exploration in Deep Reinforcement Learning" (2019), and its
 code, openai/safety-gym ``suite.py`` and ``engine.py``.
@@ -18,30 +18,30 @@ Goal = Literal["Goal", "Button", "Push"]
 
 HORIZON = 1000
 SUBSTEPS = 10
-"""Physics steps in one environment step; actions are held."""
+"""Physics steps in one environment step; actions are constant in between."""
 
 LIDAR_BINS = 16
 LIDAR_RANGE = 3.0
 ROBOT_KEEPOUT = 0.4
 ROBOT_HEIGHT = 0.1
 GOAL_HEIGHT = 0.16
-"""Height of the goal area's middle: in Push, distances to it are three-dimensional."""
+"""Height of the goal area's centre: in Push, distances to it are three-dimensional."""
 GRAVITY = 9.81
-"""What an accelerometer at rest reads, m/s^2."""
+"""Reading of an accelerometer at rest, m/s^2."""
 MAGNETIC_FIELD = -0.5
-"""What a magnetometer reads along the world's y axis."""
+"""Reading of a magnetometer along the y axis of the world frame."""
 VASE_SPEED = 1e-4
-"""Slowest speed of a vase that counts as moving, m/s."""
+"""Least speed of a vase that counts as moving, m/s."""
 GREMLIN_TRAVEL = 0.35
 """Radius of the circle on which a gremlin is led."""
 GREMLIN_HEIGHT = 0.2
 """Height at which gremlins hover: twice their half-size."""
 BUTTON_DELAY = 10
-"""Steps for which buttons are hidden and harmless after one was pressed."""
+"""Steps for which buttons are hidden and inactive after one was pressed."""
 EXCEPTION_REWARD = -10.0
-"""Reward of the step in which the physics broke down; it ends the episode."""
+"""Reward of a step in which the physics diverged; it ends the episode."""
 REWARD_BOUND = 10.0
-"""The dense reward is clipped to +- this, before the bonus for reaching a goal."""
+"""Bound of the dense reward, before the bonus for reaching a goal."""
 
 TIMESTEPS: dict[str, float] = {"Car": 0.004, "Point": 0.002}
 ROBOT_SENSORS: dict[str, tuple[tuple[str, int], ...]] = {
@@ -59,10 +59,10 @@ ROBOT_SENSORS: dict[str, tuple[tuple[str, int], ...]] = {
 
 @dataclass(frozen=True)
 class Objects:
-    """Some objects of one kind.
+    """Objects of one kind.
 
     Attributes:
-        number: how many.
+        number: number of objects.
         size: radius, or half the side of a box.
         keepout: radius around each that is kept free of other keepouts when objects are placed.
     """
@@ -74,14 +74,19 @@ class Objects:
 
 @dataclass(frozen=True)
 class SafetyTask:
-    """One task: a robot, what it must reach, and what lies around.
+    """One task: a robot, its goal, and the objects around it.
 
-    Attributes: robot: ``Car`` or ``Point``. goal: ``Goal`` (drive into an area), ``Button`` (touch the
-        right one) or ``Push`` (a box into an area). level: 0 (nothing in the way), 1 or 2. extent: objects
-        are placed in the square [-extent, extent]^2. target: the goal area; none in Button. box: what is
-        pushed; ``number`` is 0 or 1. buttons, hazards, vases, pillars, gremlins: what lies around.
-        cost_terms: what costs, in the order of the separate costs. lidars: what the pseudo-lidar sees, one
-        group of bins each.
+    Attributes:
+        robot: ``Car`` or ``Point``.
+        goal: ``Goal`` (drive into an area), ``Button`` (touch the right one) or ``Push`` (a box into an
+            area).
+        level: 0 (no obstacles), 1 or 2.
+        extent: objects are placed in the square [-extent, extent]^2.
+        target: the goal area; none in Button.
+        box: the object to push; ``number`` is 0 or 1.
+        buttons, hazards, vases, pillars, gremlins: the objects around.
+        cost_terms: the cost terms, in the order of the separate costs.
+        lidars: the kinds of objects that the pseudo-lidar sees, one group of bins each.
     """
 
     robot: Robot
@@ -110,17 +115,17 @@ class SafetyTask:
 
     @property
     def box_density(self) -> float:
-        """Safety Gym makes the Car's box smaller and lighter than the Point's."""
+        """Return the box: Safety Gym makes the Car's smaller and lighter than the Point's."""
         return 0.0005 if self.robot == "Car" else 0.001
 
     @property
     def components(self) -> tuple[tuple[str, int], ...]:
-        """The parts of an observation and their sizes, in its order: sorted by name."""
+        """Parts of an observation and their sizes, in order: sorted by name."""
         lidars = tuple((f"{kind}_lidar", LIDAR_BINS) for kind in self.lidars)
         return tuple(sorted((*ROBOT_SENSORS[self.robot], *lidars)))
 
     def where(self, component: str) -> slice:
-        """The place of one component in an observation."""
+        """Return the slice of one component in an observation."""
         start = 0
         for name, size in self.components:
             if name == component:
@@ -130,7 +135,7 @@ class SafetyTask:
 
     @property
     def observation_size(self) -> int:
-        """Numbers in an observation."""
+        """Size of an observation."""
         return sum(size for _, size in self.components)
 
 

@@ -1,4 +1,4 @@
-"""Check continuous actions, and clip or refuse those outside their bounds."""
+"""Check continuous actions; clip those outside their bounds or raise an error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Actor(Protocol):
     """Environments that take actions."""
 
     def set_actions(self, actions: npt.NDArray[Any]) -> bool:
-        """Take the actions of the next step; False if one is no number within the bounds."""
+        """Set the actions of the next step; return False if one is not a number within the bounds."""
 
 
 def give_actions(
@@ -30,12 +30,12 @@ def give_actions(
         name: the task's, for errors.
         batch: the environments.
         actions: one for each environment, or for the only one.
-        shape: that the actions must have.
+        shape: required shape of the actions.
         bound: actions are within plus or minus this.
-        out_of_range: what happens to others that are finite.
+        out_of_range: treatment of finite actions outside the bounds.
 
     Raises:
-        ValueError: the actions mean nothing; the message says what is wrong with them.
+        ValueError: the actions are invalid; the message says why.
     """
     actions = np.asarray(actions)
     if actions.shape != shape or actions.dtype.kind not in "fiu":

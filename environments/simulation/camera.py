@@ -1,7 +1,7 @@
 """Frames of environments, rendered on demand.
 
-Off-screen drawing goes through EGL or, where that is missing, OSMesa; the environment variable ``MUJOCO_GL``
-may name one of them. Importing this module imports neither.
+Off-screen rendering uses EGL or, if that is missing, OSMesa. The environment variable ``MUJOCO_GL`` may
+select one of them. Importing this module imports neither.
 """
 
 from __future__ import annotations
@@ -19,26 +19,25 @@ Frame = npt.NDArray[np.uint8]
 
 
 class RenderingUnavailableError(RuntimeError):
-    """This machine cannot draw off-screen."""
+    """This machine cannot render off-screen."""
 
 
 class Renderer(Protocol):
-    """Renders single environments of a batch."""
+    """Renderer for single environments of a batch."""
 
     def frame(self, index: int) -> Frame:
-        """Environment ``index`` as it is now, [height, width, 3]."""
+        """Render the present state of environment ``index``, [height, width, 3]."""
 
     def close(self) -> None:
-        """Free what the graphics driver holds."""
+        """Free the memory of the graphics driver."""
 
 
 class Camera:
-    """Renders a batch; copies of an environment get a camera of their own.
+    """Camera of a batch; copies of an environment get a camera of their own.
 
     Args:
         render_mode: None or ``rgb_array``.
-        make_renderer: (batch) -> what renders it, called when the first frame is wanted; a function of a
-            module.
+        make_renderer: (batch) -> its renderer, called for the first frame; a module-level function.
     """
 
     def __init__(self, render_mode: str | None, make_renderer: Callable[[Any], Renderer]) -> None:
@@ -52,29 +51,29 @@ class Camera:
         return Camera, (self.render_mode, self._make_renderer)
 
     def frames(self, batch: Any) -> tuple[Frame, ...]:
-        """One picture [height, width, 3] of each environment."""
+        """Render one frame [height, width, 3] of each environment."""
         if self.render_mode is None:
             raise ValueError(
                 f"{batch.task.name}: to render, make the environment with render_mode='rgb_array'"
             )
         if not batch.generators:
-            raise ValueError(f"{batch.task.name}: call reset before the first picture")
+            raise ValueError(f"{batch.task.name}: call reset before the first frame")
         if self._renderer is None:
             self._renderer = self._make_renderer(batch)
         return tuple(self._renderer.frame(index) for index in range(batch.number))
 
     def close(self) -> None:
-        """Free the graphics driver's memory."""
+        """Free the memory of the graphics driver."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
 
 def make_context(width: int, height: int) -> Any:
-    """An off-screen drawing context, by the first library that is there.
+    """Return an off-screen rendering context of the first available library.
 
     Raises:
-        RenderingUnavailableError: there is neither EGL nor OSMesa, or MUJOCO_GL names one that is missing.
+        RenderingUnavailableError: EGL and OSMesa are missing, or the library in MUJOCO_GL is.
     """
     defaults = {"darwin": ("cgl",), "win32": ("glfw",)}.get(sys.platform, ("egl", "osmesa"))
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
@@ -83,7 +82,7 @@ def make_context(width: int, height: int) -> Any:
         try:
             context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
             context.make_current()
-        except Exception as error:  # each library fails in a way of its own
+        except Exception as error:  # each library fails in its own way
             failures.append(f"{name}: {error}".splitlines()[0])
         else:
             return context

@@ -1,9 +1,8 @@
-"""A digest of all that a compiled function takes from elsewhere: constants, record layouts, helper functions.
+"""A digest of all that a compiled function depends on: constants, record layouts, helper functions.
 
-Numba keeps machine code, and looks only at the file of the compiled function to know whether it is still
-right. But whatever a function takes from its module's global names becomes part of the machine code, and
-those may have been imported: a record layout of another file, a constant, a function that is called.
-``salted`` makes the digest of all that a part of what Numba compares.
+Numba caches machine code and checks only the file of the compiled function. But the values of a function's
+global names become part of the machine code, and some are imported: constants, record layouts, other
+functions. ``salted`` makes their digest part of what Numba compares.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ _NUMBERS = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
 
 def salted(function: Any) -> Any:
-    """The same function to Numba, but that machine code kept for it is found under its digest only.
+    """Return a function that Numba compiles alike, but caches by its digest.
 
-    Numba compares what a function's free variables hold, so the digest becomes one that nobody reads.
+    Numba compares the values of a function's free variables, so the digest becomes an unused one.
     """
     code = function.__code__
     found = types.FunctionType(
@@ -43,10 +42,10 @@ def salted(function: Any) -> Any:
 
 
 def digest(function: Any) -> str:
-    """64 hex digits that change with the function, and with anything that it takes from elsewhere.
+    """Return 64 hex digits that change with the function and with anything that it depends on.
 
     Raises:
-        TypeError: it takes something whose value cannot be told.
+        TypeError: it depends on an object without a stable value.
     """
     found = hashlib.sha256()
     for part in _function(function, set()):
@@ -55,7 +54,7 @@ def digest(function: Any) -> str:
 
 
 def _function(function: Any, seen: set[int]) -> Iterator[str]:
-    """Describe a function, each one once."""
+    """Describe a function; each function once."""
     if id(function) in seen:
         return
     seen.add(id(function))
@@ -66,7 +65,7 @@ def _function(function: Any, seen: set[int]) -> Iterator[str]:
     for cell in function.__closure__ or ():
         yield from _value(cell.cell_contents, function, seen)
     for name in _global_names(function.__code__):
-        if name in function.__globals__:  # else Python's own, such as range
+        if name in function.__globals__:  # otherwise a Python built-in, such as range
             yield name
             yield from _value(function.__globals__[name], function, seen)
 
@@ -83,7 +82,7 @@ def _code(code: types.CodeType) -> Iterator[str]:
 
 
 def _global_names(code: types.CodeType) -> Iterator[str]:
-    """Global names that a function, or one inside it, reads."""
+    """Return the global names that a function or a nested one reads."""
     for instruction in dis.get_instructions(code):
         if instruction.opname in {"LOAD_GLOBAL", "LOAD_NAME"}:
             yield instruction.argval
@@ -93,11 +92,11 @@ def _global_names(code: types.CodeType) -> Iterator[str]:
 
 
 def _value(value: Any, taken_by: Any, seen: set[int]) -> Iterator[str]:
-    """Describe something that a function takes from elsewhere."""
-    inner = inspect.unwrap(value) if callable(value) else value  # of a compiled function, what was compiled
+    """Describe a value that a function depends on."""
+    inner = inspect.unwrap(value) if callable(value) else value  # the Python function of a compiled one
     match inner:
         case types.FunctionType() if inner.__module__.split(".")[0] in {"numba", "numpy"}:
-            # Numba has its own version of it, and compares versions itself.
+            # Numba has its own version of it and compares versions itself.
             yield f"{inner.__module__}.{inner.__qualname__}"
         case types.FunctionType():
             yield from _function(inner, seen)
@@ -128,6 +127,6 @@ def _value(value: Any, taken_by: Any, seen: set[int]) -> Iterator[str]:
 
 
 def _file_digest(module: types.ModuleType) -> str:
-    """Of a module written in Python, whose names the function may use."""
+    """Whether a value belongs to a Python module whose attributes the function may use."""
     path = Path(getattr(module, "__file__", None) or "")
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.suffix == ".py" else ""

@@ -1,4 +1,4 @@
-"""B environments of one MuJoCo task, stepped together: what the families of tasks share.
+"""B environments of one MuJoCo task, stepped together: the common part of all task families.
 
 Notation: B environments.
 """
@@ -19,7 +19,7 @@ Observations = npt.NDArray[np.float32]
 
 
 class Named(Protocol):
-    """A task that has a name."""
+    """A task with a name."""
 
     @property
     def name(self) -> str:
@@ -42,12 +42,12 @@ class Outcome(Protocol):
 
     @property
     def truncated(self) -> Booleans:
-        """Whether each episode was cut at the horizon, [B]."""
+        """Whether each episode was truncated at the horizon, [B]."""
         ...
 
     @property
     def finished(self) -> npt.NDArray[np.intp]:
-        """The environments whose episode is over."""
+        """Environments whose episode is over."""
         ...
 
 
@@ -56,7 +56,7 @@ OutcomeT = TypeVar("OutcomeT", bound=Outcome)
 
 
 class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
-    """B environments of one task. The caller restarts those whose episode is over.
+    """B environments of one task. The caller restarts environments whose episode is over.
 
     Copies are exact, as is pickling.
 
@@ -89,7 +89,7 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
         return _rebuilt, (type(self), self.task, self.number, options, state)
 
     def seed(self, seed: int | None) -> None:
-        """Give each environment a generator; environment i has the same one whatever B is."""
+        """Give each environment a generator; that of environment i does not depend on B."""
         streams = np.random.SeedSequence(seed).spawn(self.number)
         self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
 
@@ -99,7 +99,7 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
 
     @abstractmethod
     def set_actions(self, actions: npt.NDArray[Any]) -> bool:
-        """Take the actions of the next step, [B, m]; False if one is no number within the bounds."""
+        """Set the actions of the next step, [B, m]; return False if one is not a number within the bounds."""
 
     @abstractmethod
     def advance(self) -> OutcomeT:
@@ -107,10 +107,10 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
 
     @abstractmethod
     def observations(self) -> Observations:
-        """What is observed now, [B, n]."""
+        """Return the present observations, [B, n]."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the future depends on, generators included."""
+        """Return everything that the future depends on, generators included."""
         states = [copy.deepcopy(dict(one.bit_generator.state)) for one in self.generators]
         return {**self._own_state(), "generators": states}
 
@@ -118,12 +118,12 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
         """Continue exactly where ``state_dict`` was taken.
 
         Raises:
-            ValueError: the state is of another number of environments.
+            ValueError: the state has another number of environments.
         """
         if len(state["generators"]) != self.number:
             raise ValueError(
-                f"{self.task.name}: the saved state is of {len(state['generators'])} environments, "
-                f"these are {self.number}"
+                f"{self.task.name}: the saved state has {len(state['generators'])} environments, "
+                f"expected {self.number}"
             )
         self._load_own_state(state)
         self.seed(0)
@@ -132,11 +132,11 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
 
     @abstractmethod
     def _own_state(self) -> dict[str, Any]:
-        """What the future depends on beside the generators."""
+        """Return what the future depends on besides the generators."""
 
     @abstractmethod
     def _load_own_state(self, state: dict[str, Any]) -> None:
-        """Take over what ``_own_state`` gave."""
+        """Restore the result of ``_own_state``."""
 
 
 def _rebuilt(

@@ -1,6 +1,6 @@
 """Environments of MuJoCo tasks: one for Gymnasium, and a batch for agents.
 
-A family of tasks gives a ``Description`` and a batch (``EnvironmentBatch``); everything else is here, once.
+A family of tasks provides a ``Description`` and a batch (``EnvironmentBatch``); the rest is here.
 
 Notation: B environments, n observation components, m action components, k costs.
 """
@@ -29,20 +29,20 @@ Batch = EnvironmentBatch[Any, Any]
 
 @dataclass(frozen=True)
 class Description:
-    """What an environment has to know of its task.
+    """Description of a task for its environments.
 
     Attributes:
         name: of the task.
         observed: n.
         action_size: m.
         action_bound: actions are within plus or minus this.
-        out_of_range: what happens to other finite actions.
+        out_of_range: treatment of other finite actions.
         cost_names: of the k costs.
         horizon: steps in an episode, at most.
-        frames_per_second: environment steps in a second of the task's time.
+        frames_per_second: environment steps per second of simulated time.
         components: the parts of an observation, in their order; empty if it is not divided.
-        info: (outcome of a step) -> its ``info``, each value [B, ...].
-        make_renderer: (batch) -> what draws it; a function of a module.
+        info: (result of a step) -> its ``info``, each value [B, ...].
+        make_renderer: (batch) -> its renderer; a module-level function.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Description:
 
     @property
     def spaces(self) -> tuple[Box, Box]:
-        """Of the observations and of the actions of one environment."""
+        """Return the spaces of observations and actions of one environment."""
         bound = self.action_bound
         return (
             Box(-np.inf, np.inf, (self.observed,), np.float32),
@@ -68,14 +68,14 @@ class Description:
 
     @property
     def rendering(self) -> dict[str, Any]:
-        """What Gymnasium's metadata says of rendering."""
+        """Return Gymnasium's metadata of rendering."""
         return {"render_modes": ["rgb_array"], "render_fps": self.frames_per_second}
 
     def act(self, batch: Batch, actions: npt.NDArray[Any], shape: tuple[int, ...]) -> None:
         """Set the actions of the next step.
 
         Raises:
-            ValueError: there was no reset, or the actions mean nothing.
+            ValueError: there was no reset, or the actions are invalid.
         """
         if not batch.generators:
             raise ValueError(f"{self.name}: call reset before the first step")
@@ -151,15 +151,15 @@ class MujocoVectorEnv(CMDPVectorEnv):
         return self.batch.observations()
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
-        """One RGB picture of each environment, [height, width, 3]."""
+        """Render one RGB frame of each environment, [height, width, 3]."""
         return self._camera.frames(self.batch)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free what drawing needed."""
+        """Free the memory of the graphics driver."""
         self._camera.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the future depends on: physics, counters, generators."""
+        """Return everything that the future depends on: physics, counters, generators."""
         if not self.batch.generators:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
         return self.batch.state_dict()
@@ -198,7 +198,7 @@ class MujocoEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; the same seed gives the same episode as the first of a batch."""
+        """Start an episode; it equals the first of a batch with the same seed."""
         super().reset(seed=seed, options=options)
         if seed is not None or not self.batch.generators:
             self.batch.seed(seed)
@@ -218,9 +218,9 @@ class MujocoEnv(gymnasium.Env[Any, Any]):
         )
 
     def render(self) -> npt.NDArray[np.uint8]:
-        """An RGB picture, [height, width, 3]."""
+        """Render an RGB frame, [height, width, 3]."""
         return self._camera.frames(self.batch)[0]
 
     def close(self) -> None:
-        """Free what drawing needed."""
+        """Free the memory of the graphics driver."""
         self._camera.close()

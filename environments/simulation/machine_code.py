@@ -1,12 +1,12 @@
-"""Python functions compiled to machine code, which step MuJoCo's simulations.
+"""Python functions compiled to machine code, for stepping MuJoCo simulations.
 
-Numba compiles them when they are first imported, which takes some seconds, and keeps the result beside their
-file (where nobody may write there: in the user's cache folder, see Numba's NUMBA_CACHE_DIR). It compiles anew
-when that file changes, or anything that the function takes from another one: see
+Numba compiles them at the first import, which takes some seconds, and caches the result beside their file. If
+that folder is not writable, it uses the user's cache folder; see Numba's NUMBA_CACHE_DIR. It compiles anew
+when that file or anything that the function depends on changes: see
 ``recrl.environments.simulation.code_digest``.
 
-Floating-point operations are done as written (no ``fastmath``), so that results are the same to the last bit
-wherever and beside whatever a function runs.
+Floating-point operations are done as written (no ``fastmath``), so that results are equal to the last bit in
+every process and thread.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 @functools.cache
 def mujoco_library() -> Any:
-    """MuJoCo's shared library, where compiled functions find MuJoCo's, too."""
+    """Load MuJoCo's shared library, so that compiled functions find its functions."""
     folder = Path(mujoco.__file__).parent
     found = [path for pattern in ("libmujoco*", "mujoco.dll") for path in sorted(folder.glob(pattern))]
     if not found:
@@ -41,7 +41,7 @@ def mujoco_library() -> Any:
 
 
 mujoco_library()
-# Pointers are addresses: whole numbers of 64 bits, which are passed alike.
+# Pointers are addresses: 64-bit integers, which are passed in the same way.
 _ADDRESS = types.int64
 mj_step: Any = types.ExternalFunction("mj_step", types.void(_ADDRESS, _ADDRESS))
 mj_step2: Any = types.ExternalFunction("mj_step2", types.void(_ADDRESS, _ADDRESS))
@@ -55,31 +55,32 @@ mj_getState: Any = types.ExternalFunction(  # noqa: N816  # MuJoCo's name
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A function that compiled ones may call, and become part of; Python may, too."""
+    """Compile a function for use in compiled functions and in Python."""
     dispatcher: Any = numba.njit(function)
     call: Callable[Parameters, Result] = dispatcher
     return call
 
 
 def compiled_for_batch(function: Callable[[int, int, int, int], None]) -> Any:
-    """A function for ``Simulations.apply``, of (model, data, index of the simulation, argument).
+    """Compile a function for ``Simulations.apply``, of (model, data, index of the simulation, argument).
 
-    ``model`` and ``data`` are addresses, and ``argument`` is what ``apply`` was given.
+    ``model`` and ``data`` are addresses, and ``argument`` is that of ``apply``.
     """
     signature = types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
     return kept(functools.partial(numba.cfunc, signature), function)
 
 
 def compiled_for_arrays(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A function of arrays for Python."""
+    """Compile a function of arrays for Python."""
     call: Callable[Parameters, Result] = kept(numba.njit, function)
     return call
 
 
 def compiled_for_python(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A function of whole numbers, such as addresses, that Python calls often; it returns a bool or nothing.
+    """Compile a function of integers, such as addresses, for frequent calls from Python.
 
-    Numba takes no time to look at the arguments, and other Python threads go on meanwhile.
+    It returns a bool or None. Numba does not inspect the arguments, and other Python threads continue
+    meanwhile.
     """
     result = types.void if get_type_hints(function)["return"] is type(None) else types.boolean
     signature = result(*(types.int64,) * function.__code__.co_argcount)
@@ -88,7 +89,7 @@ def compiled_for_python(function: Callable[Parameters, Result]) -> Callable[Para
 
 
 def array_at(kind: Any) -> Any:
-    """A compiled function (address, size) -> an array of so many numbers or records in memory there."""
+    """Return a compiled function (address, size) -> array of ``size`` numbers or records there."""
     element = numba.from_dtype(np.dtype(kind))
 
     @intrinsic
@@ -107,8 +108,8 @@ def array_at(kind: Any) -> Any:
 
 
 def kept(compiler: Any, function: Any) -> Any:
-    """Compile, and keep the result where one may write."""
+    """Compile a function and cache the result in a writable folder."""
     try:
         return compiler(cache=True)(salted(function))
-    except RuntimeError:  # there is no such place
+    except RuntimeError:  # there is no writable folder
         return compiler()(function)

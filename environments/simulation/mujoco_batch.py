@@ -1,11 +1,11 @@
-"""Many MuJoCo simulations of one model, stepped together, that can be saved and restored exactly.
+"""Many MuJoCo simulations of one model, stepped together, with exact save and restore.
 
-They are one batch of MuJoCo's (``mjbatch.h``, MuJoCo 4) through its C interface, on MuJoCo's own threads.
-MuJoCo's Python class ``mujoco.batch.Batch`` lacks two things: it cannot run a compiled function on each
-simulation, and it offers no way to put sleeping bodies back to sleep, which is no part of a state row. Here
-``load`` does, so that a simulation with sleeping bodies continues to the last bit.
+They are one MuJoCo batch (``mjbatch.h``, MuJoCo 4), used through its C interface, on MuJoCo's own threads.
+MuJoCo's Python class ``mujoco.batch.Batch`` cannot run a compiled function on each simulation. Nor can it put
+sleeping bodies back to sleep, and sleep is no part of a state row. Here ``load`` does, so that a simulation
+with sleeping bodies continues to the last bit.
 
-A batch with several threads cannot follow its process through a fork: the child has none of the threads.
+A batch with several threads cannot be used after a fork: the child process has none of the threads.
 
 Notation: B simulations; n numbers in a state row.
 """
@@ -48,7 +48,7 @@ class _Config(ctypes.Structure):
 
 @functools.cache
 def _library() -> Any:
-    """MuJoCo's shared library, with the types of the functions that are used here."""
+    """Return MuJoCo's shared library, with the types of the functions that are used here."""
     library = mujoco_library()
     pointer, integer = ctypes.c_void_p, ctypes.c_int
     signatures: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -78,7 +78,7 @@ def _library() -> Any:
 
 
 class PhysicsError(RuntimeError):
-    """MuJoCo refused to go on."""
+    """MuJoCo could not continue a simulation."""
 
 
 class _Batch:
@@ -86,7 +86,7 @@ class _Batch:
 
     Attributes:
         address: of the ``mjBatch``.
-        process: which made it.
+        process: id of the process that made it.
     """
 
     def __init__(self, model: mujoco.MjModel, number: int, num_threads: int) -> None:
@@ -100,7 +100,7 @@ class _Batch:
         weakref.finalize(self, _delete, self.address, self.process, num_threads)
 
     def view(self, address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
-        """The batch's memory at an address as an array, which keeps the batch alive."""
+        """Return the batch's memory at an address as an array, which keeps the batch alive."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         memory = (ctypes.c_char * size).from_address(address)
         memory.batch = self
@@ -111,15 +111,15 @@ class Simulations:
     """B simulations of one model.
 
     Args:
-        model: what is simulated; it is copied.
+        model: the simulated model; it is copied.
         number: B.
         num_threads: threads to step on, the caller's included. Results do not depend on it.
 
     Attributes:
         model: as given.
         number: B.
-        rows: MuJoCo's integration states, a live view, [B, n]; writing to a row sets that simulation's
-            state for its next call.
+        rows: MuJoCo's integration states, a live view, [B, n]. Writing to a row sets that simulation's state
+            for its next call.
         stopped: simulations that MuJoCo could not compute since their last reset, [B].
         any_stopped: whether there are any.
     """
@@ -143,7 +143,7 @@ class Simulations:
         self.any_stopped = False
 
     def state(self, component: mujoco.mjtState, shape: tuple[int, ...]) -> Floats:
-        """A part of ``rows`` as a live view, [B, *shape]."""
+        """Return a part of ``rows`` as a live view, [B, *shape]."""
         size, batch = ctypes.c_int(), self._batch.address
         address = self._library.mjb_stateComponent(batch, int(component), ctypes.byref(size))
         start = (address - self._library.mjb_state(batch)) // self.rows.itemsize
@@ -155,12 +155,12 @@ class Simulations:
 
         Args:
             function: from ``machine_code.compiled_for_batch``.
-            argument: an address, which the function is given.
-            ids: which simulations, each once; None for all.
+            argument: an address, passed to the function.
+            ids: the simulations, each once; None for all.
 
         Raises:
             ValueError: there is no such simulation, or one is named twice.
-            PhysicsError: the process is a fork of the one that made the simulations, which had threads.
+            PhysicsError: the simulations use threads, and this process is a fork of their owner.
         """
         self._call(self._library.mjb_apply, ids, function.address, argument, 1)
 
@@ -169,7 +169,7 @@ class Simulations:
 
         Args:
             substeps: physics steps.
-            ids: which simulations; None for all.
+            ids: the simulations; None for all.
         """
         self._call(self._library.mjb_step, ids, substeps, _EVERYTHING)
 
@@ -186,23 +186,23 @@ class Simulations:
     def broken(self) -> npt.NDArray[np.bool_]:
         """Whether a simulation has diverged since its last reset, [B].
 
-        MuJoCo then warns and silently starts again from the model's defaults, or, where it cannot compute a
-        step at all, leaves the simulation where it was.
+        After divergence MuJoCo restarts from the model's defaults. If it cannot compute a step, it leaves the
+        state unchanged.
         """
         return np.asarray(self._warnings[:, BAD_STATES, 1].any(axis=1) | self.stopped)
 
     def any_broken(self) -> bool:
-        """Whether any simulation has diverged since its last reset: cheaper than ``broken``."""
+        """Whether any simulation has diverged since its last reset; cheaper than ``broken``."""
         return self.any_stopped or bool(self._warnings[:, BAD_STATES, 1].any())
 
     def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
-        """A copy of one simulation, for drawing or for any function of MuJoCo; a new one, or ``into``."""
+        """Copy one simulation, for rendering or any function of MuJoCo; into a new object, or ``into``."""
         data = mujoco.MjData(self.model) if into is None else into
         self._library.mjb_getData(self._batch.address, index, data._address)
         return data
 
     def save(self) -> dict[str, Any]:
-        """Everything that the future of these simulations depends on."""
+        """Return everything that the future of these simulations depends on."""
         asleep = [self.data(index, self._data).tree_asleep.copy() for index in range(self.number)]
         return {
             "rows": self.rows.copy(),
@@ -214,8 +214,8 @@ class Simulations:
     def load(self, state: dict[str, Any]) -> None:
         """Continue exactly where ``save`` was called.
 
-        What MuJoCo remembers of a sleeping body follows from its position: it is computed with everything
-        awake, and then those that slept are put back to sleep.
+        MuJoCo's data of a sleeping body follow from its position. They are computed with all bodies awake;
+        then the sleeping ones are put back to sleep.
         """
         rows = np.asarray(state["rows"], np.float64)
         if rows.shape != self.rows.shape:
@@ -239,7 +239,7 @@ class Simulations:
         mujoco.mj_forward(self.model, data)
         data.tree_asleep[:] = asleep
         self._library.mj_updateSleep(self.model._address, data._address)
-        # The forward pass leaves its own guess for the next solution; the row has the one that was saved.
+        # The forward pass leaves its own initial guess for the next solution; the row has the saved guess.
         data.qacc_warmstart[:] = self._warm_start(row)
         return data
 
@@ -250,7 +250,7 @@ class Simulations:
         return warm_start
 
     def _call(self, function: Any, ids: Ids, *arguments: Any) -> None:
-        """Call a function of MuJoCo on simulations, and note which of them it could not compute."""
+        """Call a function of MuJoCo on simulations, and record which of them it could not compute."""
         chosen = None if ids is None else self._chosen(ids)
         failed = True
         try:
@@ -269,11 +269,11 @@ class Simulations:
             raise PhysicsError(f"MuJoCo stopped in simulation {index}: {message}")
 
     def _run(self, function: Any, chosen: Integers | None, *arguments: Any) -> bool:
-        """Call a function of MuJoCo on simulations; whether it could not compute some."""
+        """Call a function of MuJoCo on simulations; return whether it could not compute some."""
         if self._num_threads > 1 and os.getpid() != self._batch.process:
             raise PhysicsError(
-                f"simulations with num_threads = {self._num_threads} stay in the process that made them, and "
-                "this is a fork of it: make them anew here, or with num_threads = 1"
+                f"simulations with num_threads = {self._num_threads} cannot be used in a forked process: "
+                "make them anew here, or with num_threads = 1"
             )
         if chosen is None:
             return bool(function(self._batch.address, None, 0, *arguments))
@@ -285,7 +285,7 @@ class Simulations:
         if ids is None:
             return np.arange(self.number, dtype=np.int32)
         chosen = np.asarray(ids)
-        ordered = np.unique(chosen)  # MuJoCo asks for that
+        ordered = np.unique(chosen)  # required by MuJoCo
         if chosen.size and (
             chosen.dtype.kind not in "iu"
             or ordered[0] < 0
@@ -300,6 +300,6 @@ class Simulations:
 
 
 def _delete(address: int, process: int, num_threads: int) -> None:
-    """Free a batch; what a fork has inherited stays, as MuJoCo would wait for threads that are not there."""
+    """Free a batch, but not in a forked process: MuJoCo would wait for threads that do not exist there."""
     if num_threads == 1 or process == os.getpid():
         _library().mjb_deleteBatch(address)

@@ -1,7 +1,8 @@
-"""Where fields lie in MuJoCo's C structures, from the declarations that come with MuJoCo.
+"""Offsets of fields in MuJoCo's C structures, from the declarations in MuJoCo's Python package.
 
-A pointer to a simulation's ``mjData`` is worth little without them: some fields, contacts among them, can
-else be read only from a copy of the whole structure, which costs as much as a physics step.
+Compiled code has a pointer to a simulation's ``mjData`` and reads fields at these offsets. Otherwise some
+fields, contacts among them, could be read only from a copy of the whole structure. Such a copy takes as long
+as a physics step.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _NUMBERS: dict[str, Any] = {
 
 @functools.cache
 def structure(name: str) -> Any:
-    """The ctypes structure of a MuJoCo structure, for example ``mjContact``.
+    """Return the ctypes structure of a MuJoCo structure, for example ``mjContact``.
 
     >>> structure("mjWarningStat").number.offset
     4

@@ -1,1 +1,1 @@
-"""Safety-Gymnasium's velocity tasks: MuJoCo robots that earn by running and pay for running too fast."""
+"""Safety-Gymnasium's velocity tasks: robots that run, with a cost above a threshold speed."""

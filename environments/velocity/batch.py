@@ -1,21 +1,21 @@
 """Safety-Gymnasium's velocity tasks: B environments of one task, stepped together.
 
-Observation: float32. The robot's coordinates but the first one or two, which say where it is, then its
-    velocities (Hopper, Walker2d: clipped to +-10). Humanoid, too: of each of 14 bodies the inertia (10
-    numbers), the velocity (6), then the actuators' forces on the 23 degrees of freedom, then of each body
-    the contact force (6); Gymnasium's Ant observes no contact forces.
+Observation: float32. The robot's coordinates without its position (the first one or two), then its velocities
+(Hopper, Walker2d: clipped to +-10). Humanoid adds inertia (10 numbers) and velocity (6) of each of 14 bodies,
+actuator forces (23), and each body's contact force (6). Gymnasium's Ant observes no
+contact forces.
 Action: the controls, within [-1, 1]; Humanoid: within [-0.4, 0.4].
-Reward: w_v vx - w_a |a|^2 + what being healthy earns, with the task's weights. vx is the distance along x
+Reward: w_v vx - w_a |a|^2 + the reward for being healthy, with the task's weights. vx is the distance along x
     over the step, divided by its seconds: of the first coordinate; Ant: of the torso; Humanoid: of the
     centre of mass.
 Cost: 1 in a step in which the velocity exceeds the task's threshold, else 0. The velocity is vx; Ant and
     Humanoid: sqrt(vx^2 + vy^2).
 Termination: when the robot has fallen (``VelocityTask.healthy``; HalfCheetah and Swimmer never do), or when
-    the physics breaks down (reward and cost 0). Truncated after 1,000 steps.
+the physics diverges (reward and cost 0). Truncated after 1,000 steps.
 Source: Gymnasium's MuJoCo environments of version 4 with the thresholds of safety-gymnasium 1.0.0, version 1.
 
-As in Gymnasium, positions and velocities of bodies (Ant's torso; Humanoid's centre of mass, inertias,
-velocities, forces) are those of the last moment at which MuJoCo computed them, up to one physics step old.
+As in Gymnasium, positions and velocities of bodies are those that MuJoCo computed last, up to one physics
+step old. This concerns Ant's torso, and Humanoid's centre of mass, inertias, velocities and forces.
 
 Notation: B environments, nq coordinates, nv velocities.
 """
@@ -40,15 +40,15 @@ TORSO = 1
 
 
 class Outcome(NamedTuple):
-    """What one step brought.
+    """Result of one step.
 
     Attributes:
         rewards: [B].
         costs: 0 or 1, [B].
-        velocities: those that are compared with the threshold, m/s, [B].
+        velocities: velocities that are compared with the threshold, m/s, [B].
         terminated: [B].
         truncated: [B].
-        broken: the physics broke down in this step, [B]; None if it did so nowhere.
+        broken: whether the physics diverged in this step, [B]; None if it did in no environment.
         finished: environments whose episode is over.
     """
 
@@ -75,13 +75,13 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         model: the physics' model.
         simulations: the physics.
         generators: one generator for each environment.
-        seconds: of the robot's time in a step.
+        seconds: simulated time of a step.
         bound: of the actions, which are within plus or minus this.
         observed: numbers in an observation.
         qpos, qvel: coordinates and velocities, live views, [B, nq] and [B, nv].
-        bodies: what the task needs of the bodies, by MuJoCo's name, as MuJoCo computed it last, [B, ...].
-        address: of the record ``PHYSICS`` that compiled functions are given.
-        places: where each robot was measured last, metres, [B, axes].
+        bodies: fields of the bodies that the task needs, by MuJoCo's name, as computed last, [B, ...].
+        address: of the record ``PHYSICS`` for compiled functions.
+        places: last measured position of each robot, metres, [B, axes].
         steps: taken in this episode, [B].
     """
 
@@ -116,12 +116,12 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         if self.bodies:
             self.simulations.apply(derive, self.address, ids)
         if self.task.observes_bodies:
-            self.bodies["cfrc_ext"][ids] = 0.0  # of before
+            self.bodies["cfrc_ext"][ids] = 0.0  # from before the reset
         self.places[ids] = self.measured()[ids]
         self.steps[ids] = 0
 
     def set_actions(self, actions: npt.NDArray[Any]) -> bool:
-        """Take the actions of the next step; False if an action, [B, nu], is no number within the bounds."""
+        """Set the next actions, [B, nu]; return False if one is not a number within the bounds."""
         self._actions[...] = actions
         return bool(np.abs(self._actions).max() <= self.bound)  # False with NaN
 
@@ -144,7 +144,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         return Outcome(rewards, costs, velocities, terminated, truncated, broken, finished)
 
     def judge(self, passed: Floats, actions: Floats) -> tuple[Floats, Floats, Floats]:
-        """What a step brings.
+        """Compute rewards, velocities and costs of a step.
 
         Args:
             passed: velocities along each axis, m/s, [B, axes].
@@ -160,13 +160,13 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         return rewards, velocities, (velocities > task.threshold).astype(np.float64)
 
     def fallen(self) -> Booleans:
-        """Whether each robot has fallen, where it is now, [B]."""
+        """Whether each robot has fallen, [B]."""
         if self.task.healthy is None:
             return np.zeros(self.number, np.bool_)
         return np.asarray(~self.task.healthy(self.qpos, self.qvel))
 
     def observations(self) -> Observations:
-        """What is observed now, [B, observed]."""
+        """Return the present observations, [B, observed]."""
         seen, start = np.empty((self.number, self.observed), np.float32), 0
         for part in self._observed_parts():
             seen[:, start : start + part.shape[1]] = part
@@ -174,7 +174,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         return seen
 
     def _own_state(self) -> dict[str, Any]:
-        """Physics, where the robots were measured, and counters."""
+        """State of physics, measured positions, and counters."""
         return {
             "physics": self.simulations.save(),
             "places": self.places.copy(),
@@ -196,7 +196,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
             self.qvel[index] = generator.uniform(-task.velocity_noise, task.velocity_noise, model.nv)
 
     def _copies_of_bodies(self) -> dict[str, Floats]:
-        """Memory for what the task needs of the bodies, by MuJoCo's name, [B, ...]."""
+        """Allocate memory for the fields of the bodies that the task needs, by MuJoCo's name, [B, ...]."""
         bodies, shapes = self.model.nbody, dict[str, tuple[int, ...]]()
         if self.task.measured == "torso":
             shapes["xpos"] = bodies, 3
@@ -208,7 +208,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         return {name: np.zeros((self.number, *shape)) for name, shape in shapes.items()}
 
     def measured(self) -> Floats:
-        """Where each robot is now, or was when MuJoCo computed it last, metres, [B, axes]."""
+        """Return the position of each robot, as MuJoCo computed it last, metres, [B, axes]."""
         axes = self.task.axes
         match self.task.measured:
             case "root":
@@ -220,7 +220,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
                 return np.asarray((mass / mass.sum()) @ self.bodies["xipos"][:, :, :axes])
 
     def _observed_parts(self) -> list[Floats]:
-        """An observation's parts in their order, [B, ...]."""
+        """Return the parts of an observation in order, [B, ...]."""
         bound = self.task.velocity_bound
         velocities = self.qvel if bound == np.inf else np.clip(self.qvel, -bound, bound)
         parts = [self.qpos[:, self.task.hidden :], velocities]

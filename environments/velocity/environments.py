@@ -4,10 +4,10 @@
     environment = gymnasium.make("recrl.environments.registration:recrl/SafetyAntVelocity-v1")
     batch = gymnasium.make_vec("recrl.environments.registration:recrl/SafetyAntVelocity-v1", num_envs=16)
 
-What is observed, done, earned and paid: ``recrl.environments.velocity.batch``.
+Observations, actions, rewards and costs: see ``recrl.environments.velocity.batch``.
 
-``info`` of a step holds ``cost`` (the cost, [k] with k = 1), ``velocity`` (what is compared with the
-threshold, m/s), and ``cost_exception`` if the physics broke down.
+``info`` of a step holds ``cost`` (the cost, [k] with k = 1), ``velocity`` (which is compared with the
+threshold, m/s), and ``cost_exception`` if the physics diverged.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class VelocityOptions(BaseModel):
         default=HORIZON, ge=1, le=HORIZON, description="Steps in an episode (safety-gymnasium: 1,000)."
     )
     out_of_range: Literal["error", "clip"] = Field(
-        default="error", description="Refuse actions outside their bounds, or clip them; agents clip theirs."
+        default="error",
+        description="Raise an error for actions outside their bounds, or clip them; agents clip theirs.",
     )
     num_threads: int = Field(
         default=1, ge=1, le=256, description="Threads for the physics (ours); results do not depend on it."
@@ -63,7 +64,7 @@ def _renderer(batch: VelocityBatch) -> Renderer:
 
 
 def _made(task: str, number: int, options: VelocityOptions) -> tuple[Description, VelocityBatch]:
-    """A task's description and environments; only this waits for MuJoCo and Numba."""
+    """Description and batch of a task; only this function imports MuJoCo and Numba."""
     from recrl.environments.velocity.batch import VelocityBatch  # noqa: PLC0415
 
     batch = VelocityBatch(_find(task), number, horizon=options.horizon, num_threads=options.num_threads)
@@ -116,10 +117,10 @@ class VelocityEnv(MujocoEnv):
 
 
 def make_velocity(name: str, num_envs: int, options: VelocityOptions) -> VelocityVectorEnv:
-    """B environments of a task by its name, for the registry of tasks."""
+    """Make B environments of a task by its name, for the registry of tasks."""
     return VelocityVectorEnv(name, num_envs, **options.model_dump())
 
 
 def draw_velocity(name: str, options: VelocityOptions) -> VelocityEnv:
-    """A task that draws itself, by its name, for the registry of tasks."""
+    """Make a rendering environment of a task by its name, for the registry of tasks."""
     return VelocityEnv(name, render_mode="rgb_array", **options.model_dump())

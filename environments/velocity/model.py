@@ -1,9 +1,9 @@
-"""The robots' models: those that come with Gymnasium, for its MuJoCo environments of version 4.
+"""Models of the robots, from Gymnasium's MuJoCo environments of version 4.
 
 They were written for MuJoCo 2, in which two shapes touch when they are nearer than the larger of their two
-margins. MuJoCo 3 and 4 add the margins up: unchanged, Ant, Hopper and Humanoid would hover, up to a
-centimetre higher than in every published result. So margins are halved, which gives MuJoCo 2's contacts
-back: all shapes of a model have the same one.
+margins. MuJoCo 3 and 4 add the margins. Unchanged, Ant, Hopper and Humanoid would hover up to a centimetre
+higher than in published results. So margins are halved. As all shapes of a model have the same margin, this
+restores MuJoCo 2's contacts.
 """
 
 from __future__ import annotations
@@ -22,14 +22,12 @@ ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 @functools.lru_cache(maxsize=16)
 def make_model(task: VelocityTask) -> mujoco.MjModel:
-    """The task's compiled model; the same object every time, and read-only."""
+    """Return the task's compiled model; always the same object, and read-only."""
     path = ASSETS / task.model
     if not path.is_file():
-        raise ImportError(
-            f"{task.name}: gymnasium must bring the model {path}, and does not: install it anew"
-        )
+        raise ImportError(f"{task.name}: gymnasium must contain the model {path}, and does not: reinstall it")
     specification = mujoco.MjSpec.from_file(str(path))
-    # MuJoCo scales masses no longer while it compiles a model, but asks for it afterwards.
+    # MuJoCo no longer scales masses while it compiles a model, but in a separate call.
     total_mass, specification.compiler.settotalmass = specification.compiler.settotalmass, -1.0
     model = specification.compile()
     if total_mass > 0.0:

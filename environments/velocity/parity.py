@@ -1,15 +1,15 @@
-"""Are our robots safety-gymnasium's? A check against recorded episodes of safety-gymnasium on MuJoCo 2.3.3.
+"""Compare our robots with recorded episodes of safety-gymnasium on MuJoCo 2.3.3.
 
-A recording holds coordinates and velocities before and after every step, the action, what was observed, the
-reward, the cost and whether the episode ended. Here our robots are put into the recorded states, and say what
-they observe, earn and pay: equal but for rounding, or something is defined differently.
+A recording holds coordinates and velocities before and after every step, the action, the observation, the
+reward, the cost and whether the episode ended. Here our robots are set to the recorded states. Their
+observations, rewards and costs must be equal up to rounding.
 
-Ant's and Humanoid's rewards, and what Humanoid observes of its bodies, come from a moment that is not
-recorded: the last one at which MuJoCo computed positions, which in its Runge-Kutta steps is the last of
-four stages. ``last_stage`` goes there from the recorded state, with the Runge-Kutta steps of MuJoCo 2:
-those of MuJoCo 4 treat orientations otherwise. Humanoid's contact forces, and hence velocities in that
-moment, are what an iterative solver found in at most 50 iterations, and MuJoCo 4's solver finds others:
-they agree only approximately where something is in contact.
+Ant's and Humanoid's rewards, and Humanoid's observation of its bodies, come from a moment that is not
+recorded: the last one at which MuJoCo computed positions. In its Runge-Kutta steps it is the last of four
+stages. ``last_stage`` computes it from the recorded state, with the Runge-Kutta steps of MuJoCo 2: those of
+MuJoCo 4 treat orientations differently. Humanoid's contact forces, and hence velocities at that moment, come
+from an iterative solver with at most 50 iterations. MuJoCo 4's solver finds others: they agree only
+approximately during contact.
 
 Notation: T steps in an episode, B robots, one for each recorded state.
 """
@@ -32,19 +32,19 @@ from recrl.environments.velocity.tasks import VELOCITY_TASKS, VelocityTask
 
 TOLERANCE = 1e-5
 STAGES = (0.5, 0.5, 1.0)
-"""Where the second to fourth stage of a Runge-Kutta step begin, in steps after its start."""
+"""Start of the second to fourth stage of a Runge-Kutta step, in fractions of the step."""
 
 
 @dataclass(frozen=True)
 class VelocityComparison:
-    """How far our robots are from one recorded episode.
+    """Differences between our robots and one recorded episode.
 
     Differences of observations are relative to max(1, |recorded|): contact forces are thousands of newtons.
 
     Attributes:
         task: the task's name.
-        states: compared, T + 1.
-        observation: greatest difference of any number but those that contact forces decide.
+        states: number of compared states, T + 1.
+        observation: greatest difference of any number that does not depend on contact forces.
         velocity: of the bodies' velocities, in every state, [T + 1]; zeros where they are not observed.
         force: likewise of the contact forces on bodies.
         reward: greatest difference of a reward.
@@ -65,7 +65,7 @@ class VelocityComparison:
 
     @property
     def equal(self) -> bool:
-        """Whether everything but what contact forces decide agrees within 1e-5."""
+        """Whether everything that does not depend on contact forces agrees within 1e-5."""
         agrees = self.observation <= TOLERANCE and self.reward <= TOLERANCE
         return agrees and not self.costs and not self.terminations
 
@@ -74,7 +74,7 @@ def compare_velocity_recording(path: Path) -> list[VelocityComparison]:
     """Compare every episode of one file.
 
     Raises:
-        ValueError: time step, frame skip, threshold or bounds of the actions are not ours.
+        ValueError: time step, frame skip, threshold or bounds of the actions differ from ours.
     """
     with np.load(path) as arrays:
         meta = json.loads(str(arrays["meta"]))
@@ -96,11 +96,11 @@ def last_stage(model: mujoco.MjModel, data: mujoco.MjData, frame_skip: int) -> t
 
     Args:
         model: of the robot.
-        data: its state, which is changed; the solver begins where it ended in the stage before.
+        data: its state, which is changed; the solver starts from its result in the stage before.
         frame_skip: steps.
 
     Returns:
-        coordinates, velocities and the solver's beginning in the last stage of the last step.
+        coordinates, velocities and the solver's initial guess in the last stage of the last step.
     """
     h = model.opt.timestep
     for _ in range(frame_skip):
@@ -147,7 +147,7 @@ def _compare_episode(task: VelocityTask, episode: dict[str, npt.NDArray[Any]]) -
     passed = np.vstack((np.zeros((1, task.axes)), np.diff(places, axis=0) / batch.seconds))
     actions = np.vstack((np.zeros_like(episode["action"][:1]), episode["action"]))
     rewards, _, costs = batch.judge(passed, actions)
-    # In single precision, as ours are; contact forces are compared relatively.
+    # In single precision, like ours; contact forces are compared relatively.
     recorded = episode["obs"].astype(np.float32).astype(np.float64)
     apart = np.abs(batch.observations() - recorded) / np.maximum(1.0, np.abs(recorded))
     bodies = batch.model.nbody
@@ -168,7 +168,7 @@ def _compare_episode(task: VelocityTask, episode: dict[str, npt.NDArray[Any]]) -
 
 
 def _see_bodies(batch: VelocityBatch, episode: dict[str, npt.NDArray[Any]]) -> Floats:
-    """Let robot t know of its bodies what was known after step t - 1, and return where each was measured."""
+    """Give robot t the body data of step t - 1; return the position of each robot."""
     state, task = mujoco.mjtState, batch.task
     batch.qpos[...], batch.qvel[...] = episode["qpos"], episode["qvel"]
     if not batch.bodies:

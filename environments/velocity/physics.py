@@ -1,7 +1,7 @@
-"""One step of a robot's physics, compiled: MuJoCo's steps, and copies of what is observed of its bodies.
+"""One compiled step of a robot's physics: MuJoCo's steps, and copies of the observed body data.
 
-After a step what is known of bodies is what MuJoCo computed last: before its last physics step ended. So it
-is in Gymnasium's environments, which read it without computing it anew.
+After a step, body data are those that MuJoCo computed last: before its last physics step ended. The same
+holds in Gymnasium's environments, which read them without computing them anew.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from recrl.environments.simulation.machine_code import (
 from recrl.environments.simulation.mujoco_layout import structure
 
 MAX_FIELDS = 5
-"""Room for fields of ``mjData`` that are copied."""
+"""Maximum number of fields of ``mjData`` that are copied."""
 
 PHYSICS = np.dtype(
     [
         ("frame_skip", np.int64),
         ("forces", np.bool_),  # whether contact forces on bodies are computed
-        ("fields", np.int64),  # how many are copied
+        ("fields", np.int64),  # number of copied fields
         ("offset", np.int64, (MAX_FIELDS,)),  # in mjData
-        ("size", np.int64, (MAX_FIELDS,)),  # numbers
+        ("size", np.int64, (MAX_FIELDS,)),  # size
         ("copy", np.int64, (MAX_FIELDS,)),  # address of [B, size]
     ],
     align=True,
@@ -43,11 +43,11 @@ _addresses = array_at(np.int64)
 
 
 def physics_record(frame_skip: int, copies: dict[str, Floats], *, forces: bool) -> npt.NDArray[Any]:
-    """The record ``PHYSICS``, an array [1].
+    """Return the record ``PHYSICS``, an array [1].
 
     Args:
         frame_skip: physics steps in a step.
-        copies: where fields of ``mjData`` are copied to, by name, contiguous, [B, ...]; kept by the caller.
+        copies: arrays for fields of ``mjData``, by name, contiguous, [B, ...]; the caller keeps them alive.
         forces: whether contact forces on bodies are computed.
     """
     record, data = np.zeros(1, PHYSICS), structure("mjData")
@@ -61,7 +61,7 @@ def physics_record(frame_skip: int, copies: dict[str, Floats], *, forces: bool) 
 
 @compiled
 def copy_fields(physics: Any, data: int, index: int) -> None:
-    """Copy what MuJoCo computed last."""
+    """Copy the fields that MuJoCo computed last."""
     for place in range(physics.fields):
         size = physics.size[place]
         source = _doubles(_addresses(data + physics.offset[place], 1)[0], size)
@@ -72,7 +72,7 @@ def copy_fields(physics: Any, data: int, index: int) -> None:
 
 @compiled_for_batch
 def advance(model: int, data: int, index: int, argument: int) -> None:
-    """The physics steps of one step; the controls are in the state."""
+    """Take the physics steps of one step; the controls are in the state."""
     physics = _physics(argument, 1)[0]
     for _step in range(physics.frame_skip):
         mj_step(model, data)
@@ -83,7 +83,7 @@ def advance(model: int, data: int, index: int, argument: int) -> None:
 
 @compiled_for_batch
 def derive(model: int, data: int, index: int, argument: int) -> None:
-    """Compute and copy what follows from the state, but for contact forces, which are as they were."""
+    """Compute and copy what follows from the state, except contact forces, which stay as they were."""
     mj_forward(model, data)
     copy_fields(_physics(argument, 1)[0], data, index)
 

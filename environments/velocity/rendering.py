@@ -1,4 +1,4 @@
-"""Pictures of the velocity tasks, drawn off-screen: the robot, and a camera that goes along with it."""
+"""Off-screen rendering of the velocity tasks: the robot, and a camera that follows it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ CAMERA_ELEVATION, CAMERA_AZIMUTH = -20.0, 90.0
 
 
 class VelocityRenderer:
-    """Draws single robots of a task.
+    """Renderer for single robots of a task.
 
     Args:
-        batch: whose robots are drawn.
-        width: of a picture, pixels.
-        height: of a picture, pixels.
+        batch: the robots.
+        width: of a frame, pixels.
+        height: of a frame, pixels.
 
     Raises:
-        RenderingUnavailableError: there is neither EGL nor OSMesa, or MUJOCO_GL names one that is missing.
+        RenderingUnavailableError: EGL and OSMesa are missing, or the library in MUJOCO_GL is.
     """
 
     def __init__(self, batch: VelocityBatch, width: int = 480, height: int = 360) -> None:
@@ -36,7 +36,7 @@ class VelocityRenderer:
         self._drawing = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawing)
         self._scene = mujoco.MjvScene(self._model, maxgeom=MAX_GEOMS)
-        # Without a graphics card these are nine tenths of the time of a picture.
+        # Without a graphics card these take nine tenths of the time of a frame.
         for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[effect] = 0
         self._look = mujoco.MjvOption()
@@ -46,7 +46,7 @@ class VelocityRenderer:
         self._camera.elevation, self._camera.azimuth = CAMERA_ELEVATION, CAMERA_AZIMUTH
 
     def frame(self, index: int) -> Frame:
-        """Robot ``index`` as it is now, [height, width, 3]."""
+        """Render the present state of robot ``index``, [height, width, 3]."""
         row, state = self._batch.simulations.rows[index], mujoco.mjtState.mjSTATE_INTEGRATION.value
         mujoco.mj_setState(self._model, self._data, row, state)
         mujoco.mj_kinematics(self._model, self._data)
@@ -63,6 +63,6 @@ class VelocityRenderer:
         return np.flipud(picture).copy()  # OpenGL counts rows from below
 
     def close(self) -> None:
-        """Free what the graphics driver holds."""
+        """Free the memory of the graphics driver."""
         self._drawing.free()
         self._context.free()

@@ -1,4 +1,4 @@
-"""The six velocity tasks as numbers: what each robot earns, pays and observes, and when it has fallen.
+"""Definitions of the six velocity tasks: rewards, costs, observations, and when a robot has fallen.
 
 Rewards, healthy ranges and reset noise are those of Gymnasium's MuJoCo environments, version 4; thresholds
 are those of safety-gymnasium's version 1.
@@ -28,28 +28,28 @@ HORIZON = 1000
 
 @dataclass(frozen=True)
 class VelocityTask:
-    """What distinguishes one velocity task from another.
+    """Definition of one velocity task.
 
     Attributes:
         name: for example ``SafetyAntVelocity``.
-        model: file of the robot's model among Gymnasium's.
+        model: file name of the robot's model in Gymnasium.
         frame_skip: physics steps in a step.
         threshold: the velocity above which a step costs 1, m/s.
-        measured: of what the velocity is: the first coordinates (``root``), the body that is the torso
-            (``torso``), or the centre of mass (``mass``).
+        measured: the point whose velocity counts: the first coordinates (``root``), the torso (``torso``) or
+            the centre of mass (``mass``).
         axes: 1 if only the x axis counts, 2 if the velocity that costs is sqrt(vx^2 + vy^2).
         hidden: coordinates, from the first one, that are not observed.
         forward_weight: reward of 1 m/s along x.
-        control_weight: what the sum of the squared actions takes off the reward.
-        healthy_reward: earned in each step.
-        position_noise: coordinates start within this much of the model's.
-        velocity_noise: likewise velocities, or their standard deviation where ``normal_velocities``.
+        control_weight: weight of the sum of squared actions, subtracted from the reward.
+        healthy_reward: reward of each step for being healthy.
+        position_noise: largest initial deviation of coordinates from the model's.
+        velocity_noise: likewise of velocities; their standard deviation if ``normal_velocities``.
         normal_velocities: whether velocities start normally distributed, not uniformly.
-        velocity_bound: velocities are observed clipped to plus or minus this.
-        observes_bodies: whether inertias, velocities and forces of all bodies are observed, too.
-        healthy: (coordinates [B, nq], velocities [B, nv]) -> whether each robot may go on, [B]; None if all
-            always may.
-        camera_distance: of pictures, metres.
+        velocity_bound: observed velocities are clipped to plus or minus this.
+        observes_bodies: whether inertias, velocities and forces of all bodies are observed.
+        healthy: (coordinates [B, nq], velocities [B, nv]) -> whether each robot is healthy, [B]; None if it
+            always is.
+        camera_distance: for frames, metres.
     """
 
     name: str
@@ -72,26 +72,26 @@ class VelocityTask:
 
 
 def ant_is_healthy(qpos: Floats, qvel: Floats) -> Booleans:
-    """Its torso is 0.2 m to 1 m high, and everything is finite."""
+    """Torso between 0.2 m and 1 m high, everything finite."""
     height = qpos[:, 2]
     finite = np.isfinite(qpos).all(axis=1) & np.isfinite(qvel).all(axis=1)
     return np.asarray((height >= 0.2) & (height <= 1.0) & finite)
 
 
 def hopper_is_healthy(qpos: Floats, qvel: Floats) -> Booleans:
-    """Its torso is more than 0.7 m high and leans less than 0.2 rad; all else is within 100."""
+    """Torso more than 0.7 m high and leaning less than 0.2 rad; all else within 100."""
     height, angle = qpos[:, 1], qpos[:, 2]
     calm = (np.abs(qpos[:, 2:]) < 100.0).all(axis=1) & (np.abs(qvel) < 100.0).all(axis=1)
     return np.asarray((height > 0.7) & (np.abs(angle) < 0.2) & calm)
 
 
 def humanoid_is_healthy(qpos: Floats, _: Floats) -> Booleans:
-    """Its torso is between 1 m and 2 m high."""
+    """Torso between 1 m and 2 m high."""
     return np.asarray((qpos[:, 2] > 1.0) & (qpos[:, 2] < 2.0))
 
 
 def walker_is_healthy(qpos: Floats, _: Floats) -> Booleans:
-    """Its torso is between 0.8 m and 2 m high and leans less than 1 rad."""
+    """Torso between 0.8 m and 2 m high and leaning less than 1 rad."""
     height, angle = qpos[:, 1], qpos[:, 2]
     return np.asarray((height > 0.8) & (height < 2.0) & (np.abs(angle) < 1.0))
 

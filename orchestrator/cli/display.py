@@ -16,9 +16,9 @@ from rich.text import Text
 
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.plan import Estimate, Plan, Work
+from recrl.orchestrator.grid.plan import Estimate, Plan, PlannedAction
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep_progress import Standing, SweepProgress, TrialProgress, standing_of
+from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, display_status
 
 TERMINAL_SECONDS = 1.0
 LINE_SECONDS = 10.0
@@ -40,14 +40,14 @@ _STYLES = {
 
 def plan_table(plan: Plan) -> Table:
     """Every trial and what a launch would do with it."""
-    table = _table("trial", "seed", "work", "done", "id")
+    table = _table("trial", "seed", "action", "done", "id")
     for trial in plan.trials:
-        done = 0 if trial.work in (Work.REPAIR, Work.DAMAGED) else trial.record.env_steps
-        fraction = 1.0 if trial.work is Work.COMPLETE else done / trial.spec.total_steps
+        done = 0 if trial.action in (PlannedAction.REPAIR, PlannedAction.DAMAGED) else trial.record.env_steps
+        fraction = 1.0 if trial.action is PlannedAction.COMPLETE else done / trial.spec.total_steps
         table.add_row(
             f"{trial.spec.task.label} {trial.spec.agent.label} {trial.spec.method.label}",
             str(trial.spec.seed),
-            _styled(trial.work),
+            _styled(trial.action),
             f"{min(1.0, fraction):.0%}",
             trial.spec.trial_id,
         )
@@ -57,16 +57,16 @@ def plan_table(plan: Plan) -> Table:
 def plan_sentence(plan: Plan) -> str:
     """``20 trials: 12 new, 3 to resume, 5 complete``."""
     words = {
-        Work.NEW: "new",
-        Work.RESUME: "to resume",
-        Work.RETRY: "to try again",
-        Work.REPAIR: "damaged, to go on from what is whole",
-        Work.RERUN: "to run again on the present code",
-        Work.COMPLETE: "complete",
-        Work.FAILED: "failed",
-        Work.DAMAGED: "damaged",
+        PlannedAction.NEW: "new",
+        PlannedAction.RESUME: "to resume",
+        PlannedAction.RETRY: "to try again",
+        PlannedAction.REPAIR: "damaged, to go on from what is whole",
+        PlannedAction.RERUN: "to run again on the present code",
+        PlannedAction.COMPLETE: "complete",
+        PlannedAction.FAILED: "failed",
+        PlannedAction.DAMAGED: "damaged",
     }
-    parts = [f"{number} {words[work]}" for work, number in plan.counts.items() if number]
+    parts = [f"{number} {words[action]}" for action, number in plan.counts.items() if number]
     return f"{_counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
 
 
@@ -84,13 +84,13 @@ def estimate_sentence(estimate: Estimate, where: str) -> str:
 
 def status_table(progress: SweepProgress) -> Table:
     """Every trial and where it stands."""
-    table = _table("trial", "seed", "standing", "done", "steps/s", "CPU", "tries", "id")
+    table = _table("trial", "seed", "status", "done", "steps/s", "CPU", "tries", "id")
     for trial in progress.trials:
-        running = trial.standing is Standing.RUNNING
+        running = trial.status is DisplayStatus.RUNNING
         table.add_row(
             f"{trial.spec.task.label} {trial.spec.agent.label} {trial.spec.method.label}",
             str(trial.spec.seed),
-            _styled(trial.standing),
+            _styled(trial.status),
             f"{trial.fraction:.0%}",
             f"{trial.record.steps_per_second:,.0f}" if running else "",
             duration(trial.record.cpu_seconds) if trial.record.cpu_seconds else "",
@@ -104,15 +104,15 @@ def status_sentence(progress: SweepProgress) -> str:
     """``12 of 20 complete, 2 running, 6 waiting, 0 failed; 61%; 22,400 steps/s; 1 min 43 s left``."""
     counts = progress.counts
     parts = [
-        f"{counts[Standing.COMPLETE]} of {len(progress.trials)} complete",
-        f"{counts[Standing.RUNNING]} running",
-        f"{counts[Standing.WAITING]} waiting",
-        f"{counts[Standing.FAILED]} failed",
+        f"{counts[DisplayStatus.COMPLETE]} of {len(progress.trials)} complete",
+        f"{counts[DisplayStatus.RUNNING]} running",
+        f"{counts[DisplayStatus.WAITING]} waiting",
+        f"{counts[DisplayStatus.FAILED]} failed",
     ]
     parts += [
-        f"{counts[standing]} {standing}"
-        for standing in (Standing.STOPPED, Standing.INTERRUPTED, Standing.DAMAGED)
-        if counts[standing]
+        f"{counts[status]} {status}"
+        for status in (DisplayStatus.STOPPED, DisplayStatus.INTERRUPTED, DisplayStatus.DAMAGED)
+        if counts[status]
     ]
     sentence = ", ".join(parts)
     if progress.is_complete:
@@ -126,10 +126,10 @@ def status_sentence(progress: SweepProgress) -> str:
 def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress], str]) -> Iterator[str]:
     """For every trial that broke off: which, why, and where its log and traceback are."""
     for trial in trials:
-        broken = trial.standing in (Standing.FAILED, Standing.DAMAGED)
-        word = str(trial.standing) if broken else "waiting"
+        broken = trial.status in (DisplayStatus.FAILED, DisplayStatus.DAMAGED)
+        word = str(trial.status) if broken else "waiting"
         yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was left'}"
-        what = "its files" if trial.standing is Standing.DAMAGED else "log and traceback"
+        what = "its files" if trial.status is DisplayStatus.DAMAGED else "log and traceback"
         yield f"        {what}: {folder_of(trial)}"
 
 
@@ -149,7 +149,7 @@ def lines_of(trial: TrialStore, *, follow: bool) -> Iterator[str]:
     """
     offset, rest = 0, ""
     while True:
-        runs = standing_of(trial.record(), now=time.time()) is Standing.RUNNING
+        runs = display_status(trial.record(), now=time.time()) is DisplayStatus.RUNNING
         with suppress(FileNotFoundError), trial.log_path.open("rb") as file:
             file.seek(offset)
             *lines, rest = (rest + file.read().decode(errors="replace")).split("\n")
@@ -219,7 +219,7 @@ def _picture(progress: SweepProgress) -> RenderableType:
         Text(status_sentence(progress)),
         ProgressBar(total=1.0, completed=progress.fraction, width=60),
     ]
-    running = progress.standing(Standing.RUNNING)
+    running = progress.with_status(DisplayStatus.RUNNING)
     table = Table.grid(padding=(0, 2))
     for trial in running[:SHOWN_RUNNING]:
         speed = f"{trial.record.steps_per_second:,.0f} steps/s" if trial.record.steps_per_second else ""

@@ -26,25 +26,25 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     import pandas as pd  # noqa: PLC0415
 
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415  (imports gymnasium)
-    from recrl.orchestrator.trial.saved_policy import FrozenTrial, summary  # noqa: PLC0415  (imports torch)
+    from recrl.orchestrator.trial.saved_policy import SavedTrial, summary  # noqa: PLC0415  (imports torch)
     from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
 
     store = open_store(request, checkpoints=True)
     policies = tuple(FrozenPolicy) if request.policy == "both" else (FrozenPolicy(request.policy),)
-    thawed, left_out = [], []
+    loaded, left_out = [], []
     for trial in _chosen(store, request):
         try:
             trial.require_whole()
-            thawed.append(FrozenTrial.thaw(trial))
+            loaded.append(SavedTrial.load(trial))
         except RecrlError as error:
             left_out.append(error)
-    if not thawed:
+    if not loaded:
         raise left_out[0]
     rows, written = [], []
-    for frozen in thawed:
-        num_episodes = request.episodes or frozen.spec.evaluation_episodes or DEFAULT_EPISODES
-        episodes, path = frozen.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
-        rows += summary(episodes, frozen)
+    for saved in loaded:
+        num_episodes = request.episodes or saved.spec.evaluation_episodes or DEFAULT_EPISODES
+        episodes, path = saved.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
+        rows += summary(episodes, saved)
         written.append(path)
     show(pd.DataFrame(rows), console)
     say(console, "Means and standard errors; within: episodes in which no cost exceeded its d_d.")
@@ -52,14 +52,14 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
         say(console, f"Episodes   {short(path)}")
     for reason in left_out:
         say(console, f"left out   {reason}")
-    changed = [frozen for frozen in thawed if has_other_code(frozen.store, frozen.spec)]
-    complete = sum(frozen.store.record().status is TrialState.COMPLETE for frozen in changed)
+    changed = [saved for saved in loaded if has_other_code(saved.store, saved.spec)]
+    complete = sum(saved.store.record().status is TrialState.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
         say(console, f"warning: {sentence}; here their policies met the present code")
     if request.video:
-        for frozen in thawed:
+        for saved in loaded:
             for policy in policies:
-                video = frozen.film(policy, VideoFormat(request.video), seed=request.seed)
+                video = saved.film(policy, VideoFormat(request.video), seed=request.seed)
                 say(console, f"Video      {short(video)}")
     _tell_mlflow(store, request, console)
     return ExitCode.OK

@@ -30,16 +30,16 @@ from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
-from recrl.orchestrator.sweep import LaunchSettings, Mirror, SweepResult, launch, stopping_on_signals
-from recrl.orchestrator.sweep_progress import Standing, SweepProgress, progress
+from recrl.orchestrator.sweep import BackgroundSync, LaunchSettings, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, progress
 from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep
 
-MIRROR_INTERVAL_SECONDS = 5.0
+SYNC_INTERVAL_SECONDS = 5.0
 
 logger = logging.getLogger("recrl.sweep")
 
@@ -75,7 +75,7 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
 
     def finish(after: SweepProgress) -> None:
         shown.close()
-        if not stop.is_set() and after.counts[Standing.COMPLETE]:
+        if not stop.is_set() and after.counts[DisplayStatus.COMPLETE]:
             read.append(sweep_data.load(store))
             if request.figures:
                 _draw_at_end(read[0], store, console)
@@ -94,15 +94,15 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
             retry_failed=request.retry_failed,
             rerun_damaged=request.rerun_damaged,
             rerun_changed=request.rerun_changed,
-            start_mirror=_mirror_to(uri) if uri else None,
+            start_sync=_sync_to(uri) if uri else None,
             watch=watch,
             finish=finish,
         )
         result = launch(settings, stop=stop)
-    kept = f", a mirror of {place.address}" if place.address else ""
+    kept = f", a local copy of {place.address}" if place.address else ""
     say(console, f"Results    {short(store.folder)}{kept}")
     if uri:
-        _say_mirrored(result, store, uri, request, console)
+        _say_synced(result, store, uri, request, console)
     for sweep in read:
         _say_results(sweep, console)
     report = store.figures_folder / "report.html"
@@ -140,8 +140,8 @@ def _executor(grid: GridSpec, place: SweepPlace, request: LaunchRequest) -> Exec
     )
 
 
-def _mirror_to(uri: str) -> Callable[[SweepStore], Mirror]:
-    return lambda store: start_mirror(store, uri, interval_seconds=MIRROR_INTERVAL_SECONDS)
+def _sync_to(uri: str) -> Callable[[SweepStore], BackgroundSync]:
+    return lambda store: start_sync(store, uri, interval_seconds=SYNC_INTERVAL_SECONDS)
 
 
 def _say_starting(request: LaunchRequest, console: Console) -> None:
@@ -177,12 +177,12 @@ def _film(
 ) -> None:
     """Film the complete trials that the grid wants filmed and that have no video yet."""
     seeds = {"none": (), "first-seed": grid.seeds[:1], "all": grid.seeds}[grid.run.videos]
-    complete = [trial.spec for trial in after.standing(Standing.COMPLETE) if trial.spec.seed in seeds]
+    complete = [trial.spec for trial in after.with_status(DisplayStatus.COMPLETE) if trial.spec.seed in seeds]
     unseen = [store.trial(spec) for spec in complete if not any(store.trial(spec).videos_folder.glob("*"))]
     if not unseen:
         return
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
-    from recrl.orchestrator.trial.saved_policy import FrozenTrial  # noqa: PLC0415  (imports torch)
+    from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415  (imports torch)
     from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
 
     say(console, f"Videos     {short(store.trials_folder)}/*/{unseen[0].videos_folder.name}")
@@ -190,12 +190,12 @@ def _film(
         if stop.is_set():
             return
         try:
-            FrozenTrial.thaw(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+            SavedTrial.load(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
         except RecrlError as error:  # a picture is no reason to call a finished sweep broken
             say(console, f"           no video: {error}")
 
 
-def _say_mirrored(
+def _say_synced(
     result: SweepResult, store: SweepStore, uri: str, request: LaunchRequest, console: Console
 ) -> None:
     """Say where MLflow's view is and how to open it, and whether it is up to date."""
@@ -207,7 +207,7 @@ def _say_mirrored(
     where = redacted(uri) if request.tracking_uri else short(store.mlflow_database)
     say(console, f"MLflow     {where}")
     say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
-    if not result.mirrored:  # a mirror that came to no end leaves the report of an earlier pass
+    if not result.synced:  # a mirror that came to no end leaves the report of an earlier pass
         report = last_report(store, uri)
         problem = f" ({report.problem})" if report and report.problem else ""
         again = shlex.join(["recrl-sweep", "sync", *place])
@@ -224,7 +224,7 @@ def _say_result(result: SweepResult, store: SweepStore, request: LaunchRequest, 
     if result.stopped:
         say(console, f"Stopped; nothing is lost. Go on with: {again}")
         return ExitCode.STOPPED
-    if damaged := result.progress.standing(Standing.DAMAGED):
+    if damaged := result.progress.with_status(DisplayStatus.DAMAGED):
         them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
         rerun = again if request.rerun_damaged else f"{again} --rerun-damaged"
         say(console, f"{them} left alone; what is damaged is moved aside and run again with: {rerun}")

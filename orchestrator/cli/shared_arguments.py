@@ -52,7 +52,7 @@ def add_command(
             "--storage",
             metavar="URI",
             help="keep the sweep in an object store (s3://bucket/folder, gs://, abfs://...) that all nodes "
-            "reach; its folder under --root is then a mirror, and remembers the address",
+            "reach; its folder under --root is then a local copy that stores the address",
         )
     return command
 

@@ -22,7 +22,13 @@ from recrl.orchestrator.grid.plan import make_plan
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep import REQUEST_SECONDS
-from recrl.orchestrator.sweep_progress import Standing, SweepProgress, TrialProgress, progress, standing_of
+from recrl.orchestrator.sweep_progress import (
+    DisplayStatus,
+    SweepProgress,
+    TrialProgress,
+    display_status,
+    progress,
+)
 
 
 def run_status(request: StatusRequest, console: Console) -> ExitCode:
@@ -104,7 +110,7 @@ def run_logs(request: LogsRequest, console: Console) -> ExitCode:
         if request.follow:
             if not store.is_locked():
                 place = sweep_place(store, request.storage)
-                following.enter_context(place.mirrored(threading.Event()))
+                following.enter_context(place.kept_up_to_date(threading.Event()))
             _wait_for_start(store, text, console)
         for line in display.lines_of(_trial(store, text), follow=request.follow):
             say(console, line)
@@ -127,7 +133,7 @@ def _meant(store: SweepStore, text: str) -> list[TrialStore]:
     if text:
         return found
     now = time.time()
-    return [trial for trial in found if standing_of(trial.record(), now=now) is Standing.RUNNING]
+    return [trial for trial in found if display_status(trial.record(), now=now) is DisplayStatus.RUNNING]
 
 
 def _trial(store: SweepStore, text: str) -> TrialStore:
@@ -149,8 +155,8 @@ def say_failures(now: SweepProgress, store: SweepStore, console: Console) -> Non
         return str(short(store.trial(trial.spec).folder))
 
     broken = [
-        *now.standing(Standing.FAILED, Standing.DAMAGED),
-        *(t for t in now.standing(Standing.STOPPED) if t.record.error),
+        *now.with_status(DisplayStatus.FAILED, DisplayStatus.DAMAGED),
+        *(t for t in now.with_status(DisplayStatus.STOPPED) if t.record.error),
     ]
     for line in display.failures(broken, folder_of):
         say(console, line)

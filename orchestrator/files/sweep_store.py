@@ -119,7 +119,7 @@ class SweepStore:
         return self.folder / "mlartifacts"
 
     @property
-    def mirror_folder(self) -> Path:
+    def sync_folder(self) -> Path:
         """How far MLflow has been told; may be deleted at any time."""
         return self.folder / "mirror"
 

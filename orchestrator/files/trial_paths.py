@@ -98,7 +98,7 @@ class TrialPaths:
         return self.folder.name.rpartition("__")[2]
 
     @property
-    def is_mirror(self) -> bool:
+    def is_local_copy(self) -> bool:
         """Whether the folder only mirrors a trial that is kept in an object store."""
         return (self.folder / ".pulled.json").exists()
 

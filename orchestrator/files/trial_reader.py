@@ -127,8 +127,8 @@ class TrialReader(TrialPaths):
         claims = stated.status if stated.attempt else None
         if isinstance(error, OtherFormatError):
             claims = TrialState.COMPLETE  # perhaps: nobody is to run it again unasked
-        if self.is_mirror:
-            remedy = "the sweep's folder is a mirror here: delete it, and it is fetched again"
+        if self.is_local_copy:
+            remedy = "the sweep's folder is only a local copy: delete it, and it is fetched again"
         elif claims in (TrialState.COMPLETE, TrialState.FAILED):
             remedy = "launch --rerun-damaged runs the trial again and moves what is damaged aside"
         else:
@@ -166,7 +166,7 @@ class TrialReader(TrialPaths):
             except StorageError as error:
                 yield str(error)
         paths = {path.name: path for path in self.checkpoints()}
-        if record.checkpoint and (record.status.is_finished or not self.is_mirror):
+        if record.checkpoint and (record.status.is_finished or not self.is_local_copy):
             paths[record.checkpoint] = self.checkpoints_folder / record.checkpoint
         for path in paths.values():
             try:

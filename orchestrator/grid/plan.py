@@ -27,7 +27,7 @@ GIGABYTES_AROUND = 1.2
 SELECTABLE = ("task", "agent", "method", "seed")
 
 
-class Work(StrEnum):
+class PlannedAction(StrEnum):
     """What a launch would do with a trial."""
 
     NEW = "new"
@@ -42,7 +42,13 @@ class Work(StrEnum):
     @property
     def is_to_do(self) -> bool:
         """Whether a launch would work on the trial."""
-        return self in (Work.NEW, Work.RESUME, Work.RETRY, Work.REPAIR, Work.RERUN)
+        return self in (
+            PlannedAction.NEW,
+            PlannedAction.RESUME,
+            PlannedAction.RETRY,
+            PlannedAction.REPAIR,
+            PlannedAction.RERUN,
+        )
 
 
 @dataclass(frozen=True)
@@ -51,21 +57,21 @@ class PlannedTrial:
 
     Attributes:
         spec: the trial.
-        work: what a launch would do with it.
+        action: what a launch would do with it.
         record: what its files say.
         has_other_code: whether an attempt at it ran other code than is installed now.
     """
 
     spec: TrialSpec
-    work: Work
+    action: PlannedAction
     record: TrialRecord
     has_other_code: bool = False
 
     @property
     def steps_left(self) -> int:
         """Environment steps that a launch would still take, at most."""
-        done = self.record.env_steps if self.work in (Work.RESUME, Work.RETRY) else 0
-        return max(0, self.spec.total_steps - done) if self.work.is_to_do else 0
+        done = self.record.env_steps if self.action in (PlannedAction.RESUME, PlannedAction.RETRY) else 0
+        return max(0, self.spec.total_steps - done) if self.action.is_to_do else 0
 
 
 @dataclass(frozen=True)
@@ -83,22 +89,22 @@ class Plan:
     @property
     def to_do(self) -> tuple[TrialSpec, ...]:
         """The trials to run, in their order."""
-        return tuple(trial.spec for trial in self.trials if trial.work.is_to_do)
+        return tuple(trial.spec for trial in self.trials if trial.action.is_to_do)
 
-    def doing(self, work: Work) -> tuple[PlannedTrial, ...]:
-        """The trials with this kind of work."""
-        return tuple(trial for trial in self.trials if trial.work is work)
+    def with_action(self, action: PlannedAction) -> tuple[PlannedTrial, ...]:
+        """Return the trials with this action."""
+        return tuple(trial for trial in self.trials if trial.action is action)
 
     @property
     def other_code(self) -> tuple[PlannedTrial, ...]:
         """The trials that ran other code than is installed now, and are not run again from the beginning."""
-        return tuple(it for it in self.trials if it.has_other_code and it.work is not Work.RERUN)
+        return tuple(it for it in self.trials if it.has_other_code and it.action is not PlannedAction.RERUN)
 
     @property
-    def counts(self) -> Mapping[Work, int]:
-        """How many trials there are of each kind of work."""
-        found = Counter(trial.work for trial in self.trials)
-        return {work: found[work] for work in Work}
+    def counts(self) -> Mapping[PlannedAction, int]:
+        """Number of trials by planned action."""
+        found = Counter(trial.action for trial in self.trials)
+        return {action: found[action] for action in PlannedAction}
 
     @property
     def steps_left(self) -> int:
@@ -153,11 +159,11 @@ def make_plan(
     for spec in select(specs, only or {}):
         trial = store.trial(spec)
         record = trial.verified_record() if rerun_damaged else trial.record()
-        work = _work(record, retry_failed=retry_failed, rerun_damaged=rerun_damaged)
+        action = _planned_action(record, retry_failed=retry_failed, rerun_damaged=rerun_damaged)
         changed = has_other_code(trial, spec)
-        if changed and rerun_changed and (work.is_to_do or work is Work.COMPLETE):
-            work = Work.RERUN
-        trials.append(PlannedTrial(spec, work, record, changed))
+        if changed and rerun_changed and (action.is_to_do or action is PlannedAction.COMPLETE):
+            action = PlannedAction.RERUN
+        trials.append(PlannedTrial(spec, action, record, changed))
     orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)
     return Plan(tuple(trials), orphans)
 
@@ -234,17 +240,17 @@ def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> t
     return tuple(spec for spec in specs if all(_label(spec, key) in values for key, values in wanted.items()))
 
 
-def _work(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> Work:
+def _planned_action(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> PlannedAction:
     match record.status:
         case TrialState.COMPLETE:
-            return Work.COMPLETE
+            return PlannedAction.COMPLETE
         case TrialState.FAILED:
-            return Work.RETRY if retry_failed else Work.FAILED
+            return PlannedAction.RETRY if retry_failed else PlannedAction.FAILED
         case TrialState.DAMAGED:
             left_alone = record.claims in (TrialState.COMPLETE, TrialState.FAILED)
-            return Work.DAMAGED if left_alone and not rerun_damaged else Work.REPAIR
+            return PlannedAction.DAMAGED if left_alone and not rerun_damaged else PlannedAction.REPAIR
         case TrialState.WAITING | TrialState.RUNNING:
-            return Work.RESUME if record.attempt else Work.NEW
+            return PlannedAction.RESUME if record.attempt else PlannedAction.NEW
 
 
 def kind_of(spec: TrialSpec) -> str:

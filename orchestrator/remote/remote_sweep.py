@@ -126,7 +126,7 @@ class RemoteSweep:
         if known is not None and known != self.uri:
             raise RecrlError(
                 f"{store.folder}: this sweep is kept at {known}, not at {self.uri}; give another "
-                "--root, or delete the folder, which is only a mirror"
+                "--root, or delete the folder, which is only a local copy"
             )
         store.folder.mkdir(parents=True, exist_ok=True)
         if known is None:
@@ -192,7 +192,7 @@ class RemoteSweep:
                     keys.setdefault(name, []).append(rest)
 
             def pull_trial(name: str) -> None:
-                self.trial(name).mirror(self.store.trial_named(name), keys[name], checkpoints=checkpoints)
+                self.trial(name).download(self.store.trial_named(name), keys[name], checkpoints=checkpoints)
 
             before = {} if checkpoints else self._pulled
             news = [name for name in keys if _is_new(keys[name], before.get(name))]
@@ -208,7 +208,7 @@ class RemoteSweep:
             StorageError: the store cannot be read.
         """
         with self._alone():
-            self.trial(spec.folder_name).mirror(self.store.trial(spec), checkpoints=False)
+            self.trial(spec.folder_name).download(self.store.trial(spec), checkpoints=False)
 
     def is_out_of_touch(self, silence_seconds: float) -> bool:
         """Return whether the folder is so old that a silence of so many seconds in it says nothing.
@@ -219,7 +219,7 @@ class RemoteSweep:
         return time.monotonic() - self._in_touch_at > max(3.0 * PULL_SECONDS, silence_seconds / 3.0)
 
     @contextmanager
-    def mirrored(self, stop: threading.Event, *, every: float = PULL_SECONDS) -> Iterator[None]:
+    def kept_up_to_date(self, stop: threading.Event, *, every: float = PULL_SECONDS) -> Iterator[None]:
         """Pull the trials again and again, from a thread beside the body, and once more after it.
 
         Args:
@@ -242,7 +242,7 @@ class RemoteSweep:
                 else:
                     pause = every
 
-        with beside(follow, name="mirror"):
+        with beside(follow, name="local copy"):
             yield
         patiently(self._pull_trials, stop.is_set)
 
@@ -279,7 +279,7 @@ class RemoteSweep:
         if record.status is TrialState.WAITING and not record.attempt:
             return  # never begun
         remote = self.trial(spec.folder_name)
-        remote.mirror(trial, checkpoints=True)
+        remote.download(trial, checkpoints=True)
         if trial.record() != record:
             return  # it said itself how it ended
         upload = Upload(remote, trial)

@@ -72,7 +72,7 @@ class RemoteTrial:
             trial.folder.mkdir(parents=True, exist_ok=True)
             trial.write_record(record)
 
-    def mirror(self, trial: TrialStore, keys: Sequence[str] | None = None, *, checkpoints: bool) -> None:
+    def download(self, trial: TrialStore, keys: Sequence[str] | None = None, *, checkpoints: bool) -> None:
         """Make a folder show the newest commit, and how far the trial has come since.
 
         What was said here of a running attempt from outside (``TrialStore.set_status``) stands until that one

@@ -19,11 +19,11 @@ from pathlib import Path
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import RedactedStream
-from recrl.orchestrator.sweep_progress import Standing, standing_of
+from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.client import ENVIRONMENT
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker
-from recrl.orchestrator.tracking.positions import mirror_folder
+from recrl.orchestrator.tracking.positions import sync_folder
 
 POLITENESS = 10  # added to the process's nice value: about a tenth of a core that a trial also wants
 LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is away
@@ -31,7 +31,7 @@ ORPHAN_SECONDS = 15.0  # trials outlive a killed launch by some seconds; the las
 
 
 @dataclass
-class Mirror:
+class BackgroundSync:
     """The process that keeps MLflow up to date during a launch; it ends when its parent does."""
 
     process: subprocess.Popen[bytes]
@@ -55,15 +55,15 @@ class Mirror:
             return False
 
 
-def start_mirror(store: SweepStore, uri: str, *, interval_seconds: float) -> Mirror:
-    """Keep MLflow up to date from a process of its own, until ``Mirror.stop`` or until this process dies.
+def start_sync(store: SweepStore, uri: str, *, interval_seconds: float) -> BackgroundSync:
+    """Keep MLflow up to date from a separate process, until ``stop`` is called or this process dies.
 
     Args:
         store: the sweep.
         uri: of ``tracking_uri``.
         interval_seconds: between two passes, above 0; longer while MLflow is away.
     """
-    folder = mirror_folder(store, uri)
+    folder = sync_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "recrl.orchestrator.tracking.background_sync", str(store.folder)]
     with open(os.open(folder / "log.txt", os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600), "ab") as log:
@@ -76,11 +76,11 @@ def start_mirror(store: SweepStore, uri: str, *, interval_seconds: float) -> Mir
             stderr=log,
             start_new_session=True,  # Ctrl-C is for the launch, which then says when to stop
         )
-    return Mirror(process)
+    return BackgroundSync(process)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Mirror a sweep until standard input closes; the process of ``start_mirror``."""
+    """Mirror a sweep until standard input closes; the process of ``start_sync``."""
     parser = argparse.ArgumentParser(
         prog="python -m recrl.orchestrator.tracking.background_sync", description=main.__doc__
     )
@@ -112,7 +112,7 @@ def _pass(tracker: Tracker, *, live: bool) -> SyncReport:
 
 def _any_runs(store: SweepStore) -> bool:
     records = (trial.record() for trial in store.trials())
-    return any(standing_of(record, now=time.time()) is Standing.RUNNING for record in records)
+    return any(display_status(record, now=time.time()) is DisplayStatus.RUNNING for record in records)
 
 
 def _is_over(parent: int, seconds: float) -> bool:

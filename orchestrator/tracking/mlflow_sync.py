@@ -32,7 +32,7 @@ from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter
 from recrl.orchestrator.tracking.points import Summary
-from recrl.orchestrator.tracking.positions import exclusive, mirror_folder
+from recrl.orchestrator.tracking.positions import exclusive, sync_folder
 from recrl.orchestrator.tracking.runs import SweepRuns
 from recrl.orchestrator.tracking.sweep_sync import SweepSync
 from recrl.orchestrator.tracking.trial_sync import TrialSync
@@ -88,7 +88,7 @@ def sync(
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:
     """Return the report of the last pass that ended, in whatever process; None if there was none."""
     try:
-        return SyncReport(**json.loads((mirror_folder(store, uri) / "report.json").read_text()))
+        return SyncReport(**json.loads((sync_folder(store, uri) / "report.json").read_text()))
     except (OSError, ValueError, TypeError):
         return None
 
@@ -128,7 +128,7 @@ class Tracker:
                 experiment_id=view.runs.experiment_id if view else "",
                 parent_run_id=view.runs.parent_id if view else "",
             )
-            write_json(mirror_folder(self.store, self.uri) / "report.json", asdict(report))
+            write_json(sync_folder(self.store, self.uri) / "report.json", asdict(report))
         self._view = None if done.problems else view
         return report
 
@@ -141,7 +141,7 @@ class _View:
     ) -> None:
         self.runs = SweepRuns(store, uri, rebuild=rebuild)
         if rebuild:
-            folder = mirror_folder(store, uri)
+            folder = sync_folder(store, uri)
             for path in (folder / "sweep.json", *folder.glob("trial-*.json")):
                 path.unlink(missing_ok=True)
         self._store = store

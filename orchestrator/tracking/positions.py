@@ -61,15 +61,15 @@ def read_position(path: Path) -> Position | None:
     return position if all(map(isinstance, values, kinds)) else None
 
 
-def mirror_folder(store: SweepStore, uri: str) -> Path:
+def sync_folder(store: SweepStore, uri: str) -> Path:
     """Return the folder of the positions for one MLflow store; the address itself may hold a password."""
-    return store.mirror_folder / hashlib.sha256(uri.encode()).hexdigest()[:10]
+    return store.sync_folder / hashlib.sha256(uri.encode()).hexdigest()[:10]
 
 
 @contextmanager
 def exclusive(store: SweepStore, uri: str) -> Iterator[None]:
     """Wait until no other process sends this sweep to this store; two would make every run twice."""
-    folder = mirror_folder(store, uri)
+    folder = sync_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
     with open_lock(folder / "lock") as file:
         fcntl.flock(file, fcntl.LOCK_EX)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.sweep_progress import Standing, standing_of
+from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 
 MAX_ERROR = 5_000  # characters of a failed trial's error
 
@@ -18,26 +18,26 @@ def mlflow_status(record: TrialRecord, *, live: bool) -> str:
         record: of the trial; ``attempt`` is at least 1.
         live: whether a launch runs that will resume what waits.
     """
-    match standing_of(record, now=time.time()):
-        case Standing.COMPLETE:
+    match display_status(record, now=time.time()):
+        case DisplayStatus.COMPLETE:
             return "FINISHED"
-        case Standing.FAILED | Standing.DAMAGED:
+        case DisplayStatus.FAILED | DisplayStatus.DAMAGED:
             return "FAILED"
-        case Standing.RUNNING:
+        case DisplayStatus.RUNNING:
             return "RUNNING"
-        case Standing.INTERRUPTED:
+        case DisplayStatus.INTERRUPTED:
             return "KILLED"
-        case Standing.STOPPED | Standing.WAITING:
+        case DisplayStatus.STOPPED | DisplayStatus.WAITING:
             return "SCHEDULED" if live else "KILLED"
 
 
-def sweep_status(counts: Mapping[Standing, int], *, live: bool) -> str:
-    """Return what MLflow calls the state of a sweep with so many trials of each standing."""
-    if live or counts[Standing.RUNNING]:
+def sweep_status(counts: Mapping[DisplayStatus, int], *, live: bool) -> str:
+    """Return what MLflow calls the state of a sweep with so many trials of each status."""
+    if live or counts[DisplayStatus.RUNNING]:
         return "RUNNING"
-    if counts[Standing.FAILED]:
+    if counts[DisplayStatus.FAILED]:
         return "FAILED"
-    complete = counts[Standing.COMPLETE] == sum(counts.values())
+    complete = counts[DisplayStatus.COMPLETE] == sum(counts.values())
     return "FINISHED" if complete else "KILLED"
 
 

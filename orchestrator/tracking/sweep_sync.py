@@ -9,10 +9,10 @@ from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.sweep_progress import Standing, standing_of
+from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.points import Summary, charts_page, note
-from recrl.orchestrator.tracking.positions import Position, mirror_folder, read_position
+from recrl.orchestrator.tracking.positions import Position, read_position, sync_folder
 from recrl.orchestrator.tracking.run_states import sweep_status
 from recrl.orchestrator.tracking.runs import SweepRuns
 
@@ -41,7 +41,7 @@ class SweepSync:
         self._store = store
         self._runs = runs
         self._summaries = summaries
-        folder = mirror_folder(store, uri)
+        folder = sync_folder(store, uri)
         self._path = folder / "sweep.json"
         known = read_position(self._path)
         self._position = known if known and known.run_id == runs.parent_id else Position(runs.parent_id)
@@ -68,11 +68,11 @@ class SweepSync:
     def _show_state(self, position: Position, records: dict[str, TrialRecord], *, live: bool) -> Position:
         from mlflow.entities import RunTag  # noqa: PLC0415
 
-        counts = Counter(standing_of(record, now=time.time()) for record in records.values())
+        counts = Counter(display_status(record, now=time.time()) for record in records.values())
         status = sweep_status(counts, live=live)
         text = note(
             self._store.name,
-            {standing: counts[standing] for standing in Standing},
+            {status: counts[status] for status in DisplayStatus},
             self._summaries(),
             charts=f"#{charts_page(self._runs.experiment_id)}",
         )

@@ -27,7 +27,7 @@ from recrl.orchestrator.tracking.points import (
     rows_after,
     thinned,
 )
-from recrl.orchestrator.tracking.positions import Position, file_mark, mirror_folder, read_position
+from recrl.orchestrator.tracking.positions import Position, file_mark, read_position, sync_folder
 from recrl.orchestrator.tracking.run_states import mlflow_status, state_tags
 from recrl.orchestrator.tracking.runs import SweepRuns
 
@@ -40,7 +40,7 @@ class TrialSync:
 
     def __init__(self, store: SweepStore, uri: str, runs: SweepRuns) -> None:
         self._runs = runs
-        self._folder = mirror_folder(store, uri)
+        self._folder = sync_folder(store, uri)
         self._positions: dict[str, Position] = {}
 
     def show(self, trial: TrialStore, *, live: bool) -> int:

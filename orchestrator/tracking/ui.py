@@ -15,7 +15,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking.address import is_server
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 from recrl.orchestrator.tracking.points import charts_page
-from recrl.orchestrator.tracking.positions import mirror_folder
+from recrl.orchestrator.tracking.positions import sync_folder
 
 # Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.
 SETTINGS = ("DO_NOT_TRACK=true", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false")
@@ -83,7 +83,7 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 1
     if is_server(uri):
         return UI(url, None)
     command = ui_command(store, uri, port=port)
-    log_path = mirror_folder(store, uri) / "ui.txt"
+    log_path = sync_folder(store, uri) / "ui.txt"
     with open(os.open(log_path, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o600), "wb") as log:
         environment = {**os.environ, "MLFLOW_BACKEND_STORE_URI": uri}
         server = subprocess.Popen(command, stdout=log, stderr=log, env=environment)

@@ -41,7 +41,7 @@ class NoCheckpointError(RecrlError):
 
 
 @dataclass(frozen=True, eq=False)
-class FrozenTrial:
+class SavedTrial:
     """The policy of a trial's newest intact checkpoint.
 
     Attributes:
@@ -61,7 +61,7 @@ class FrozenTrial:
     env_steps: int
 
     @classmethod
-    def thaw(cls, store: TrialStore) -> FrozenTrial:
+    def load(cls, store: TrialStore) -> SavedTrial:
         """The trial as its files have it.
 
         Raises:
@@ -168,14 +168,14 @@ class FrozenTrial:
         return f"step {shot.step}   return {shot.episode_return:.1f}   {costs}"
 
 
-def summary(rows: pd.DataFrame, frozen: FrozenTrial) -> list[dict[str, Any]]:
+def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
     """What an evaluation says, a row a policy, as finished text.
 
     Means are given with their standard errors; ``within`` is the share of the episodes in which no cost
     exceeded its d_d.
     """
-    costs = [f"cost_{i}" for i in range(frozen.cmdp.num_costs)]
-    limits = frozen.spec.deploy_limits.array
+    costs = [f"cost_{i}" for i in range(saved.cmdp.num_costs)]
+    limits = saved.spec.deploy_limits.array
     table = []
     for policy in FrozenPolicy:
         episodes = rows[rows["policy"] == policy]
@@ -184,13 +184,13 @@ def summary(rows: pd.DataFrame, frozen: FrozenTrial) -> list[dict[str, Any]]:
         within = float((episodes[costs].to_numpy() <= limits).all(axis=1).mean())
         table.append(
             {
-                "trial": frozen.spec.title,
-                "update": f"{frozen.update} of {frozen.spec.num_updates}",
+                "trial": saved.spec.title,
+                "update": f"{saved.update} of {saved.spec.num_updates}",
                 "policy": policy.value,
                 "episodes": str(len(episodes)),
                 "return": _mean_text(episodes["episode_return"]),
                 "costs": ", ".join(_mean_text(episodes[column]) for column in costs),
-                "d_d": ", ".join(f"{limit:g}" for limit in frozen.spec.deploy_limits),
+                "d_d": ", ".join(f"{limit:g}" for limit in saved.spec.deploy_limits),
                 "within": f"{within:.0%}",
             }
         )

@@ -13,7 +13,7 @@
     sweep = recrl.launch("demo.yaml")         # or recrl-sweep launch demo.yaml
     sweep = recrl.load_sweep("runs/demo")
 
-Importing this imports nothing else: each name is loaded when it is first used.
+Each name is imported when it is first used.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ SOURCE = "grid"
 
 
 def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
-    """Check a grid whole, without running it.
+    """Check a whole grid without running it.
 
     Args:
         grid: the path of a grid file, or its content as a dictionary.
@@ -41,11 +41,11 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
             author you trust.
 
     Returns:
-        The checked grid, every default filled in; ``trials()`` has its trials.
+        The checked grid with all defaults; ``trials()`` has its trials.
 
     Raises:
-        GridError: one sentence for every mistake, also in ``problems``.
-        RecrlError: no mistake was found, but something was not called; see ``trust``.
+        GridError: one sentence for each mistake, also in ``problems``.
+        RecrlError: no mistake was found, but an import path was not followed; see ``trust``.
 
     Example:
         >>> import recrl
@@ -71,25 +71,25 @@ def launch(
 ) -> Sweep:
     """Run every trial of a grid that is not complete, as ``recrl-sweep launch`` does.
 
-    The same call goes on after a crash or Ctrl-C. It imports what the grid names by an import path.
+    The same call continues after a crash or Ctrl-C. It follows the grid's import paths.
 
     Args:
         grid: the path of a grid file, or its content as a dictionary.
         root: the folder of all sweeps.
-        executor: ``ray``, side by side on all cores or a cluster; or ``inline``, one after the other in this
+        executor: ``ray``, in parallel on all cores or a cluster; or ``inline``, one after the other in this
             process.
         address: of an existing Ray cluster; by default one is started here.
-        max_concurrent: trials at once, at most.
-        mlflow: whether to show the sweep in MLflow.
+        max_concurrent: largest number of parallel trials.
+        mlflow: whether to log the sweep to MLflow.
         figures: whether to draw figures and the report at the end.
         progress: whether to print progress and results.
 
     Returns:
-        The sweep, as ``load_sweep`` reads it. Its frame ``trials`` says which trials are complete.
+        The sweep, as from ``load_sweep``. Its table ``trials`` shows which trials are complete.
 
     Raises:
         GridError: the grid is wrong; nothing was started.
-        RecrlError: the sweep is run by another process, or Ray, MLflow or the disk cannot be used.
+        RecrlError: another process runs the sweep, or Ray, MLflow or the disk cannot be used.
     """
     from recrl.orchestrator.cli.requests import LaunchRequest  # noqa: PLC0415
 
@@ -133,20 +133,19 @@ def train(
 ) -> Training:
     """Train one agent on one task under one curriculum, in this process and on one core.
 
-    PyTorch uses one thread meanwhile, which is much faster for small networks; then its setting is restored.
-    The result is the same as that of a sweep's trial with these settings, byte for byte.
+    Meanwhile PyTorch uses one thread, which is much faster for small networks. The result equals that of a
+    sweep's trial with these settings, byte for byte.
 
     Args:
         task: its name, or a mapping with ``name`` and ``options``.
         agent: likewise.
         method: the curriculum, likewise; ``none`` trains under the deployment limits from the start.
         total_steps: environment steps of both phases, over all environments.
-        deploy_limits: deployment limits d_d, undiscounted cost per episode: one number for every cost, or a
-            list with one number a cost.
+        deploy_limits: deployment limits d_d, undiscounted cost per episode: one number for all costs, or a
+            list with one number per cost.
         train_limits: training limits d_t at the start, at least d_d, likewise; ``auto`` measures them.
         seed: of the trial, at least 0.
-        folder: where to keep the files, as a sweep of one trial; the same call goes on from there. None keeps
-            none.
+        folder: for the files, as a sweep of one trial; the same call continues from there. None for no files.
         progress: whether to print a line that shows return and cost.
         **run: other settings of a grid's section ``run``: ``deploy_fraction``, ``num_envs``,
             ``rollout_steps``, ``evaluation_episodes``.
@@ -155,7 +154,7 @@ def train(
         The data frames and the policy.
 
     Raises:
-        GridError: an argument is wrong; one sentence for every mistake.
+        GridError: an argument is wrong; one sentence for each mistake.
         RecrlError: the trial failed; its traceback is a note of the error.
 
     Example:
@@ -196,12 +195,12 @@ def train(
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """What ``train`` returns.
+    """Result of ``train``.
 
     Attributes:
         sweep: the data frames, as ``load_sweep`` describes them.
         policy: the final policy.
-        folder: the trial's folder, or None where no files were kept.
+        folder: the trial's folder, or None without files.
     """
 
     sweep: Sweep
@@ -210,12 +209,12 @@ class Training:
 
     @property
     def updates(self) -> pd.DataFrame:
-        """A row a policy update: end_step, episode_return, cost_i, limit_i, and the agent's metrics."""
+        """One row per policy update: end_step, episode_return, cost_i, limit_i, and the agent's metrics."""
         return self.sweep.updates
 
     @property
     def evaluations(self) -> pd.DataFrame:
-        """A row an episode of the final policy, stochastic and deterministic: episode_return, cost_i."""
+        """One row per episode of the final policy, stochastic and deterministic: episode_return, cost_i."""
         return self.sweep.evaluations
 
 
@@ -224,7 +223,7 @@ def _scratch(stack: ExitStack) -> Path:
 
 
 def _checked(grid: Grid) -> GridSpec:
-    """The grid of a file or of a dictionary; the mistakes in a dictionary have no lines."""
+    """Read the grid of a file or of a dictionary; mistakes in a dictionary have no line numbers."""
     if isinstance(grid, str | Path):
         return read_grid(Path(grid))
     try:
@@ -259,7 +258,7 @@ def one_thread() -> Iterator[None]:
 
 
 class _Line(logging.Handler):
-    """Shows the newest line of a trial's log in place."""
+    """Handler that shows the newest line of a trial's log in place."""
 
     def emit(self, record: logging.LogRecord) -> None:
         sys.stderr.write(f"\r{record.getMessage():<79.79}")
@@ -268,7 +267,7 @@ class _Line(logging.Handler):
 
 @contextmanager
 def shown_progress(wanted: bool) -> Iterator[None]:
-    """Show how far a trial in this process is, on one line of the standard error."""
+    """Show the progress of a trial in this process, on one line of the standard error."""
     if not wanted:
         yield
         return

@@ -1,4 +1,4 @@
-"""Sweeps and policies in Python: reading what a sweep left, and acting with a policy that it learnt."""
+"""Sweeps and policies in Python: read results, and act with a trained policy."""
 
 from __future__ import annotations
 
@@ -25,16 +25,15 @@ if TYPE_CHECKING:
 def load_sweep(
     source: str | Path, name: str | None = None, *, root: str | Path = "runs", trust: bool = False
 ) -> Sweep:
-    """Read a finished or running sweep as tidy data frames.
+    """Read a finished or running sweep as tidy tables.
 
     Args:
-        source: the sweep's folder (``runs/demo``), its name below ``root``, its grid file, a file that
-            ``recrl-sweep export`` wrote (``demo.zip``), or an MLflow address (``http://host:port``,
-            ``sqlite:///file.db``).
-        name: of the sweep; needed with an MLflow address that holds several.
+        source: the sweep's folder (``runs/demo``), its name below ``root``, its grid file, an export
+            (``demo.zip``), or an MLflow address (``http://host:port``, ``sqlite:///file.db``).
+        name: of the sweep; required for an MLflow address with several.
         root: the folder of all sweeps, for a name.
-        trust: whether to run code that the sweep names by an import path, to compute the optimum of a task.
-            Do so only with files whose author you trust.
+        trust: whether to follow the sweep's import paths, to compute the optimum of a task. This runs their
+            code: do so only with files whose author you trust.
 
     Returns:
         An object with the data frames ``trials``, ``phases``, ``updates``, ``evaluations``, ``events`` and
@@ -66,9 +65,9 @@ def load_policy(trial: str | Path, *, seed: int | None = 0, trust: bool = False)
 
     Args:
         trial: the trial's folder, which ``recrl-sweep logs demo 3f2a --folder`` prints.
-        seed: of the policy's random numbers; None for a different one each time.
-        trust: whether to run code that the trial names by an import path. Do so only with files whose author
-            you trust.
+        seed: of the policy's random numbers; None for a random one.
+        trust: whether to follow the trial's import paths. This runs their code: do so only with files whose
+            author you trust.
 
     Returns:
         The policy, which does not learn.
@@ -91,17 +90,17 @@ def load_policy(trial: str | Path, *, seed: int | None = 0, trust: bool = False)
 
 
 def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:
-    """The policy in a trial's files."""
-    from recrl.orchestrator.trial.saved_policy import FrozenTrial  # noqa: PLC0415
+    """Load the policy from a trial's files."""
+    from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415
 
     trial.require_whole()
-    frozen = FrozenTrial.thaw(trial)
-    return Policy(frozen.policy, frozen.cmdp, frozen.spec, frozen.update, np.random.default_rng(seed))
+    saved = SavedTrial.load(trial)
+    return Policy(saved.policy, saved.cmdp, saved.spec, saved.update, np.random.default_rng(seed))
 
 
 @contextmanager
 def following(trust: bool) -> Iterator[None]:
-    """Follow the import paths of files only where their author is trusted; errors say how."""
+    """Follow the import paths of files only if their author is trusted; errors say how."""
     try:
         with nullcontext() if trust else refuse_import_paths():
             yield
@@ -117,10 +116,10 @@ class Policy:
 
     Attributes:
         final: chooses the actions.
-        cmdp: what the task fixes: ``observation_space``, ``action_space``, ``cost_names``, ``horizon``.
-        spec: the trial that trained it.
-        update: policy updates that it has learnt for.
-        generator: where ``act`` draws its random numbers.
+        cmdp: the task's CMDP: ``observation_space``, ``action_space``, ``cost_names``, ``horizon``.
+        spec: specification of its trial.
+        update: number of its policy updates.
+        generator: random numbers of ``act``.
     """
 
     final: FinalPolicy
@@ -133,13 +132,13 @@ class Policy:
         """Choose actions.
 
         Args:
-            observation: one observation [n], or a batch [B, n], as ``recrl.make`` and ``recrl.make_env``
-                give them.
+            observation: one observation [n], or a batch [B, n], as from ``recrl.make`` and
+                ``recrl.make_env``.
             deterministic: whether to take the mode of the policy instead of a sample.
 
         Returns:
-            Of a batch int64 [B] (discrete actions) or float32 [B, m] (continuous ones, within the task's
-            bounds); of one observation an int or float32 [m].
+            For a batch, int64 [B] (discrete actions) or float32 [B, m] (continuous ones, within the task's
+            bounds). For one observation, an int or float32 [m].
 
         Raises:
             ValueError: the observation has another shape.
@@ -161,5 +160,5 @@ class Policy:
         return int(actions[0]) if actions.ndim == 1 else actions[0]
 
     def seed(self, seed: int) -> None:
-        """Start the policy's random numbers anew."""
+        """Restart the policy's random numbers."""
         self.generator = np.random.default_rng(seed)

@@ -22,14 +22,14 @@ def make(task: str, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
 
     Args:
         task: its name (``recrl-sweep list tasks``), or ``package.module:attribute``.
-        num_envs: B, environments that are stepped together, at least 1.
+        num_envs: B, number of environments, at least 1.
         **options: of the task (``recrl-sweep options TASK``).
 
     Returns:
         A vector environment. ``step(actions)`` takes actions [B] or [B, m]. It returns observations [B, n],
         rewards [B], terminated [B], truncated [B] and ``info``; ``info["cost"]`` holds each step's costs,
         [B, k]. An environment whose episode ended is reset in the same step, and ``info["final_obs"]`` has
-        the last observation. ``cmdp`` says what the task fixes.
+        the last observation. ``cmdp`` describes the task.
 
     Raises:
         RecrlError: there is no such task, or an option is wrong.
@@ -46,7 +46,7 @@ def make(task: str, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
 
 
 def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
-    """Make a task as one Gymnasium environment, which can draw itself (``render()`` is RGB).
+    """Make a task as one Gymnasium environment, with rendering (``render()`` is RGB).
 
     Args:
         task: as for ``make``.
@@ -54,7 +54,7 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
 
     Returns:
         An environment with flat observations [n], which a policy's ``act`` takes. ``info["cost"]`` holds each
-        step's costs, [k]. An environment of your own draws itself if it takes the keyword ``render_mode``.
+        step's costs, [k]. Your own environment can render if it takes the keyword ``render_mode``.
 
     Raises:
         RecrlError: there is no such task, an option is wrong, or the task exists as a vector only.
@@ -81,12 +81,12 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
 
 
 def _with_cost_arrays(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-    """The environment with ``info["cost"]`` as an array [k] also where it reports a number."""
+    """Wrapper with ``info["cost"]`` as an array [k], also if the environment reports a number."""
     import numpy as np  # noqa: PLC0415
     from gymnasium import Wrapper  # noqa: PLC0415
 
     class CostArrays(Wrapper[Any, Any, Any, Any]):
-        """Costs as arrays."""
+        """Convert costs to arrays."""
 
         def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
             observation, reward, terminated, truncated, info = super().step(action)
@@ -97,7 +97,7 @@ def _with_cost_arrays(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any
 
 
 def _check(task: str, options: dict[str, Any]) -> None:
-    """Say every mistake in the options in the words of a grid's check."""
+    """Report all mistakes in the options, as the check of a grid does."""
     try:
         model = options_model(task)
         model.model_validate(options)

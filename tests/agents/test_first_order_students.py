@@ -46,9 +46,9 @@ def test_p3os_gain_is_the_one_computed_by_hand() -> None:
     # Reward: only sample 2 has moved, its ratio counts as 1.2: (0.2 * 2) / 6 spreads.
     # Cost: its centred advantage is 0, so the surrogate stays 0 and the violation 0.3 stands.
     gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(0.3), clip=CLIP, factor=KAPPA)
-    value, price = gain(ratios)
+    value, weight = gain(ratios)
     assert float(value) == pytest.approx((0.4 / 6.0 - KAPPA * 0.3) / SPREAD, rel=1e-5)
-    assert price == KAPPA
+    assert weight == KAPPA
 
 
 def test_p3o_is_pessimistic_about_cost() -> None:
@@ -61,9 +61,9 @@ def test_p3o_is_pessimistic_about_cost() -> None:
 
 def test_a_constraint_that_holds_costs_p3o_nothing() -> None:
     gain = penalised_surrogate_objective(BATCH, REWARDS, COSTS, violation(-1.0), clip=CLIP, factor=KAPPA)
-    value, price = gain(torch.ones(6))
+    value, weight = gain(torch.ones(6))
     assert float(value) == pytest.approx(0.0, abs=1e-6)
-    assert price == 0.0
+    assert weight == 0.0
 
 
 def test_the_barrier_is_a_logarithm_that_goes_on_along_its_tangent() -> None:
@@ -87,10 +87,10 @@ def test_the_barriers_slopes_are_its_finite_differences() -> None:
 
 def test_ipos_gain_is_the_one_computed_by_hand() -> None:
     config = IPOConfig(barrier_sharpness=10.0, barrier_slope=20.0, clip=CLIP)
-    value, price = barrier_surrogate_objective(BATCH, REWARDS, COSTS, violation(-0.5), config)(torch.ones(6))
+    value, weight = barrier_surrogate_objective(BATCH, REWARDS, COSTS, violation(-0.5), config)(torch.ones(6))
     slack = 0.5 / SPREAD
     assert float(value) == pytest.approx(math.log(slack) / 10.0, rel=1e-5)
-    assert price == pytest.approx(1.0 / (10.0 * slack), rel=1e-5)
+    assert weight == pytest.approx(1.0 / (10.0 * slack), rel=1e-5)
 
 
 def test_ipo_counts_relief_up_to_the_clip_range_and_the_papers_goes_on() -> None:

@@ -1,8 +1,8 @@
-"""Whether memory stays flat over a long trial: of the worker, the driver, the teacher service and the mirror.
+"""Memory over a long trial: of the worker, the driver, the teacher service and the MLflow sync.
 
     OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_memory [--task river-grid] [--updates 3000]
 
-One trial on Ray with the teacher service and a mirror to MLflow, as a launch has them. The resident memory of
+One trial on Ray with the teacher service and the MLflow sync, as a launch has them. The resident memory of
 every process is read once a second. Its median in the tenth of the time behind the warm-up (the first
 fifth) is held against that in the last tenth. On a machine that others use the trial takes longer; its memory
 is the same.
@@ -27,7 +27,7 @@ from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.executor import RayExecutor
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_sync
 from tests.benchmarks.bench_overhead import car_trial, family
 
 LOOK_SECONDS = 1.0
@@ -37,7 +37,7 @@ NAMES = {  # by what the command line has in it, the first that fits
     "ray::DashboardAgent": "",
     "ray::RuntimeEnvAgent": "",
     "ray::": "worker",
-    "tracking_mirror": "mirror",
+    "background_sync": "MLflow sync",
     "gcs_server": "Ray: gcs_server",
     "raylet/raylet": "Ray: raylet",
     "log_monitor.py": "Ray: log monitor",
@@ -127,17 +127,17 @@ def medians(looks: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
 def bench(spec: TrialSpec, root: Path) -> None:
     """Run a trial and say what its processes held."""
     store = SweepStore(root, "memory")
-    mirror = start_mirror(store, tracking_uri(store, None), interval_seconds=5.0)
+    sync = start_sync(store, tracking_uri(store, None), interval_seconds=5.0)
     with local_cluster(num_cpus=1), MemoryWatch() as watch:
         RayExecutor(num_cpus=1).run([spec], LocalSweep(store), threading.Event())
-    mirrored = mirror.stop(timeout=600.0)
+    synced = sync.stop(timeout=600.0)
     record = store.trial(spec).record()
     episodes = len(store.trial(spec).episodes())
     seconds = max(looks[-1][0] for looks in watch.seen.values())
     print(
         f"{spec.title}: {record.status}, {record.env_steps:,} steps, {record.update:,} updates, "
         f"{episodes:,} episodes, {record.cpu_seconds:.0f} CPU s in {seconds:.0f} s; "
-        f"MLflow up to date: {mirrored}"
+        f"MLflow up to date: {synced}"
     )
     print(f"  {'MB':20} {'at 20-30%':>10} {'at 50-60%':>10} {'at 90-100%':>10} {'growth':>8}")
     for name, looks in sorted(watch.seen.items()):

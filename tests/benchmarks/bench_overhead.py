@@ -3,14 +3,14 @@
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_overhead.py [--updates 30] [--trials 2000]
 
 First one trial of CarGoal2 (``ppo-lag``, 256x256, 16 environments) in this process. Its files: the CPU time
-of its thread inside the writer, heartbeats included, with a commit every 20 seconds. MLflow: the mirror's
+of its thread inside the writer, heartbeats included, with a commit every 20 seconds. MLflow: the sync
 process beside the trial, as a launch has it, less that over an empty sweep. Both go by the clock. Where
 others take the core from the trial, they look larger beside its CPU time than they are beside a core: the
 second share is that of a trial with a core of its own. The aim is at most 2% of it. Ray, the driver and the
 teacher service are in ``bench_ray_processes``.
 
 Then the whole command over many trials of some milliseconds: wall seconds, on a quiet machine only. The
-mirror may take 120 s after a launch; ``sync`` shows what it could not.
+sync may take 120 s after a launch; ``sync`` shows what it could not.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from typing import Any
 import torch
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.cli.launch import MIRROR_INTERVAL_SECONDS
+from recrl.orchestrator.cli.launch import SYNC_INTERVAL_SECONDS
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.trial.runner import run_trial
 from recrl.teachers.registry import make_teacher
 
@@ -97,13 +97,13 @@ def inline_trial(store: SweepStore, spec: TrialSpec) -> tuple[float, float, floa
 
 
 @contextmanager
-def mirrored(store: SweepStore) -> Iterator[list[float]]:
-    """Have a mirror meanwhile, as a launch has one; the list then holds the CPU seconds of its process."""
+def syncing(store: SweepStore) -> Iterator[list[float]]:
+    """Sync to MLflow meanwhile, as a launch does; the list then holds the CPU seconds of its process."""
     before, used = children_cpu(), list[float]()
-    mirror = start_mirror(store, tracking_uri(store, None), interval_seconds=MIRROR_INTERVAL_SECONDS)
+    sync = start_sync(store, tracking_uri(store, None), interval_seconds=SYNC_INTERVAL_SECONDS)
     yield used
-    if not mirror.stop(timeout=600.0):
-        sys.exit("the mirror did not come to its end")
+    if not sync.stop(timeout=600.0):
+        sys.exit("the MLflow sync did not end")
     used.append(children_cpu() - before)
 
 
@@ -133,10 +133,10 @@ def family() -> dict[int, list[str]]:
 
 def bench_trial(root: Path, updates: int) -> None:
     torch.set_num_threads(1)
-    with mirrored(SweepStore(root, "empty")) as of_nothing:
+    with syncing(SweepStore(root, "empty")) as of_nothing:
         pass
     store = SweepStore(root, "inline")
-    with mirrored(store) as of_trial:
+    with syncing(store) as of_trial:
         began = time.monotonic()
         trial, files, teacher = inline_trial(store, car_trial(updates))
         clock = time.monotonic() - began
@@ -185,7 +185,7 @@ def bench_many(root: Path, trials: int) -> None:
 
 def show_behind(store: SweepStore) -> None:
     """How many trials MLflow does not show yet."""
-    shown = len(list(store.mirror_folder.glob("*/trial-*.json")))
+    shown = len(list(store.sync_folder.glob("*/trial-*.json")))
     print(f"  ({len(store.trials()) - shown} trials not in MLflow yet)", flush=True)
 
 

@@ -16,8 +16,8 @@ In Button a gremlin is led: what it is tied to must move before every physics st
 count cannot do. So there are two bare speeds: "bare", the same call as elsewhere, in which the gremlin hangs
 still, tied to a lead that does not move; and "led", ten calls of ``mj_step`` with the lead moved in between,
 which is what the task's physics needs. The first is the higher hurdle: it does less than the task, and pays
-for Python once instead of ten times. In both the gremlin is tied throughout, as the model has it; our worlds
-tie it only while the robot is near, and that is part of what is measured.
+for Python once instead of ten times. In both the gremlin is tied throughout, as in the model. Ours tie it
+only while the robot is near, and that is part of the measurement.
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ def timed(work: Callable[[], object], clock: Callable[[], float]) -> float:
 class Bare:
     """Simulations stepped by MuJoCo alone."""
 
-    def __init__(self, worlds: SafetyGymBatch) -> None:
-        self.model = worlds.scene.model
-        self.datas = [mujoco.MjData(self.model) for _ in range(worlds.number)]
+    def __init__(self, batch: SafetyGymBatch) -> None:
+        self.model = batch.scene.model
+        self.datas = [mujoco.MjData(self.model) for _ in range(batch.number)]
         self.generator = np.random.default_rng(0)
-        self.restart(worlds)
+        self.restart(batch)
 
-    def restart(self, worlds: SafetyGymBatch) -> None:
-        """Begin where these worlds are; gremlins where the model has them."""
-        state, scene = mujoco.mjtState.mjSTATE_INTEGRATION.value, worlds.scene
-        for data, row in zip(self.datas, worlds.simulations.rows, strict=True):
+    def restart(self, batch: SafetyGymBatch) -> None:
+        """Begin where the environments are; gremlins where the model has them."""
+        state, scene = mujoco.mjtState.mjSTATE_INTEGRATION.value, batch.scene
+        for data, row in zip(self.datas, batch.simulations.rows, strict=True):
             mujoco.mj_resetData(self.model, data)
             mujoco.mj_setState(self.model, data, row, state)
             if scene.gremlin_mocap >= 0:
@@ -92,10 +92,10 @@ class Bare:
 class Led(Bare):
     """Simulations whose gremlin is led, stepped by MuJoCo alone."""
 
-    def restart(self, worlds: SafetyGymBatch) -> None:
-        """Begin where these worlds are."""
-        super().restart(worlds)
-        self.gremlin = worlds.scene.gremlin_mocap
+    def restart(self, batch: SafetyGymBatch) -> None:
+        """Begin where the environments are."""
+        super().restart(batch)
+        self.gremlin = batch.scene.gremlin_mocap
         self.substeps = 0
 
     def steps(self) -> None:
@@ -161,9 +161,9 @@ def measure(name: str, repeats: int) -> tuple[Floats, Floats]:
 class Batch:
     """MuJoCo's own batch, which steps simulations on its own threads and computes nothing of ours."""
 
-    def __init__(self, worlds: SafetyGymBatch, num_threads: int) -> None:
-        model, rows = worlds.scene.model, worlds.simulations.rows
-        self.batch: Any = mujoco.batch.Batch(model, worlds.number, nthread=num_threads, persistent=True)
+    def __init__(self, batch: SafetyGymBatch, num_threads: int) -> None:
+        model, rows = batch.scene.model, batch.simulations.rows
+        self.batch: Any = mujoco.batch.Batch(model, batch.number, nthread=num_threads, persistent=True)
         data, state = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
         for index, row in enumerate(rows):
             mujoco.mj_setState(model, data, row, state)
@@ -204,9 +204,9 @@ def step_in_turns(
     name: str, rank: int, rounds: int, barrier: Barrier, counts: Queue[tuple[bool, int, int]]
 ) -> None:
     """What one of several processes does: step alone if it is the first, then with all others."""
-    worlds = SafetyGymVectorEnv(name, NUM_ENVS)
-    worlds.reset(seed=rank)
-    bare = Bare(worlds.batch)
+    environments = SafetyGymVectorEnv(name, NUM_ENVS)
+    environments.reset(seed=rank)
+    bare = Bare(environments.batch)
     for turn in range(rounds):
         for together in (False, True):
             barrier.wait()

@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_tracking.py [--trials 20] [--updates 300]
 
-The mirror's process is run over a made-up, finished sweep and its CPU seconds are counted, so a busy machine
-matters little. The aim: below 5% of the CPU time of the trials themselves.
+The MLflow sync process is run over a made-up, finished sweep. Its CPU seconds are counted, so a busy
+machine matters little. The aim: below 5% of the CPU time of the trials themselves.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from recrl.environments.cmdp import CostLimits, Phase
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 STEPS_PER_UPDATE = 3200
@@ -74,11 +74,11 @@ def write_sweep(root: Path, *, trials: int, updates: int) -> SweepStore:
     return store
 
 
-def mirror_seconds(store: SweepStore, uri: str) -> tuple[float, float]:
-    """CPU and wall seconds of the mirror's whole process over the sweep as it is."""
+def sync_seconds(store: SweepStore, uri: str) -> tuple[float, float]:
+    """CPU and wall seconds of the whole sync process over the sweep as it is."""
     cpu, wall = children_cpu(), time.monotonic()
-    if not start_mirror(store, uri, interval_seconds=3600.0).stop(timeout=3600.0):
-        sys.exit(f"the mirror did not come to its end: {last_report(store, uri)}")
+    if not start_sync(store, uri, interval_seconds=3600.0).stop(timeout=3600.0):
+        sys.exit(f"the MLflow sync did not end: {last_report(store, uri)}")
     return children_cpu() - cpu, time.monotonic() - wall
 
 
@@ -97,10 +97,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         store = write_sweep(Path(folder), trials=arguments.trials, updates=arguments.updates)
         empty = SweepStore(Path(folder), "empty")
-        base, _ = mirror_seconds(empty, tracking_uri(empty, None))
+        base, _ = sync_seconds(empty, tracking_uri(empty, None))
         uri = tracking_uri(store, None)
-        cpu, wall = mirror_seconds(store, uri)
-        again, _ = mirror_seconds(store, uri)
+        cpu, wall = sync_seconds(store, uri)
+        again, _ = sync_seconds(store, uri)
         size = store.mlflow_database.stat().st_size
     per_trial = (cpu - base) / arguments.trials
     share = cpu / (arguments.trials * arguments.trial_seconds)

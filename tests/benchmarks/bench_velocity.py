@@ -46,9 +46,9 @@ PEER = {
 class Bare:
     """Simulations stepped by MuJoCo alone."""
 
-    def __init__(self, worlds: VelocityBatch) -> None:
-        self.batch, self.task, self.model = worlds, worlds.task, worlds.model
-        self.datas = [mujoco.MjData(self.model) for _ in range(worlds.number)]
+    def __init__(self, batch: VelocityBatch) -> None:
+        self.batch, self.task, self.model = batch, batch.task, batch.model
+        self.datas = [mujoco.MjData(self.model) for _ in range(batch.number)]
 
     def begin(self) -> None:
         """Begin where the environments are."""

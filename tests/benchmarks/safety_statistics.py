@@ -57,16 +57,16 @@ def push(box: Floats, goal: Floats) -> Floats:
     return drive(box - 0.35 * towards)
 
 
-def scripted(worlds: SafetyGymBatch) -> Floats:
+def scripted(batch: SafetyGymBatch) -> Floats:
     """The scripted policy's actions, [B, 2]."""
-    rotation = rotation_matrices(worlds.qpos[:, 3:7])
-    flat = np.zeros((worlds.number, worlds.points.shape[1], 3))
-    flat[..., :2] = worlds.points
-    ego = ((flat - worlds.qpos[:, None, :3]) @ rotation)[..., :2]
-    goal = ego[:, worlds.group["goal"].start]
-    if worlds.task.goal != "Push":
+    rotation = rotation_matrices(batch.qpos[:, 3:7])
+    flat = np.zeros((batch.number, batch.points.shape[1], 3))
+    flat[..., :2] = batch.points
+    ego = ((flat - batch.qpos[:, None, :3]) @ rotation)[..., :2]
+    goal = ego[:, batch.group["goal"].start]
+    if batch.task.goal != "Push":
         return np.stack([drive(place) for place in goal])
-    box = ego[:, worlds.group["box"].start]
+    box = ego[:, batch.group["box"].start]
     return np.stack([push(*places) for places in zip(box, goal, strict=True)])
 
 

@@ -80,13 +80,13 @@ def test_of_several_objects_each_sector_shows_the_one_that_reads_most() -> None:
 def test_a_robot_sees_every_kind_of_object_where_it_is(name: str) -> None:
     environment = SafetyGymVectorEnv(name, 2)
     environment.reset(seed=3)
-    worlds, task = environment.batch, environment.batch.task
+    batch, task = environment.batch, environment.batch.task
     for action in np.random.default_rng(0).uniform(-1.0, 1.0, (30, 2, 2)):
         seen = environment.step(action)[0]
-        for index, robot in enumerate(worlds.qpos[:, :7]):
-            offsets = np.zeros((worlds.points.shape[1], 3)) - robot[:3]
-            offsets[:, :2] += worlds.points[index]
+        for index, robot in enumerate(batch.qpos[:, :7]):
+            offsets = np.zeros((batch.points.shape[1], 3)) - robot[:3]
+            offsets[:, :2] += batch.points[index]
             places = offsets @ rotation_matrices(robot[3:])
-            for kind, group in worlds.group.items():
+            for kind, group in batch.group.items():
                 expected = np.max([literal_reading(x, y) for x, y, _ in places[group]], axis=0)
                 np.testing.assert_allclose(seen[index, task.where(f"{kind}_lidar")], expected, atol=2e-6)

@@ -1,4 +1,4 @@
-"""Our worlds, put into recorded states, observe, earn and pay what was recorded."""
+"""Our environments, put into recorded states, observe, earn and pay what was recorded."""
 
 from __future__ import annotations
 

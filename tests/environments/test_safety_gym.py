@@ -30,9 +30,9 @@ def held_actions(steps: int, num_envs: int, seed: int = 0) -> npt.NDArray[np.flo
 
 def drive(environment: SafetyGymEnv) -> npt.NDArray[np.float64]:
     """Turn the Car towards the goal's place in its own frame, and drive; its front is -y."""
-    worlds = environment.batch
-    offset = worlds.points[0, worlds.group["goal"].start] - worlds.qpos[0, :2]
-    x, y = offset @ rotation_matrices(worlds.qpos[0, 3:7])[:2, :2]
+    batch = environment.batch
+    offset = batch.points[0, batch.group["goal"].start] - batch.qpos[0, :2]
+    x, y = offset @ rotation_matrices(batch.qpos[0, 3:7])[:2, :2]
     angle = np.arctan2(x, -y)
     forwards, turn = max(np.cos(angle), 0.0), np.clip(angle, -1.0, 1.0)
     wheels: npt.NDArray[np.float64] = np.clip(np.array([forwards + turn, forwards - turn]), -1.0, 1.0)
@@ -184,19 +184,19 @@ def test_costs_of_a_task_without_hazards_cannot_be_told_apart() -> None:
 def test_reaching_a_goal_pays_one_and_brings_another() -> None:
     environment = SafetyGymEnv("CarGoal0")
     environment.reset(seed=3)
-    worlds = environment.batch
+    batch = environment.batch
     goals = 0
     while goals < 3:
-        before = worlds.distances[0, 0]
+        before = batch.distances[0, 0]
         _, reward, terminated, truncated, info = environment.step(drive(environment))
         assert not terminated
         assert not truncated
         if info["goal_met"]:
             goals += 1
             assert 1.0 < reward < 1.0 + 0.1
-            assert worlds.distances[0, 0] > 0.4 + 0.305 - 1e-9
+            assert batch.distances[0, 0] > 0.4 + 0.305 - 1e-9
         else:
-            assert reward == pytest.approx(before - worlds.distances[0, 0])
+            assert reward == pytest.approx(before - batch.distances[0, 0])
 
 
 def test_buttons_hide_for_ten_steps_after_one_was_pressed() -> None:
@@ -278,18 +278,18 @@ def test_an_unknown_task_or_option_is_refused() -> None:
 def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -> None:
     environment = SafetyGymVectorEnv(name, 4)
     environment.reset(seed=5)
-    worlds, model = environment.batch, environment.batch.scene.model
-    kinds = list(worlds.scene.touchable.values())
-    felt, data = 0, worlds.simulations.data(0)
+    batch, model = environment.batch, environment.batch.scene.model
+    kinds = list(batch.scene.touchable.values())
+    felt, data = 0, batch.simulations.data(0)
     for action in held_actions(250, 4, seed=2):
         environment.step(action)
         for index in range(4):
-            contact = worlds.simulations.data(index, into=data).contact
+            contact = batch.simulations.data(index, into=data).contact
             roots = model.body_rootid[model.geom_bodyid[contact.geom]]
-            others = {int(other) for pair in roots for other in pair if worlds.scene.robot_body in pair}
+            others = {int(other) for pair in roots for other in pair if batch.scene.robot_body in pair}
             for bodies in kinds:
                 expected = [body in others for body in range(bodies.start, bodies.stop)]
-                assert worlds.touching[index, bodies].tolist() == expected
+                assert batch.touching[index, bodies].tolist() == expected
                 felt += sum(expected)
     assert felt > 0 or name == "CarPush2" or name.startswith("Point")
 

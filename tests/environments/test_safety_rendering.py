@@ -23,7 +23,7 @@ def drawing(task: str) -> SafetyGymEnv:
 
 
 @pytest.mark.parametrize("task", ["CarGoal2", "CarButton2", "PointPush2"])
-def test_a_picture_is_rgb_and_changes_with_the_world(task: str) -> None:
+def test_a_picture_is_rgb_and_changes_with_the_state(task: str) -> None:
     environment = drawing(task)
     first = environment.render()
     assert first.shape == (360, 480, 3)
@@ -59,7 +59,7 @@ def test_drawing_changes_nothing() -> None:
     seen.close()
 
 
-def test_a_batch_gives_a_picture_of_each_world() -> None:
+def test_a_batch_gives_a_picture_of_each_environment() -> None:
     drawing("CarGoal1").close()
     environment = SafetyGymVectorEnv("CarGoal1", 2, render_mode="rgb_array")
     environment.reset(seed=0)

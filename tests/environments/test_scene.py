@@ -74,7 +74,7 @@ def test_computed_sensors_are_those_of_mujoco(robot: str) -> None:
     record = task_record(scene, memory, 1000)
     generator = np.random.default_rng(0)
     for _ in range(100):
-        memory.worlds["action"] = generator.uniform(-1.0, 1.0, 2)
+        memory.environments["action"] = generator.uniform(-1.0, 1.0, 2)
         step.ctypes(model._address, data._address, 0, record.ctypes.data)
         for name, _ in task.components:
             if not name.startswith("ball") and not name.endswith("lidar"):

@@ -241,7 +241,7 @@ def test_a_view_outlives_its_simulations() -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize(("num_threads", "exit_code"), [(1, 1), (2, 42)])
-def test_a_fork_uses_simulations_of_one_thread_and_is_told_to_make_others_anew(
+def test_a_fork_uses_simulations_of_one_thread_and_gets_an_error_that_says_to_make_others(
     num_threads: int, exit_code: int
 ) -> None:
     simulations = many(num_threads)
@@ -259,7 +259,7 @@ def _count_and_exit(simulations: Simulations) -> None:
         simulations.apply(count, numbers.ctypes.data)
     except PhysicsError as error:
         assert str(error) == (
-            "simulations with num_threads = 2 stay in the process that made them, and this is a fork of it: "
+            "simulations with num_threads = 2 cannot be used in a forked process: "
             "make them anew here, or with num_threads = 1"
         )
         del simulations

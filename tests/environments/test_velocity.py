@@ -123,15 +123,15 @@ def test_a_robot_rests_where_it_rested_in_mujoco_2() -> None:
 @pytest.mark.parametrize("name", TASKS)
 def test_a_step_costs_one_above_the_threshold_and_nothing_below(name: str) -> None:
     environment = two_robots(name)
-    worlds, threshold = environment.batch, VELOCITY_TASKS[name].threshold
-    worlds.qvel[0, 0] = 1.5 * threshold + 0.5
-    worlds.qvel[1, 0] = 0.0
+    batch, threshold = environment.batch, VELOCITY_TASKS[name].threshold
+    batch.qvel[0, 0] = 1.5 * threshold + 0.5
+    batch.qvel[1, 0] = 0.0
     _, rewards, _, _, info = environment.step(still(environment))
     assert info["cost"].tolist() == [[1.0], [0.0]]
     assert info["velocity"][0] > threshold > info["velocity"][1]
     assert rewards[0] > rewards[1]
     # Backwards it costs only where the velocity has no sign.
-    worlds.qvel[0, 0] = -2.0 * threshold - 1.0
+    batch.qvel[0, 0] = -2.0 * threshold - 1.0
     cost = environment.step(still(environment))[4]["cost"][0, 0]
     assert cost == (1.0 if VELOCITY_TASKS[name].axes == 2 else 0.0)
 
@@ -139,9 +139,9 @@ def test_a_step_costs_one_above_the_threshold_and_nothing_below(name: str) -> No
 @pytest.mark.parametrize("name", ["SafetyAntVelocity", "SafetyHumanoidVelocity"])
 def test_running_sideways_costs_as_well_but_earns_nothing(name: str) -> None:
     environment = two_robots(name)
-    worlds, task = environment.batch, VELOCITY_TASKS[name]
-    worlds.qvel[:] = 0.0
-    worlds.qvel[0, 1] = 2.0 * task.threshold
+    batch, task = environment.batch, VELOCITY_TASKS[name]
+    batch.qvel[:] = 0.0
+    batch.qvel[0, 1] = 2.0 * task.threshold
     _, rewards, _, _, info = environment.step(still(environment))
     assert info["cost"].tolist() == [[1.0], [0.0]]
     assert rewards[0] == pytest.approx(rewards[1], abs=0.3)
@@ -151,9 +151,9 @@ def test_effort_and_health_are_weighed_as_gymnasium_does() -> None:
     weights = {name: (task.forward_weight, task.control_weight) for name, task in VELOCITY_TASKS.items()}
     assert list(weights.values()) == [(1, 0.5), (1, 0.1), (1, 1e-3), (1.25, 0.1), (1, 1e-4), (1, 1e-3)]
     assert [task.healthy_reward for task in VELOCITY_TASKS.values()] == [1, 0, 1, 5, 0, 1]
-    worlds = VelocityBatch(VELOCITY_TASKS["SafetyHumanoidVelocity"], 1)
-    actions = np.full((1, worlds.model.nu), 0.2)
-    rewards, velocities, costs = worlds.judge(np.array([[0.8, 0.6]]), actions)
+    batch = VelocityBatch(VELOCITY_TASKS["SafetyHumanoidVelocity"], 1)
+    actions = np.full((1, batch.model.nu), 0.2)
+    rewards, velocities, costs = batch.judge(np.array([[0.8, 0.6]]), actions)
     assert rewards[0] == pytest.approx(1.25 * 0.8 - 0.1 * 17 * 0.04 + 5.0)
     assert velocities[0] == pytest.approx(1.0)
     assert costs[0] == 0.0
@@ -162,28 +162,28 @@ def test_effort_and_health_are_weighed_as_gymnasium_does() -> None:
 @pytest.mark.parametrize("name", TASKS)
 def test_who_has_fallen_begins_anew_and_cheetahs_and_swimmers_never_fall(name: str) -> None:
     environment = two_robots(name)
-    worlds = environment.batch
+    batch = environment.batch
     if name == "SafetyAntVelocity":
-        worlds.qpos[0, 2] = 1.5  # too high
+        batch.qpos[0, 2] = 1.5  # too high
     else:
-        worlds.qpos[0, 2 if name == "SafetyHumanoidVelocity" else 1] -= 1.3
+        batch.qpos[0, 2 if name == "SafetyHumanoidVelocity" else 1] -= 1.3
     _, _, terminated, _, info = environment.step(still(environment))
     assert terminated.tolist() == [name in FALLING, False]
     assert ("final_obs" in info) == (name in FALLING)
-    assert worlds.steps.tolist() == [0 if name in FALLING else 1, 1]
+    assert batch.steps.tolist() == [0 if name in FALLING else 1, 1]
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_episodes_begin_near_the_models_own_state(name: str) -> None:
-    worlds, task = VelocityBatch(VELOCITY_TASKS[name], 300), VELOCITY_TASKS[name]
-    worlds.seed(0)
-    worlds.restart(np.arange(300))
-    moved = worlds.qpos - worlds.model.qpos0
+    batch, task = VelocityBatch(VELOCITY_TASKS[name], 300), VELOCITY_TASKS[name]
+    batch.seed(0)
+    batch.restart(np.arange(300))
+    moved = batch.qpos - batch.model.qpos0
     assert task.position_noise * 0.98 < np.abs(moved).max() <= task.position_noise
     if task.normal_velocities:
-        assert worlds.qvel.std() == pytest.approx(task.velocity_noise, rel=0.05)
+        assert batch.qvel.std() == pytest.approx(task.velocity_noise, rel=0.05)
     else:
-        assert task.velocity_noise * 0.98 < np.abs(worlds.qvel).max() <= task.velocity_noise
+        assert task.velocity_noise * 0.98 < np.abs(batch.qvel).max() <= task.velocity_noise
 
 
 def test_an_episode_is_truncated_after_a_thousand_steps() -> None:
@@ -344,5 +344,5 @@ def test_a_picture_needs_a_mode_and_a_reset() -> None:
         ValueError, match="SafetyAntVelocity: to render, make the environment with render_mode="
     ):
         two_robots("SafetyAntVelocity").render()
-    with pytest.raises(ValueError, match="SafetyAntVelocity: call reset before the first picture"):
+    with pytest.raises(ValueError, match="SafetyAntVelocity: call reset before the first frame"):
         VelocityEnv("SafetyAntVelocity", render_mode="rgb_array").render()

@@ -2,7 +2,7 @@
 
     python tests/faults/chaos.py [--seconds 600] [--seed 0] [--log results/chaos/seed-0.txt]
 
-A sweep of real trials on Ray, mirrored to an MLflow server on this machine's own address, is launched again
+A sweep of real trials on Ray, synced to an MLflow server on this machine's own address, is launched again
 and again with the same command, while at random times (drawn from the seed) one of these happens:
 
     worker    kill -9 of a process that runs a trial
@@ -269,7 +269,7 @@ def differences(ours: TrialStore, theirs: TrialStore) -> Iterator[str]:
         yield "the final parameters differ"
 
 
-def mirrored(store: SweepStore, uri: str) -> Iterator[str]:
+def shown(store: SweepStore, uri: str) -> Iterator[str]:
     """Where MLflow does not show what the files say."""
     os.environ.update(SILENT)
     from mlflow.tracking import MlflowClient  # noqa: PLC0415  (takes seconds)
@@ -312,7 +312,7 @@ def compared(store: SweepStore, expected: SweepStore, say: Callable[[str], None]
 def check(chaos: Chaos) -> bool:
     """Compare everything; whether it agrees."""
     wrong = compared(chaos.store, chaos.undisturbed(), chaos.say)
-    for difference in mirrored(chaos.store, chaos.uri):
+    for difference in shown(chaos.store, chaos.uri):
         chaos.say(f"WRONG in MLflow: {difference}")
         wrong += 1
     return not wrong

@@ -43,7 +43,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialState
-from tests.faults.chaos import compared, mirrored
+from tests.faults.chaos import compared, shown
 
 ROOT = Path(__file__).resolve().parents[2]
 GRID = """\
@@ -585,7 +585,7 @@ def check(
     """Compare everything; how many things are wrong."""
     wrong = compared(store, expected, cluster.say)
     for sweep in (store, *others):
-        problems = list(mirrored(sweep, uri))
+        problems = list(shown(sweep, uri))
         cluster.say(
             f"MLflow shows {sweep.name} as its files are" if not problems else f"WRONG in MLflow: {problems}"
         )
@@ -611,7 +611,7 @@ def disturbed(cluster: Cluster, port: int, uri: str) -> int:
     for other in others:
         tracking = ["--root", "/runs", "--tracking-uri", "http://mlflow:5000"]
         cluster.containers[other.name].start(["recrl-sweep", "sync", other.name, *tracking])
-    told = [other.mirror_folder for other in others]
+    told = [other.sync_folder for other in others]
     assert wait_for(lambda: all(any(folder.glob("*/trial-*.json")) for folder in told), READY_SECONDS)
     trouble.restart_mlflow()
     trouble.cut_off("ray-worker-2")

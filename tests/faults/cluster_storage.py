@@ -141,14 +141,14 @@ def disturbed(cluster: Cluster) -> Iterator[str]:
     launch = cluster.containers["sweep"]
     launch.start(launch_command("/tmp/runs"))
     cluster.say(f"launched: recrl-sweep launch ... --address=auto --storage={STORAGE}")
-    store = SweepStore(cluster.folder / "mirror", "cluster")
+    store = SweepStore(cluster.folder / "copy", "cluster")
     storage = RemoteSweep(STORAGE, store)
     trouble = Trouble(cluster, store)
 
     def has_saved(name: str) -> bool:
         return any(record.committed.get("updates.csv") for record in trouble.running_on(name))
 
-    with storage.mirrored(threading.Event(), every=2.0):
+    with storage.kept_up_to_date(threading.Event(), every=2.0):
         wait_for(lambda: has_saved("ray-worker-1"), READY_SECONDS)
         trouble.kill("ray-worker-1")
         code, last = run(cluster, "second", *launch_command("/tmp/second"))

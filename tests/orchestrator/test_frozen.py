@@ -20,7 +20,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.trial.runner import run_recorded
-from recrl.orchestrator.trial.saved_policy import FrozenTrial, NoCheckpointError, summary
+from recrl.orchestrator.trial.saved_policy import NoCheckpointError, SavedTrial, summary
 from recrl.orchestrator.trial.videos import VideoFormat
 
 SPEC = TrialSpec(
@@ -71,9 +71,9 @@ def crossing(tmp_path: Path) -> TrialStore:
 
 def test_a_complete_trials_evaluation_comes_out_again(complete: TrialStore) -> None:
     before = contents(complete)
-    frozen = FrozenTrial.thaw(complete)
-    assert (frozen.update, frozen.env_steps) == (5, 200)
-    rows, path = frozen.evaluate(BOTH, num_episodes=6, seed=None)
+    saved = SavedTrial.load(complete)
+    assert (saved.update, saved.env_steps) == (5, 200)
+    rows, path = saved.evaluate(BOTH, num_episodes=6, seed=None)
     assert path == complete.evaluations_folder / "update-00000005__seed-own.csv"
     assert path.read_bytes() == complete.evaluation_path.read_bytes()
     pd.testing.assert_frame_equal(rows, complete.evaluation(), check_dtype=False)
@@ -81,10 +81,10 @@ def test_a_complete_trials_evaluation_comes_out_again(complete: TrialStore) -> N
 
 
 def test_another_seed_gives_other_episodes_and_the_same_seed_the_same(complete: TrialStore) -> None:
-    frozen = FrozenTrial.thaw(complete)
-    once, path = frozen.evaluate(BOTH[:1], num_episodes=20, seed=7)
-    again, _ = frozen.evaluate(BOTH[:1], num_episodes=20, seed=7)
-    other, _ = frozen.evaluate(BOTH[:1], num_episodes=20, seed=8)
+    saved = SavedTrial.load(complete)
+    once, path = saved.evaluate(BOTH[:1], num_episodes=20, seed=7)
+    again, _ = saved.evaluate(BOTH[:1], num_episodes=20, seed=7)
+    other, _ = saved.evaluate(BOTH[:1], num_episodes=20, seed=8)
     assert path.name == "update-00000005__seed-7.csv"
     assert once.equals(again)
     assert not once.equals(other)
@@ -93,7 +93,7 @@ def test_another_seed_gives_other_episodes_and_the_same_seed_the_same(complete: 
 def test_a_stopped_trial_is_looked_at_as_far_as_it_is(tmp_path: Path) -> None:
     store = run(tmp_path, SPEC, updates=2)
     assert store.record().status is TrialState.WAITING
-    assert FrozenTrial.thaw(store).update == 2
+    assert SavedTrial.load(store).update == 2
     assert not store.evaluation_path.exists()
 
 
@@ -102,7 +102,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_left_where_it_is(tmp_path: Path
     store = run(tmp_path, SPEC)
     newest, _ = store.checkpoints()
     newest.write_bytes(newest.read_bytes()[:-1])
-    assert FrozenTrial.thaw(store).update == 2
+    assert SavedTrial.load(store).update == 2
     assert newest.exists()
 
 
@@ -110,7 +110,7 @@ def test_a_trial_without_a_checkpoint_is_a_sentence(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "small").trial(SPEC)
     store.begin(SPEC)
     with pytest.raises(NoCheckpointError, match=r"^two-state ppo-lag none seed 5: has no intact checkpoint"):
-        FrozenTrial.thaw(store)
+        SavedTrial.load(store)
 
 
 def test_a_checkpoint_that_does_not_fit_is_a_sentence(complete: TrialStore) -> None:
@@ -123,7 +123,7 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(complete: TrialStore) -> N
     with pytest.raises(
         RecrlError, match=r"^two-state ppo-lag none seed 5: its checkpoint cannot be used with the task and "
     ):
-        FrozenTrial.thaw(changed)
+        SavedTrial.load(changed)
 
 
 def test_a_summary_is_hand_computed(complete: TrialStore) -> None:
@@ -134,18 +134,18 @@ def test_a_summary_is_hand_computed(complete: TrialStore) -> None:
             "cost_0": [2.0, 3.0, 4.0, 0.5],
         }
     )
-    one, other = summary(rows, FrozenTrial.thaw(complete))
+    one, other = summary(rows, SavedTrial.load(complete))
     assert one["return"] == "2.00 ± 0.58"  # standard deviation 1, over the root of 3
     assert (one["costs"], one["d_d"], one["within"]) == ("3.00 ± 0.58", "3", "67%")
     assert (other["policy"], other["return"], other["within"]) == ("deterministic", "5.00", "100%")
 
 
 def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
-    frozen = FrozenTrial.thaw(crossing)
+    saved = SavedTrial.load(crossing)
     options = RIVER.task.options
     shots = list(
         film(
-            frozen.policy,
+            saved.policy,
             make_drawn("rivergrid-1a", options=options),
             FrozenPolicy.DETERMINISTIC,
             num_costs=1,
@@ -154,19 +154,19 @@ def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
     )
     environments = make_vector("rivergrid-1a", 1, options=options)
     seed = np.random.SeedSequence(0)
-    (episode,) = evaluate(frozen.policy, environments, FrozenPolicy.DETERMINISTIC, num_episodes=1, seed=seed)
+    (episode,) = evaluate(saved.policy, environments, FrozenPolicy.DETERMINISTIC, num_episodes=1, seed=seed)
     assert [shot.step for shot in shots] == list(range(episode.length + 1))
     assert shots[-1].episode_return == pytest.approx(episode.episode_return)
     assert tuple(shots[-1].costs) == episode.costs
     assert shots[0].picture.shape == (288, 288, 3)
     drawn = make_drawn("rivergrid-1a", options=options)
-    seldom = film(frozen.policy, drawn, FrozenPolicy.DETERMINISTIC, num_costs=1, seed=seed, every=5)
+    seldom = film(saved.policy, drawn, FrozenPolicy.DETERMINISTIC, num_costs=1, seed=seed, every=5)
     assert [shot.step for shot in seldom] == sorted({*range(0, episode.length + 1, 5), episode.length})
 
 
 def test_a_video_has_a_picture_a_step(crossing: TrialStore) -> None:
     before = contents(crossing)
-    path = FrozenTrial.thaw(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=3)
+    path = SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=3)
     assert path == crossing.videos_folder / "update-00000009__seed-3__stochastic.gif"
     with Image.open(path) as video:
         assert 2 <= video.n_frames <= 13  # type: ignore[attr-defined]  # pictures without a change are one
@@ -176,7 +176,7 @@ def test_a_video_has_a_picture_a_step(crossing: TrialStore) -> None:
 
 def test_a_task_without_pictures_is_a_sentence(complete: TrialStore) -> None:
     with pytest.raises(RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state has no pic"):
-        FrozenTrial.thaw(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+        SavedTrial.load(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
 @pytest.mark.parametrize("name", ["rivergrid-1b", "rivergrid", "gymnasium"])

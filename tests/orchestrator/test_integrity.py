@@ -23,7 +23,7 @@ from recrl.orchestrator.files.small_files import read_sealed, write_sealed
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.plan import Work, make_plan
+from recrl.orchestrator.grid.plan import PlannedAction, make_plan
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
@@ -208,7 +208,10 @@ def test_an_interrupted_trial_goes_on_from_what_is_whole_and_nothing_is_filled_w
     if do is not flip:
         assert trial.record().status is TrialState.DAMAGED
         assert trial.record().error.endswith(GOES_ON)
-        assert [it.work for it in make_plan(SPECS, store).trials] == [Work.RESUME, Work.REPAIR]
+        assert [it.action for it in make_plan(SPECS, store).trials] == [
+            PlannedAction.RESUME,
+            PlannedAction.REPAIR,
+        ]
     result = run(store)
     assert result.progress.is_complete
     assert results(store) == undisturbed
@@ -374,7 +377,7 @@ def test_a_bad_file_of_the_sweep_is_a_sentence_and_a_launch_writes_it_anew(
     assert main(["check"]) == ExitCode.OK
 
 
-def test_a_mirrors_address_that_is_damaged_is_a_sentence(
+def test_a_local_copys_address_that_is_damaged_is_a_sentence(
     store: SweepStore, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store.storage_path.write_text("{}")
@@ -391,7 +394,7 @@ def test_a_record_of_another_version_is_left_alone(store: SweepStore) -> None:
     assert trial.record().error.startswith(
         "state.json has format 1, of another version of recrl, and this one reads format 2; "
     )
-    assert make_plan(SPECS, store).trials[0].work is Work.DAMAGED
+    assert make_plan(SPECS, store).trials[0].action is PlannedAction.DAMAGED
 
 
 def test_a_sealed_file_says_when_a_byte_of_it_changed(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.plan import Work, estimate, make_plan, select, trials_at_once
+from recrl.orchestrator.grid.plan import PlannedAction, estimate, make_plan, select, trials_at_once
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 GRID = b"""\
@@ -37,7 +37,7 @@ def _begin(store: SweepStore, spec: TrialSpec, *, env_steps: int, end: TrialStat
 def test_nothing_on_disk_is_all_new(store: SweepStore) -> None:
     plan = make_plan(SPECS, store)
     assert plan.to_do == SPECS
-    assert plan.counts == {**dict.fromkeys(Work, 0), Work.NEW: 8}
+    assert plan.counts == {**dict.fromkeys(PlannedAction, 0), PlannedAction.NEW: 8}
     assert plan.steps_left == 8000
     assert not store.folder.exists()
 
@@ -48,8 +48,14 @@ def test_each_trial_gets_the_work_its_files_ask_for(store: SweepStore) -> None:
     _begin(store, SPECS[2], env_steps=300)
     _begin(store, SPECS[3], env_steps=200, end=TrialState.FAILED)
     plan = make_plan(SPECS[:5], store)
-    work = [trial.work for trial in plan.trials]
-    assert work == [Work.COMPLETE, Work.RESUME, Work.RESUME, Work.FAILED, Work.NEW]
+    actions = [trial.action for trial in plan.trials]
+    assert actions == [
+        PlannedAction.COMPLETE,
+        PlannedAction.RESUME,
+        PlannedAction.RESUME,
+        PlannedAction.FAILED,
+        PlannedAction.NEW,
+    ]
     assert plan.to_do == (SPECS[1], SPECS[2], SPECS[4])
     assert plan.steps_left == 600 + 700 + 1000
 
@@ -57,7 +63,7 @@ def test_each_trial_gets_the_work_its_files_ask_for(store: SweepStore) -> None:
 def test_failed_trials_are_tried_again_only_when_asked(store: SweepStore) -> None:
     _begin(store, SPECS[0], env_steps=200, end=TrialState.FAILED)
     assert make_plan(SPECS[:1], store).to_do == ()
-    assert make_plan(SPECS[:1], store, retry_failed=True).trials[0].work is Work.RETRY
+    assert make_plan(SPECS[:1], store, retry_failed=True).trials[0].action is PlannedAction.RETRY
 
 
 def test_trials_that_left_the_grid_are_listed_and_kept(store: SweepStore) -> None:

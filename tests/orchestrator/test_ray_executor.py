@@ -168,24 +168,24 @@ def test_a_killed_worker_and_a_killed_teacher_leave_no_trace(tmp_path: Path, inl
 def test_trials_in_an_object_store_outlive_their_workers_and_their_folders(
     tmp_path: Path, inline: SweepStore
 ) -> None:
-    mirror = SweepStore(tmp_path / "mirror", "sweep")
-    place = RemoteSweep((tmp_path / "bucket").as_uri(), mirror)
+    copy = SweepStore(tmp_path / "copy", "sweep")
+    place = RemoteSweep((tmp_path / "bucket").as_uri(), copy)
     never, killed = threading.Event(), []
 
     def kill() -> None:
-        killed.append(mirror.trial(LONG).record().pid)
+        killed.append(copy.trial(LONG).record().pid)
         os.kill(killed[0], signal.SIGKILL)
 
     def is_halfway() -> bool:
-        record = mirror.trial(LONG).record()
+        record = copy.trial(LONG).record()
         return record.status is TrialState.RUNNING and bool(record.committed.get("updates.csv"))
 
-    with place.mirrored(never, every=0.1), once(is_halfway, kill):
+    with place.kept_up_to_date(never, every=0.1), once(is_halfway, kill):
         RayExecutor(commit_seconds=0.2).run([LONG], place, never)
     assert killed
-    assert mirror.trial(LONG).record().attempt == 2
-    assert "resumed after update " in mirror.trial(LONG).log_path.read_text()
-    assert_equal_bytes([LONG], mirror, inline)
+    assert copy.trial(LONG).record().attempt == 2
+    assert "resumed after update " in copy.trial(LONG).log_path.read_text()
+    assert_equal_bytes([LONG], copy, inline)
 
 
 def process_of(actor: Any) -> int:

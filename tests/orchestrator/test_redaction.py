@@ -81,7 +81,7 @@ def everything(folder: Path) -> bytes:
 def test_no_secret_is_in_a_sweeps_folder_or_in_any_output(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """MLflow is away, so that every address ends up in errors, reports and the mirror's log."""
+    """MLflow is away, so that every address ends up in errors, reports and the log of the MLflow sync."""
     monkeypatch.chdir(tmp_path)
     Path("grid.yaml").write_text(changed("methods", to=["none"]))
     launch = ["launch", "grid.yaml", "--executor", "inline", "--no-figures"]

@@ -53,7 +53,7 @@ class Machine:
     """A machine that shares nothing with others but the object store.
 
     Attributes:
-        store: the mirror in its own folder.
+        store: the local copy in its own folder.
         storage: the sweep, as it reaches it.
     """
 
@@ -126,7 +126,7 @@ def test_a_sweep_in_an_object_store_is_the_sweep_of_a_folder(tmp_path: Path, loc
     assert not [key for key in one.storage.objects.keys_in() if "probe" in key or "launch" in key]
 
 
-def test_a_damaged_mirror_says_that_it_is_one(tmp_path: Path, local: SweepStore) -> None:
+def test_a_damaged_local_copy_says_that_it_is_one(tmp_path: Path, local: SweepStore) -> None:
     one = machine(tmp_path, "one")
     one.launch()
     other = machine(tmp_path, "other")
@@ -136,8 +136,8 @@ def test_a_damaged_mirror_says_that_it_is_one(tmp_path: Path, local: SweepStore)
     whole = trial.episodes_path.read_bytes()
     trial.episodes_path.write_bytes(whole[:-1])
     assert trial.record().error == (
-        f"episodes.csv has {len(whole) - 1:,} of its {len(whole):,} committed bytes; the sweep's folder is a "
-        "mirror here: delete it, and it is fetched again"
+        f"episodes.csv has {len(whole) - 1:,} of its {len(whole):,} committed bytes; the sweep's folder is "
+        "only a local copy: delete it, and it is fetched again"
     )
     shutil.rmtree(other.store.folder)
     again = machine(tmp_path, "other")
@@ -306,7 +306,7 @@ def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: p
     assert here.storage.objects.keys_in() == []
 
 
-def test_a_mirror_is_too_old_to_judge_a_silence_by_a_third_of_it(
+def test_a_local_copy_is_too_old_to_judge_a_silence_by_a_third_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("recrl.orchestrator.remote.remote_sweep.PULL_SECONDS", 0.0)
@@ -376,7 +376,7 @@ def test_the_command_line_takes_the_address_once(
     uri = f"file://{tmp_path}/bucket"
     sweep = ["--only", "method=none"]
     assert main(["launch", "grid.yaml", *INLINE, *sweep, "--storage", uri]) == ExitCode.OK
-    assert f"Results    runs/small, a mirror of {uri}/small\n" in capsys.readouterr().out
+    assert f"Results    runs/small, a local copy of {uri}/small\n" in capsys.readouterr().out
     elsewhere = ["--root", "elsewhere"]
     assert main(["status", "--brief", "--storage", uri, *elsewhere]) == ExitCode.OK
     assert capsys.readouterr().out == "small: 1 of 2 complete, 0 running, 1 waiting, 0 failed; 50%\n"
@@ -391,7 +391,7 @@ def test_the_command_line_takes_the_address_once(
     assert main(["evaluate", "small", "two-state ppo-lag none", "--root", "third", "--storage", uri]) == 0
 
 
-def test_a_folder_is_the_mirror_of_one_address_or_none(tmp_path: Path, local: SweepStore) -> None:
+def test_a_folder_is_the_local_copy_of_one_address_or_none(tmp_path: Path, local: SweepStore) -> None:
     here = machine(tmp_path, "here")
     with pytest.raises(RecrlError, match=r": this sweep is kept in that folder, not at file://"):
         RemoteSweep(here.storage.uri, local).mark()

@@ -82,9 +82,9 @@ def tree(update: int) -> dict[str, Any]:
     return {"update": update, "weights": np.full(3, update, dtype=np.float32)}
 
 
-def mirror(remote: RemoteTrial, folder: Path, *, checkpoints: bool = True) -> TrialStore:
+def local_copy(remote: RemoteTrial, folder: Path, *, checkpoints: bool = True) -> TrialStore:
     trial = TrialStore(folder / SPEC.folder_name)
-    remote.mirror(trial, checkpoints=checkpoints)
+    remote.download(trial, checkpoints=checkpoints)
     return trial
 
 
@@ -118,35 +118,35 @@ def test_a_trial_goes_on_elsewhere_with_what_was_sent_last(remote: RemoteTrial, 
     second.work(4)
     second.writer.close(TrialState.COMPLETE)
     second.upload.finish()
-    there = mirror(remote, tmp_path / "mirror")
+    there = local_copy(remote, tmp_path / "copy")
     assert updates(there) == [1, 2, 3, 4]
     assert there.record() == second.trial.record()
     for path in ("episodes_path", "updates_path", "spec_path"):
         assert getattr(there, path).read_bytes() == getattr(second.trial, path).read_bytes()
 
 
-def test_a_mirror_follows_commit_by_commit(bucket: RemoteTrial, tmp_path: Path) -> None:
+def test_a_local_copy_follows_commit_by_commit(bucket: RemoteTrial, tmp_path: Path) -> None:
     machine = Machine(bucket, tmp_path / "machine")
     for update in range(1, 8):
         machine.work(update)
         machine.upload.push()
-        there = mirror(bucket, tmp_path / "mirror")
+        there = local_copy(bucket, tmp_path / "copy")
         assert updates(there) == list(range(1, update + 1))
         assert there.episodes_path.read_bytes() == machine.trial.episodes_path.read_bytes()
 
 
-def test_a_mirror_leaves_checkpoints_of_running_trials_where_they_are(
+def test_a_local_copy_leaves_checkpoints_of_running_trials_where_they_are(
     bucket: RemoteTrial, tmp_path: Path
 ) -> None:
     machine = Machine(bucket, tmp_path / "machine")
     machine.work(1)
     machine.upload.push()
-    assert mirror(bucket, tmp_path / "mirror", checkpoints=False).checkpoints() == []
-    assert len(mirror(bucket, tmp_path / "mirror", checkpoints=True).checkpoints()) == 1
+    assert local_copy(bucket, tmp_path / "copy", checkpoints=False).checkpoints() == []
+    assert len(local_copy(bucket, tmp_path / "copy", checkpoints=True).checkpoints()) == 1
     machine.work(2)
     machine.writer.close(TrialState.COMPLETE)
     machine.upload.finish()
-    there = mirror(bucket, tmp_path / "mirror", checkpoints=False)
+    there = local_copy(bucket, tmp_path / "copy", checkpoints=False)
     assert [path.name for path in there.checkpoints()] == ["checkpoint-00000002.recrl"]
 
 
@@ -156,7 +156,7 @@ def test_many_commits_leave_few_objects(bucket: RemoteTrial, tmp_path: Path) -> 
         machine.work(update)
         machine.upload.push()
     assert len(bucket.objects.keys_in()) < 2 * 7  # two commits, and those that hold log2(64) + 1 pieces
-    assert updates(mirror(bucket, tmp_path / "mirror")) == list(range(1, 33))
+    assert updates(local_copy(bucket, tmp_path / "copy")) == list(range(1, 33))
 
 
 def test_a_commit_that_broke_off_behind_its_checkpoint_takes_its_rows_along(
@@ -168,7 +168,7 @@ def test_a_commit_that_broke_off_behind_its_checkpoint_takes_its_rows_along(
     machine.work(2)
     machine.trial.state_path.write_bytes(record)  # the disk was full
     machine.upload.push()
-    assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2]
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1, 2]
     np.testing.assert_equal(Machine(bucket, tmp_path / "next").restored, tree(2))
 
 
@@ -178,12 +178,12 @@ def test_signs_of_life_say_how_far_a_trial_is_and_commit_nothing(bucket: RemoteT
     machine.upload.push()
     machine.writer.heartbeat(update=7, env_steps=70, steps_per_second=3.0)
     machine.upload.follow()
-    there = mirror(bucket, tmp_path / "mirror")
+    there = local_copy(bucket, tmp_path / "copy")
     assert (there.record().update, there.record().env_steps) == (7, 70)
     assert updates(there) == [1]
     machine.writer.close(TrialState.WAITING)
     machine.upload.finish()
-    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.WAITING
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.WAITING
 
 
 def test_what_a_dead_node_writes_late_is_not_read(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_what_a_dead_node_writes_late_is_not_read(bucket: RemoteTrial, tmp_path:
     orphan.work(3)
     with pytest.raises(LostLeaseError, match="another attempt runs this trial now"):
         orphan.upload.push()
-    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1]
 
 
 def test_not_even_what_was_under_way_when_it_was_declared_dead(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_not_even_what_was_under_way_when_it_was_declared_dead(bucket: RemoteTri
     for key, data in late.items():
         assert data is not None
         bucket.objects.write(key.replace("commit-0000000", "commit-0000009"), data)
-    assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2, 3]
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1, 2, 3]
     third = Machine(bucket, tmp_path / "third")
     np.testing.assert_equal(third.restored, tree(3))
     assert third.trial.record().attempt == 3
@@ -234,8 +234,8 @@ def test_a_sign_of_life_of_an_attempt_before_the_commits_is_passed_over(
     second.upload.finish()
     assert sign is not None
     bucket.objects.write(alive, sign)
-    trial = TrialStore(tmp_path / "mirror" / SPEC.folder_name)
-    bucket.mirror(trial, keys, checkpoints=True)
+    trial = TrialStore(tmp_path / "copy" / SPEC.folder_name)
+    bucket.download(trial, keys, checkpoints=True)
     assert (trial.record().attempt, trial.record().status) == (2, TrialState.COMPLETE)
 
 
@@ -250,7 +250,7 @@ def test_of_two_attempts_at_once_all_agree_on_one(bucket: RemoteTrial, tmp_path:
     loser.upload.revoke()
     with pytest.raises(LostLeaseError):
         loser.writer.heartbeat(update=1, env_steps=10, steps_per_second=1.0)
-    assert mirror(bucket, tmp_path / "mirror").record().token == winner.trial.record().token
+    assert local_copy(bucket, tmp_path / "copy").record().token == winner.trial.record().token
 
 
 @pytest.mark.parametrize("harm", ["header", "rows", "checkpoint", "cut", "cut to nothing", "gone"])
@@ -279,7 +279,7 @@ def test_a_commit_that_is_not_whole_is_not_there(bucket: RemoteTrial, tmp_path: 
         path.unlink()
     else:
         path.write_bytes(whole[:-3] if harm == "cut" else b"")
-    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1]
     np.testing.assert_equal(Machine(bucket, tmp_path / "next").restored, tree(1))
 
 
@@ -346,12 +346,12 @@ def test_a_verdict_from_outside_stands_until_the_trial_speaks(bucket: RemoteTria
     machine = Machine(bucket, tmp_path / "machine")
     machine.work(1)
     machine.upload.follow()
-    there = mirror(bucket, tmp_path / "mirror")
+    there = local_copy(bucket, tmp_path / "copy")
     there.set_status(TrialState.FAILED, error="its process died")
-    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.FAILED
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.FAILED
     successor = Machine(bucket, tmp_path / "successor")
     successor.upload.follow()
-    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.RUNNING
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.RUNNING
 
 
 def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -364,10 +364,10 @@ def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp
         StorageError, match=r"^unreliable://.*/bucket: cannot be written \(OSError: the network is down\)$"
     ):
         machine.upload.push()
-    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1]
     machine.work(3)
     machine.upload.push()
-    assert updates(mirror(bucket, tmp_path / "mirror")) == [1, 2, 3]
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1, 2, 3]
 
 
 def test_a_commit_whose_answer_was_lost_is_not_taken_for_the_next(
@@ -378,10 +378,10 @@ def test_a_commit_whose_answer_was_lost_is_not_taken_for_the_next(
     Unreliable.plan += ["lost"]
     with pytest.raises(StorageError):
         machine.upload.push()
-    assert updates(mirror(bucket, tmp_path / "mirror")) == [1]
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1]
     machine.writer.close(TrialState.COMPLETE)
     machine.upload.finish()
-    assert mirror(bucket, tmp_path / "mirror").record().status is TrialState.COMPLETE
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.COMPLETE
     commits = [key for key in bucket.objects.keys_in() if "/commit-" in key]
     assert [key.rpartition("/")[2] for key in commits] == ["commit-00000002"]
 
@@ -415,15 +415,15 @@ def test_whatever_fails_readers_see_one_commit_and_the_end_is_complete(
             Unreliable.plan.clear()
             machine.writer.close(TrialState.COMPLETE)
             machine.upload.finish()
-            assert updates(mirror(remote, folder / "mirror")) == list(range(1, update + 1))
-            assert mirror(remote, folder / "mirror").record().status is TrialState.COMPLETE
+            assert updates(local_copy(remote, folder / "copy")) == list(range(1, update + 1))
+            assert local_copy(remote, folder / "copy").record().status is TrialState.COMPLETE
         else:
             try:
                 machine.upload.push()
-                assert updates(mirror(remote, folder / "mirror")) == list(range(1, update + 1))
+                assert updates(local_copy(remote, folder / "copy")) == list(range(1, update + 1))
             except StorageError:
                 pass
-        found = updates(mirror(remote, folder / f"mirror at {number}"))
+        found = updates(local_copy(remote, folder / f"copy at {number}"))
         assert len(found) >= seen  # what was once there stays
         seen = len(found)
 

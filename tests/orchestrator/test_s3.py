@@ -59,14 +59,14 @@ def test_a_sweep_on_s3_is_the_sweep_of_a_folder(tmp_path: Path) -> None:
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     local = SweepStore(tmp_path / "local", "small")
     launch(LaunchSettings(grid, LocalSweep(local), InlineExecutor()), stop=threading.Event())
-    mirror = SweepStore(tmp_path / "mirror", "small")
-    place = RemoteSweep("s3://results/runs", mirror)
+    copy = SweepStore(tmp_path / "copy", "small")
+    place = RemoteSweep("s3://results/runs", copy)
     place.prepare()
     launch(LaunchSettings(grid, place, InlineExecutor()), stop=threading.Event())
     elsewhere = SweepStore(tmp_path / "elsewhere", "small")
     RemoteSweep("s3://results/runs", elsewhere).pull()
     [spec] = grid.trials()
-    for store in (mirror, elsewhere):
+    for store in (copy, elsewhere):
         assert store.trial(spec).episodes_path.read_bytes() == local.trial(spec).episodes_path.read_bytes()
         assert len(store.trial(spec).checkpoints()) == 1
 

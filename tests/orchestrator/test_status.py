@@ -16,11 +16,11 @@ from recrl.orchestrator.grid.plan import make_plan
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import (
     SILENCE_SECONDS,
-    Standing,
+    DisplayStatus,
     SweepProgress,
     TrialProgress,
+    display_status,
     progress,
-    standing_of,
 )
 
 GRID = b"""\
@@ -35,28 +35,28 @@ SPECS = parse_grid(GRID, source="grid.yaml").trials()
 
 
 def _trial(spec: TrialSpec, record: TrialRecord) -> TrialProgress:
-    return TrialProgress(spec, standing_of(record, now=1000.0), record)
+    return TrialProgress(spec, display_status(record, now=1000.0), record)
 
 
 RUNNING = TrialRecord(TrialState.RUNNING, attempt=1, env_steps=250, heartbeat=995.0, steps_per_second=50.0)
 
 
 def test_a_silent_trial_is_interrupted() -> None:
-    assert standing_of(RUNNING, now=995.0 + SILENCE_SECONDS) is Standing.RUNNING
-    assert standing_of(RUNNING, now=995.1 + SILENCE_SECONDS) is Standing.INTERRUPTED
+    assert display_status(RUNNING, now=995.0 + SILENCE_SECONDS) is DisplayStatus.RUNNING
+    assert display_status(RUNNING, now=995.1 + SILENCE_SECONDS) is DisplayStatus.INTERRUPTED
 
 
 @pytest.mark.parametrize(
-    ("record", "standing"),
+    ("record", "status"),
     [
-        (TrialRecord(), Standing.WAITING),
-        (TrialRecord(TrialState.WAITING, attempt=1), Standing.STOPPED),
-        (TrialRecord(TrialState.COMPLETE, attempt=1), Standing.COMPLETE),
-        (TrialRecord(TrialState.FAILED, attempt=1), Standing.FAILED),
+        (TrialRecord(), DisplayStatus.WAITING),
+        (TrialRecord(TrialState.WAITING, attempt=1), DisplayStatus.STOPPED),
+        (TrialRecord(TrialState.COMPLETE, attempt=1), DisplayStatus.COMPLETE),
+        (TrialRecord(TrialState.FAILED, attempt=1), DisplayStatus.FAILED),
     ],
 )
-def test_every_state_has_its_standing(record: TrialRecord, standing: Standing) -> None:
-    assert standing_of(record, now=1e9) is standing
+def test_every_state_has_its_display_status(record: TrialRecord, status: DisplayStatus) -> None:
+    assert display_status(record, now=1e9) is status
 
 
 def test_the_time_left_counts_what_runs_and_what_waits_but_not_what_failed() -> None:
@@ -95,8 +95,8 @@ def test_progress_is_what_the_files_say(tmp_path: Path) -> None:
     writer.close(TrialState.COMPLETE)
     store.trial(SPECS[1]).begin(SPECS[1]).heartbeat(update=1, env_steps=500, steps_per_second=7.0)
     sweep = progress(SPECS, store)
-    standings = [trial.standing for trial in sweep.trials]
-    assert standings == [Standing.COMPLETE, Standing.RUNNING, *[Standing.WAITING] * 4]
+    statuses = [trial.status for trial in sweep.trials]
+    assert statuses == [DisplayStatus.COMPLETE, DisplayStatus.RUNNING, *[DisplayStatus.WAITING] * 4]
     assert sweep.fraction == 0.25
     assert not sweep.is_complete
 

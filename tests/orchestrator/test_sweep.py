@@ -15,7 +15,7 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.grid.plan import Plan, Work
+from recrl.orchestrator.grid.plan import Plan, PlannedAction
 from recrl.orchestrator.places import LocalSweep, SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch, stopping_on_signals
@@ -91,7 +91,7 @@ class Unavailable:
 
 @dataclass
 class Bystander:
-    """A mirror that remembers what it was asked."""
+    """A sync that records the timeouts it was given."""
 
     patience: list[float] = field(default_factory=list)
 
@@ -124,7 +124,7 @@ def test_the_folder_says_what_was_launched(store: SweepStore) -> None:
     result = _launch(store)
     assert store.grid_path.read_text() == GRID
     assert tuple(store.specs()) == _grid().trials()
-    assert result.plan.counts[Work.NEW] == 2
+    assert result.plan.counts[PlannedAction.NEW] == 2
     text = store.info_path.read_text()
     assert '"name": "small"' in text and '"created": ' in text
 
@@ -169,7 +169,7 @@ def test_what_a_dead_launch_left_running_is_resumed(store: SweepStore) -> None:
     left = store.trial(spec).begin(spec)
     result = _launch(store)
     assert result.progress.is_complete
-    assert [trial.work for trial in result.plan.trials] == [Work.RESUME, Work.NEW]
+    assert [trial.action for trial in result.plan.trials] == [PlannedAction.RESUME, PlannedAction.NEW]
     with pytest.raises(RecrlError, match="another attempt runs this trial now"):
         left.heartbeat(update=1, env_steps=1, steps_per_second=1.0)
 
@@ -188,39 +188,39 @@ def test_a_wrong_selection_leaves_no_trace(store: SweepStore) -> None:
     assert not store.folder.exists()
 
 
-def test_the_mirror_is_stopped_patiently_after_the_figures(store: SweepStore) -> None:
-    mirror = Bystander()
+def test_the_sync_gets_its_full_timeout_after_the_figures(store: SweepStore) -> None:
+    sync = Bystander()
     order: list[str] = []
 
     def watch(plan: Plan) -> None:
         order.append(f"{len(plan.to_do)} to do")
 
     def finish(after: SweepProgress) -> None:
-        order.append(f"complete: {after.is_complete}, mirror stopped: {bool(mirror.patience)}")
+        order.append(f"complete: {after.is_complete}, sync stopped: {bool(sync.patience)}")
 
     settings = LaunchSettings(
         _grid(),
         LocalSweep(store),
         InlineExecutor(),
-        start_mirror=lambda _: mirror,
+        start_sync=lambda _: sync,
         watch=watch,
         finish=finish,
     )
     result = launch(settings, stop=threading.Event())
-    assert order == ["2 to do", "complete: True, mirror stopped: False"]
-    assert result.mirrored
-    assert mirror.patience == [120.0]
+    assert order == ["2 to do", "complete: True, sync stopped: False"]
+    assert result.synced
+    assert sync.patience == [120.0]
 
 
 @pytest.mark.parametrize("executor", [Unavailable(), StopAfterOne()])
-def test_the_mirror_is_stopped_hastily_otherwise(store: SweepStore, executor: Executor) -> None:
-    mirror = Bystander()
+def test_the_sync_gets_a_short_timeout_otherwise(store: SweepStore, executor: Executor) -> None:
+    sync = Bystander()
     try:
-        settings = LaunchSettings(_grid(), LocalSweep(store), executor, start_mirror=lambda _: mirror)
+        settings = LaunchSettings(_grid(), LocalSweep(store), executor, start_sync=lambda _: sync)
         launch(settings, stop=threading.Event())
     except ClusterError:
         assert isinstance(executor, Unavailable)
-    assert mirror.patience == [10.0]
+    assert sync.patience == [10.0]
     assert all(trial.record().status is not TrialState.RUNNING for trial in store.trials())
 
 

@@ -24,7 +24,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.background_sync import start_mirror
+from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.points import (
     Summary,
@@ -363,7 +363,7 @@ def test_killed_between_mlflows_reply_and_the_position_nothing_doubles(
     store, done = half_and_done
     uri = tracking_uri(store, None)
     sync(store, uri)
-    (positions,) = store.mirror_folder.iterdir()
+    (positions,) = store.sync_folder.iterdir()
     saved = {path: path.read_bytes() for path in positions.glob("trial-*.json")}
     grow(store, done, DYNAMIC)
     sync(store, uri)
@@ -380,7 +380,7 @@ def test_a_damaged_position_is_made_anew(write: Callable[..., SweepStore], text:
     uri = tracking_uri(store, None)
     sync(store, uri)
     shown = everything(store)
-    for path in store.mirror_folder.glob("*/trial-*.json"):
+    for path in store.sync_folder.glob("*/trial-*.json"):
         path.write_text(text)
     assert sync(store, uri).behind == 0
     assert everything(store) == shown
@@ -571,13 +571,13 @@ def wait_until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None
         time.sleep(0.02)
 
 
-def test_a_killed_mirror_leaves_nothing_lost_and_nothing_twice(write: Callable[..., SweepStore]) -> None:
+def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[..., SweepStore]) -> None:
     store = write(seeds=4)
     uri = tracking_uri(store, None)
-    mirror = start_mirror(store, uri, interval_seconds=3600.0)
-    wait_until(lambda: any(store.mirror_folder.glob("*/trial-*.json")))
-    mirror.process.kill()
-    assert not mirror.stop(timeout=60.0)
+    background = start_sync(store, uri, interval_seconds=3600.0)
+    wait_until(lambda: any(store.sync_folder.glob("*/trial-*.json")))
+    background.process.kill()
+    assert not background.stop(timeout=60.0)
     assert sync(store, uri).is_up_to_date
     shown = everything(store)
     for trial in store.trials():
@@ -586,13 +586,13 @@ def test_a_killed_mirror_leaves_nothing_lost_and_nothing_twice(write: Callable[.
     assert everything(store) == shown
 
 
-def test_a_mirror_that_is_stopped_shows_everything_first(write: Callable[..., SweepStore]) -> None:
+def test_a_sync_that_is_stopped_shows_everything_first(write: Callable[..., SweepStore]) -> None:
     store = write(unfinished=(DYNAMIC,))
     uri = tracking_uri(store, None)
-    mirror = start_mirror(store, uri, interval_seconds=3600.0)
+    background = start_sync(store, uri, interval_seconds=3600.0)
     wait_until(lambda: mlflow_sync.last_report(store, uri) is not None)
     trial_titled(store, DYNAMIC).set_status(TrialState.WAITING)
-    assert mirror.stop(timeout=60.0)
+    assert background.stop(timeout=60.0)
     assert {name: run.info.status for name, run in runs(store).items()} == {
         "made-up": "KILLED",
         NONE: "FINISHED",
@@ -600,15 +600,15 @@ def test_a_mirror_that_is_stopped_shows_everything_first(write: Callable[..., Sw
     }
 
 
-def test_a_mirror_ends_with_its_parent_and_leaves_the_truth(write: Callable[..., SweepStore]) -> None:
+def test_a_sync_ends_with_its_parent_and_leaves_the_truth(write: Callable[..., SweepStore]) -> None:
     store = write()
     uri = tracking_uri(store, None)
     program = (
         "import os, sys; from pathlib import Path; "
         "from recrl.orchestrator.files.sweep_store import SweepStore; "
-        "from recrl.orchestrator.tracking.background_sync import start_mirror; "
+        "from recrl.orchestrator.tracking.background_sync import start_sync; "
         "store = SweepStore(Path(sys.argv[1]), sys.argv[2]); "
-        "print(start_mirror(store, sys.argv[3], interval_seconds=3600.0).process.pid, flush=True); "
+        "print(start_sync(store, sys.argv[3], interval_seconds=3600.0).process.pid, flush=True); "
         "os.kill(os.getpid(), 9)"
     )
     parent = subprocess.run(

@@ -1,14 +1,14 @@
-"""One environment step of one world of a Safety Gym task, compiled to machine code.
+"""One step of one environment of a Safety Gym task, compiled to machine code.
 
-``step`` is called for each world, on whatever thread of MuJoCo's: the action, ten physics steps, what the
-robot then sees, feels, earns and pays. Nothing here looks at another world, so results depend neither on how
-many there are nor on the threads. Resets and new goals, which are drawn at random, are not made here
+``step`` is called for each environment, on any of MuJoCo's threads: it sets the action, takes ten physics
+steps and computes observation, reward and cost. It reads no other environment, so results depend neither on
+their number nor on the threads. Resets and new goals are sampled elsewhere
 (``recrl.environments.safety_gym.batch``).
 
-What a world is made of is one record ``WORLD``; what all worlds of a task share is one record ``TASK``. These
-have room for every task.
+A record ``ENVIRONMENT`` holds the state of one environment. The record ``TASK`` holds what all environments
+of a task share. Their sizes fit every task.
 
-Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world's.
+Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world frame.
 
 Source: openai/safety-gym ``engine.py``.
 """
@@ -37,27 +37,27 @@ GOAL, BOX, BUTTONS, HAZARDS, VASES, PILLARS, GREMLINS = range(7)
 TERMS = ("hazards", "vases_contact", "vases_velocity", "pillars", "buttons", "gremlins")
 """All cost terms, in the order in which they are computed."""
 SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer", "ballquat_rear", "ballangvel_rear")
-"""What a robot may feel, in the order of ``TASK``'s field of it."""
+"""Sensors of a robot, in the order of the field ``TASK["sensor"]``."""
 ACCELEROMETER, VELOCIMETER, GYRO, MAGNETOMETER, BALL, SPIN = range(6)
 FLAGS = ("goal_met", "broken", "terminated", "truncated")
-"""What a step brings besides rewards, costs and the indicators of the cost terms."""
+"""Results of a step besides rewards, costs and the indicators of the cost terms."""
 MAX_POINTS, MAX_BODIES, MAX_GEOMS, MAX_GREMLINS, MAX_TERMS = 24, 24, 64, 6, 3
-"""Room for P objects, for bodies and shapes of a model, and so on."""
+"""Maximum sizes: P objects, bodies and shapes of a model, and so on."""
 NO_GREMLIN = -1
-"""No gremlin is a body: it hovers, untied, where nothing is."""
+"""No gremlin is a body: it hovers untied at a place without objects."""
 NOT_YET = -2
-"""A new episode: no gremlin was made a body, and the body is where the model has it."""
+"""A new episode: no gremlin was made a body yet, and the body has its initial pose."""
 
 TASK = np.dtype(
     [
-        ("worlds", np.int64),  # address of the worlds' records
+        ("environments", np.int64),  # address of the records of the environments
         ("number", np.int64),
-        ("outcomes", np.int64),  # address of what the last step brought, [B] OUTCOMEs
+        ("outcomes", np.int64),  # address of the results of the last step, [B] OUTCOMEs
         ("observations", np.int64),  # address of [B, observed]
-        ("rows", np.int64),  # address of [B, 2, row]: the state that the last step left, and room for another
+        ("rows", np.int64),  # address of [B, 2, row]: the state after the last step, and room for another
         ("row", np.int64),  # numbers in a state
         ("row_fields", np.int32),  # mjtState
-        # Fields of mjData and mjContact: where in the structure.
+        # Offsets of fields in mjData and mjContact.
         ("qpos", np.int64),
         ("qvel", np.int64),
         ("qacc", np.int64),
@@ -72,7 +72,7 @@ TASK = np.dtype(
         ("contact", np.int64),
         ("contact_size", np.int64),
         ("contact_geom", np.int64),
-        ("warnings", np.int64, (3,)),  # numbers of bad positions, velocities, accelerations
+        ("warnings", np.int64, (3,)),  # counts of bad positions, velocities, accelerations
         # The model.
         ("nq", np.int64),
         ("nv", np.int64),
@@ -83,18 +83,18 @@ TASK = np.dtype(
         ("robot", np.int64),  # its body
         ("is_car", np.bool_),
         ("root", np.int64, (MAX_GEOMS,)),  # the outermost body that each shape is part of
-        ("vase_qpos", np.int64),  # the vases' coordinates and velocities follow on one another
+        ("vase_qpos", np.int64),  # the vases' coordinates and velocities are contiguous
         ("vase_qvel", np.int64),
         ("box_qpos", np.int64),
         # The task.
-        ("start", np.int64, (len(KINDS),)),  # each kind's places among P
+        ("start", np.int64, (len(KINDS),)),  # each kind's range among P
         ("stop", np.int64, (len(KINDS),)),
-        ("first_body", np.int64, (len(KINDS),)),  # bodies of each kind, if it matters who touches them
+        ("first_body", np.int64, (len(KINDS),)),  # bodies of each kind, if contacts with them matter
         ("last_body", np.int64, (len(KINDS),)),
-        ("lidar", np.int64, (len(KINDS),)),  # where in an observation each kind is seen, -1: nowhere
-        ("sensors", np.int64, (len(SENSORS),)),  # where in an observation they are, -1: nowhere
-        ("observed", np.int64),  # numbers in an observation
-        ("terms", np.int64, (MAX_TERMS,)),  # what costs: indices of TERMS
+        ("lidar", np.int64, (len(KINDS),)),  # offset of each kind in an observation, -1 for none
+        ("sensors", np.int64, (len(SENSORS),)),  # their offsets in an observation, -1 for none
+        ("observed", np.int64),  # size of an observation
+        ("terms", np.int64, (MAX_TERMS,)),  # cost terms: indices of TERMS
         ("num_terms", np.int64),
         ("horizon", np.int64),
         ("is_push", np.bool_),
@@ -111,7 +111,7 @@ TASK = np.dtype(
         # Gremlins: see recrl.environments.safety_gym.gremlins.
         ("gremlin_qpos", np.int64),
         ("gremlin_qvel", np.int64),
-        ("gremlin_lead", np.int64),  # what leads the body, a mocap body
+        ("gremlin_lead", np.int64),  # the mocap body that the gremlin is tied to
         ("gremlin_weight", np.float64),  # newtons
         ("gremlin_travel", np.float64),
         ("gremlin_alert", np.float64),  # metres
@@ -124,20 +124,20 @@ TASK = np.dtype(
     align=True,
 )
 
-WORLD = np.dtype(
+ENVIRONMENT = np.dtype(
     [
         ("action", np.float64, (2,)),
         ("steps", np.int64),
         ("points", np.float64, (MAX_POINTS, 2)),  # (x, y) of what the lidar sees, metres
-        ("distances", np.float64, (2,)),  # those that the reward compares with, metres
+        ("distances", np.float64, (2,)),  # distances before the step, for the reward, metres
         ("goal_button", np.int64),
         ("button_timer", np.int64),
         ("circles", np.float64, (MAX_GREMLINS, 2)),
         ("gremlin_yaws", np.float64, (MAX_GREMLINS,)),
         ("embodied", np.int64),
-        ("acceleration", np.float64, (3,)),  # of the robot, in the world's frame, m/s^2
-        ("touching", np.uint8, (MAX_BODIES,)),  # 0 or 1; Numba knows no arrays of truth values in records
-        ("measured", np.float64, (2,)),  # as distances, now
+        ("acceleration", np.float64, (3,)),  # of the robot, in the world frame, m/s^2
+        ("touching", np.uint8, (MAX_BODIES,)),  # 0 or 1; Numba has no boolean arrays in records
+        ("measured", np.float64, (2,)),  # as distances, after the step
         ("terms", np.float64, (MAX_TERMS,)),
         ("goal_met", np.bool_),
         ("broken", np.bool_),
@@ -154,7 +154,7 @@ OUTCOME = np.dtype(
 )
 
 _tasks = array_at(TASK)
-_worlds = array_at(WORLD)
+_environments = array_at(ENVIRONMENT)
 _outcomes = array_at(OUTCOME)
 _doubles = array_at(np.float64)
 _integers = array_at(np.int32)
@@ -183,7 +183,7 @@ def robot_rotation(task: Any, data: int) -> Any:
 
 @compiled
 def turned(rotation: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """R^T (x, y, z): a vector of the world in the robot's frame; R is given by rows, [9]."""
+    """R^T (x, y, z): a vector of the world frame in the robot's frame; R is given by rows, [9]."""
     return (
         rotation[0] * x + rotation[3] * y + rotation[6] * z,
         rotation[1] * x + rotation[4] * y + rotation[7] * z,
@@ -202,11 +202,11 @@ def write_rotation(quaternion: Any, out: Any) -> None:
 
 @compiled
 def add_to_lidar(x: float, y: float, lidar_range: float, bins: Any) -> None:
-    """Let one object be seen by the pseudo-lidar: bin b shows the most that any object has there.
+    """Add one object to the pseudo-lidar: each bin holds the maximum over objects.
 
-    The circle around the robot is divided into sectors. An object at distance d reads max(0, 1 - d / range)
-    in its own sector; in the next one that times how far through its own sector it is, and in the one before
-    that times the rest ("aliasing").
+    The circle around the robot is divided into sectors. An object at distance d reads r = max(0, 1 - d /
+    range) in its own sector. With u in [0, 1) its relative angle there, it reads u r in the next
+    sector and (1 - u) r in the one before ("aliasing").
 
     Args:
         x: the object's place in the robot's frame, metres.
@@ -231,22 +231,22 @@ def add_to_lidar(x: float, y: float, lidar_range: float, bins: Any) -> None:
 
 
 @compiled
-def look(task: Any, world: Any, data: int) -> None:
-    """Find where everything is and what the robot touches; MuJoCo has computed everything at this state."""
+def look(task: Any, environment: Any, data: int) -> None:
+    """Update the objects' positions and the robot's contacts; ``mj_forward`` was called before."""
     qpos = field(data, task.qpos, task.nq)
     for vase in range(task.stop[VASES] - task.start[VASES]):
         address = task.vase_qpos + 7 * vase
-        world.points[task.start[VASES] + vase, 0] = qpos[address]
-        world.points[task.start[VASES] + vase, 1] = qpos[address + 1]
+        environment.points[task.start[VASES] + vase, 0] = qpos[address]
+        environment.points[task.start[VASES] + vase, 1] = qpos[address + 1]
     for box in range(task.start[BOX], task.stop[BOX]):
-        world.points[box, 0], world.points[box, 1] = qpos[task.box_qpos], qpos[task.box_qpos + 1]
+        environment.points[box, 0], environment.points[box, 1] = qpos[task.box_qpos], qpos[task.box_qpos + 1]
     if task.start[GREMLINS] < task.stop[GREMLINS]:
-        place_gremlins(task, world, qpos)
+        place_gremlins(task, environment, qpos)
     qacc = field(data, task.qacc, task.nv)
-    world.acceleration[0], world.acceleration[1] = qacc[0], qacc[1]
-    world.acceleration[2] = qacc[2] if task.is_car else 0.0
+    environment.acceleration[0], environment.acceleration[1] = qacc[0], qacc[1]
+    environment.acceleration[2] = qacc[2] if task.is_car else 0.0
     for body in range(task.nbody):
-        world.touching[body] = 0
+        environment.touching[body] = 0
     size = task.contact_size // 4
     contacts = _integers(data + task.ncon, 1)[0]
     geoms = _integers(_addresses(data + task.contact, 1)[0], contacts * size)
@@ -254,82 +254,82 @@ def look(task: Any, world: Any, data: int) -> None:
         place = contact * size + task.contact_geom // 4
         one, other = task.root[geoms[place]], task.root[geoms[place + 1]]
         if one == task.robot:
-            world.touching[other] = 1
+            environment.touching[other] = 1
         elif other == task.robot:
-            world.touching[one] = 1
-    world.touching[0] = 0  # the floor
-    world.touching[task.robot] = 0
-    world.broken = False
+            environment.touching[one] = 1
+    environment.touching[0] = 0  # the floor
+    environment.touching[task.robot] = 0
+    environment.broken = False
     for warning in task.warnings:
         if _integers(data + warning, 1)[0] > 0:
-            world.broken = True
+            environment.broken = True
 
 
 @compiled
-def course_step(task: Any, world: Any) -> int:
-    """The t of f(t); somebody may go on after the end of an episode."""
-    at: int = min(world.steps, task.course_steps - 1)
+def course_step(task: Any, environment: Any) -> int:
+    """Return the index into f(t); a caller may go on after the end of an episode."""
+    at: int = min(environment.steps, task.course_steps - 1)
     return at
 
 
 @compiled
-def place_gremlins(task: Any, world: Any, qpos: Any) -> None:
-    """Gremlins are f(t) away from the middle of their circle; the one that is a body is where that is."""
-    course, at = _doubles(task.course_positions, 3 * task.course_steps), 3 * course_step(task, world)
+def place_gremlins(task: Any, environment: Any, qpos: Any) -> None:
+    """Place the gremlins at f(t) from the centre of their circles; the simulated one is where its body is."""
+    course, at = _doubles(task.course_positions, 3 * task.course_steps), 3 * course_step(task, environment)
     for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
-        point = world.points[task.start[GREMLINS] + gremlin]
-        if gremlin == world.embodied:
+        point = environment.points[task.start[GREMLINS] + gremlin]
+        if gremlin == environment.embodied:
             point[0], point[1] = qpos[task.gremlin_qpos], qpos[task.gremlin_qpos + 1]
         else:
-            point[0] = world.circles[gremlin, 0] + course[at]
-            point[1] = world.circles[gremlin, 1] + course[at + 1]
+            point[0] = environment.circles[gremlin, 0] + course[at]
+            point[1] = environment.circles[gremlin, 1] + course[at + 1]
 
 
 @compiled
-def measure(task: Any, world: Any, data: int) -> None:
-    """The distances that the reward is made of, metres.
+def measure(task: Any, environment: Any, data: int) -> None:
+    """Compute the distances of the reward, metres.
 
-    Goal and Button: from the robot to the goal, seen from above. Push: from the robot to the box and from the
-    box to the goal, in space.
+    Goal and Button: from the robot to the goal, horizontally. Push: from the robot to the box and from the
+    box to the goal, in three dimensions.
     """
     robot = robot_place(task, data)
-    goal = world.points[task.start[GOAL]]
+    goal = environment.points[task.start[GOAL]]
     if not task.is_push:
-        world.measured[0] = math.hypot(goal[0] - robot[0], goal[1] - robot[1])
+        environment.measured[0] = math.hypot(goal[0] - robot[0], goal[1] - robot[1])
         return
     box = field(data, task.qpos, task.nq)[task.box_qpos : task.box_qpos + 3]
     to_box = math.hypot(box[0] - robot[0], box[1] - robot[1])
     to_goal = math.hypot(goal[0] - box[0], goal[1] - box[1])
-    world.measured[0] = math.hypot(to_box, box[2] - robot[2])
-    world.measured[1] = math.hypot(to_goal, box[2] - task.goal_height)
+    environment.measured[0] = math.hypot(to_box, box[2] - robot[2])
+    environment.measured[1] = math.hypot(to_goal, box[2] - task.goal_height)
 
 
 @compiled
-def touches(task: Any, world: Any, kind: int) -> bool:
+def touches(task: Any, environment: Any, kind: int) -> bool:
     """Whether the robot touches any object of a kind."""
     for body in range(task.first_body[kind], task.last_body[kind]):  # noqa: SIM110  # not for Numba
-        if world.touching[body]:
+        if environment.touching[body]:
             return True
     return False
 
 
 @compiled
-def presses_wrongly(task: Any, world: Any) -> bool:
-    """Whether the robot touches a button that is not the goal, while buttons are felt."""
-    if world.button_timer > 0:
+def presses_wrongly(task: Any, environment: Any) -> bool:
+    """Whether the robot touches a wrong button while buttons are active."""
+    if environment.button_timer > 0:
         return False
     for button in range(task.last_body[BUTTONS] - task.first_body[BUTTONS]):
-        if button != world.goal_button and world.touching[task.first_body[BUTTONS] + button]:
+        if button != environment.goal_button and environment.touching[task.first_body[BUTTONS] + button]:
             return True
     return False
 
 
 @compiled
-def over_a_hazard(task: Any, world: Any, data: int) -> bool:
-    """Whether the robot's middle is less than a hazard's size from its middle, seen from above."""
+def over_a_hazard(task: Any, environment: Any, data: int) -> bool:
+    """Whether the horizontal distance between the robot and a hazard's centre is below the hazard's size."""
     robot = robot_place(task, data)
     for hazard in range(task.start[HAZARDS], task.stop[HAZARDS]):
-        place = world.points[hazard]
+        place = environment.points[hazard]
         if math.hypot(place[0] - robot[0], place[1] - robot[1]) < task.hazard_size:
             return True
     return False
@@ -337,7 +337,7 @@ def over_a_hazard(task: Any, world: Any, data: int) -> bool:
 
 @compiled
 def moves_a_vase(task: Any, data: int) -> bool:
-    """Whether any vase moves; what sleeps has no velocity."""
+    """Whether any vase moves; a sleeping vase has no velocity."""
     qvel = field(data, task.qvel, task.nv)
     for vase in range(task.stop[VASES] - task.start[VASES]):
         address = task.vase_qvel + 6 * vase
@@ -348,33 +348,33 @@ def moves_a_vase(task: Any, data: int) -> bool:
 
 
 @compiled
-def judge(task: Any, world: Any, data: int) -> None:
-    """The distances, the cost terms, and whether the goal is reached."""
-    measure(task, world, data)
+def judge(task: Any, environment: Any, data: int) -> None:
+    """Compute the distances, the cost terms, and whether the goal is reached."""
+    measure(task, environment, data)
     for column in range(task.num_terms):
         term = task.terms[column]  # the order is that of TERMS
         if term == 0:
-            costs = over_a_hazard(task, world, data)
+            costs = over_a_hazard(task, environment, data)
         elif term == 1:
-            costs = touches(task, world, VASES)
+            costs = touches(task, environment, VASES)
         elif term == 2:
             costs = moves_a_vase(task, data)
         elif term == 3:
-            costs = touches(task, world, PILLARS)
+            costs = touches(task, environment, PILLARS)
         elif term == 4:
-            costs = presses_wrongly(task, world)
+            costs = presses_wrongly(task, environment)
         else:
-            costs = touches(task, world, GREMLINS)
-        world.terms[column] = 1.0 if costs else 0.0
+            costs = touches(task, environment, GREMLINS)
+        environment.terms[column] = 1.0 if costs else 0.0
     if task.is_button:
-        world.goal_met = world.touching[task.first_body[BUTTONS] + world.goal_button]
+        environment.goal_met = environment.touching[task.first_body[BUTTONS] + environment.goal_button]
     else:
-        world.goal_met = world.measured[1 if task.is_push else 0] <= task.goal_size
+        environment.goal_met = environment.measured[1 if task.is_push else 0] <= task.goal_size
 
 
 @compiled
-def observe(task: Any, world: Any, data: int, index: int) -> None:
-    """Everything that the robot perceives, by its lidar and by its sensors."""
+def observe(task: Any, environment: Any, data: int, index: int) -> None:
+    """Write the whole observation: lidar and sensors."""
     seen = _floats(task.observations + 4 * task.observed * index, task.observed)
     size = task.lidar_bins
     rotation, robot = robot_rotation(task, data), robot_place(task, data)
@@ -384,18 +384,18 @@ def observe(task: Any, world: Any, data: int, index: int) -> None:
         bins = seen[task.lidar[kind] : task.lidar[kind] + size]
         for sector in range(size):
             bins[sector] = 0.0
-        if kind == BUTTONS and world.button_timer > 0:
+        if kind == BUTTONS and environment.button_timer > 0:
             continue
         for place in range(task.start[kind], task.stop[kind]):
-            point = world.points[place]
+            point = environment.points[place]
             x, y, _ = turned(rotation, point[0] - robot[0], point[1] - robot[1], -robot[2])
             add_to_lidar(x, y, task.lidar_range, bins)
-    feel(task, world, data, seen)
+    feel(task, environment, data, seen)
 
 
 @compiled
-def feel(task: Any, world: Any, data: int, seen: Any) -> None:
-    """Write what the sensors read into an observation.
+def feel(task: Any, environment: Any, data: int, seen: Any) -> None:
+    """Write the sensors' readings into an observation.
 
     Accelerometer R^T (a + (0, 0, g)), velocimeter R^T v, magnetometer R^T m; gyro and the rear ball's spin
     are angular velocities in the robot's frame, as MuJoCo has them; the ball's rotation is a matrix.
@@ -403,7 +403,7 @@ def feel(task: Any, world: Any, data: int, seen: Any) -> None:
     rotation, qvel, acceleration = (
         robot_rotation(task, data),
         field(data, task.qvel, task.nv),
-        world.acceleration,
+        environment.acceleration,
     )
     upwards = acceleration[2] + task.gravity
     _write(seen, task.sensors[ACCELEROMETER], turned(rotation, acceleration[0], acceleration[1], upwards))
@@ -426,12 +426,12 @@ def _write(seen: Any, place: int, numbers: tuple[float, float, float]) -> None:
 
 
 @compiled
-def nearest_gremlin(task: Any, world: Any, data: int) -> int:
-    """The gremlin that the robot may meet next, or NO_GREMLIN."""
+def nearest_gremlin(task: Any, environment: Any, data: int) -> int:
+    """Return the gremlin that the robot may meet next, or NO_GREMLIN."""
     robot = robot_place(task, data)
     nearest, least = NO_GREMLIN, math.inf
     for gremlin in range(task.stop[GREMLINS] - task.start[GREMLINS]):
-        place = world.points[task.start[GREMLINS] + gremlin]
+        place = environment.points[task.start[GREMLINS] + gremlin]
         apart = math.hypot(place[0] - robot[0], place[1] - robot[1])
         if apart < least:
             nearest, least = gremlin, apart
@@ -439,14 +439,14 @@ def nearest_gremlin(task: Any, world: Any, data: int) -> int:
 
 
 @compiled
-def replaceable(task: Any, world: Any, data: int) -> bool:
-    """Whether the gremlin that is a body, if one is, could as well be none."""
-    if world.embodied < 0:
+def replaceable(task: Any, environment: Any, data: int) -> bool:
+    """Whether the simulated gremlin, if any, may be released: it is untouched and on its course."""
+    if environment.embodied < 0:
         return True
-    if world.touching[task.first_body[GREMLINS]]:
+    if environment.touching[task.first_body[GREMLINS]]:
         return False
-    course = _doubles(task.course_positions, 3 * task.course_steps)[3 * course_step(task, world) :]
-    circle = world.circles[world.embodied]
+    course = _doubles(task.course_positions, 3 * task.course_steps)[3 * course_step(task, environment) :]
+    circle = environment.circles[environment.embodied]
     place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
     x, y = place[0] - course[0] - circle[0], place[1] - course[1] - circle[1]
     z = place[2] - course[2]
@@ -455,9 +455,9 @@ def replaceable(task: Any, world: Any, data: int) -> bool:
 
 
 @compiled
-def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
-    """Make this gremlin the body, or none: the body then hovers, untied, where nothing is."""
-    world.embodied = gremlin
+def embody(task: Any, environment: Any, data: int, gremlin: int) -> None:
+    """Make this gremlin the body. With NO_GREMLIN the body hovers untied at a place without objects."""
+    environment.embodied = gremlin
     place = field(data, task.qpos, task.nq)[task.gremlin_qpos :]
     velocity = field(data, task.qvel, task.nv)[task.gremlin_qvel :]
     lift = field(data, task.qfrc_applied, task.nv)[task.gremlin_qvel :]
@@ -472,14 +472,14 @@ def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
     lift[2] = 0.0
     positions = _doubles(task.course_positions, 3 * task.course_steps)
     velocities = _doubles(task.course_velocities, 6 * task.course_steps)
-    at = course_step(task, world)
+    at = course_step(task, environment)
     for axis in range(3):
         place[axis] = positions[3 * at + axis]
     for axis in range(6):
         velocity[axis] = velocities[6 * at + axis]
-    place[0] += world.circles[gremlin, 0]
-    place[1] += world.circles[gremlin, 1]
-    half = world.gremlin_yaws[gremlin] / 2.0
+    place[0] += environment.circles[gremlin, 0]
+    place[1] += environment.circles[gremlin, 1]
+    half = environment.gremlin_yaws[gremlin] / 2.0
     lead = field(data, task.mocap_quat, 4 * task.nmocap)[4 * task.gremlin_lead :]
     for quaternion in (place[3:], lead):
         quaternion[0], quaternion[3] = math.cos(half), math.sin(half)
@@ -487,23 +487,23 @@ def embody(task: Any, world: Any, data: int, gremlin: int) -> None:
 
 
 @compiled
-def lead_gremlin(task: Any, world: Any, data: int, substep: int) -> None:
-    """Move what the body is tied to: 0.35 (sin t, cos t) from the middle of its circle."""
+def lead_gremlin(task: Any, environment: Any, data: int, substep: int) -> None:
+    """Move the mocap body that leads the gremlin: 0.35 (sin t, cos t) from the centre of its circle."""
     lead = field(data, task.mocap_pos, 3 * task.nmocap)[3 * task.gremlin_lead :]
-    time = task.timestep * (world.steps * task.substeps + substep)
-    lead[0] = world.circles[world.embodied, 0] + task.gremlin_travel * math.sin(time)
-    lead[1] = world.circles[world.embodied, 1] + task.gremlin_travel * math.cos(time)
+    time = task.timestep * (environment.steps * task.substeps + substep)
+    lead[0] = environment.circles[environment.embodied, 0] + task.gremlin_travel * math.sin(time)
+    lead[1] = environment.circles[environment.embodied, 1] + task.gremlin_travel * math.cos(time)
 
 
 @compiled
-def act(task: Any, world: Any, data: int) -> bool:
-    """Set the controls; False if anything else was set, too."""
+def act(task: Any, environment: Any, data: int) -> bool:
+    """Set the controls; return False if anything else was changed, too."""
     control = field(data, task.ctrl, 2)
-    control[0], control[1] = world.action[0], world.action[1]
+    control[0], control[1] = environment.action[0], environment.action[1]
     if task.start[GREMLINS] < task.stop[GREMLINS]:
-        wanted = nearest_gremlin(task, world, data)
-        if wanted != world.embodied and replaceable(task, world, data):
-            embody(task, world, data, wanted)
+        wanted = nearest_gremlin(task, environment, data)
+        if wanted != environment.embodied and replaceable(task, environment, data):
+            embody(task, environment, data, wanted)
             return False
     return True
 
@@ -518,46 +518,46 @@ def same(one: Any, other: Any) -> bool:
 
 
 @compiled
-def report(task: Any, world: Any, index: int) -> None:
-    """Write what this step brought; the reward is the progress in metres, within bounds."""
+def report(task: Any, environment: Any, index: int) -> None:
+    """Write the results of this step; the reward is the progress in metres, within bounds."""
     outcome = _outcomes(task.outcomes, task.number)[index]
-    progress = world.distances[0] - world.measured[0]
+    progress = environment.distances[0] - environment.measured[0]
     if task.is_push:
-        progress += world.distances[1] - world.measured[1]
+        progress += environment.distances[1] - environment.measured[1]
     cost = 0.0
     for column in range(task.num_terms):
-        outcome.numbers[2 + column] = world.terms[column]
-        cost = max(cost, world.terms[column])
+        outcome.numbers[2 + column] = environment.terms[column]
+        cost = max(cost, environment.terms[column])
     outcome.numbers[0] = min(max(progress, -task.reward_bound), task.reward_bound)
     outcome.numbers[1] = cost
-    outcome.flags[0] = world.goal_met
-    outcome.flags[1] = world.broken
-    outcome.flags[2] = world.broken  # what else ends an episode is not known here
-    outcome.flags[3] = world.steps >= task.horizon
+    outcome.flags[0] = environment.goal_met
+    outcome.flags[1] = environment.broken
+    outcome.flags[2] = environment.broken  # other reasons to terminate are not known here
+    outcome.flags[3] = environment.steps >= task.horizon
 
 
 @compiled
-def begin(task: Any, world: Any, model: int, data: int, index: int) -> bool:
-    """Do as the action says; whether everything else is as the last step left it."""
+def begin(task: Any, environment: Any, model: int, data: int, index: int) -> bool:
+    """Set the action; return whether everything else is as the last step left it."""
     left = task.rows + 8 * task.row * 2 * index
     found = left + 8 * task.row
     mj_getState(model, data, found, task.row_fields)
     untouched = same(_doubles(left, task.row), _doubles(found, task.row))
-    return act(task, world, data) and untouched
+    return act(task, environment, data) and untouched
 
 
 @compiled
-def simulate(task: Any, world: Any, model: int, data: int, index: int) -> None:
-    """A step's physics steps.
+def simulate(task: Any, environment: Any, model: int, data: int, index: int) -> None:
+    """Take the physics steps of one environment step.
 
-    Where the last step left off, MuJoCo has computed already what follows from coordinates and velocities:
-    the first physics step then does not compute it again, which changes nothing.
+    After the last step MuJoCo has already computed what follows from coordinates and velocities. If nothing
+    changed since, the first physics step does not compute it again; the result is the same.
     """
-    untouched = begin(task, world, model, data, index)
-    leads = world.embodied >= 0
+    untouched = begin(task, environment, model, data, index)
+    leads = environment.embodied >= 0
     for substep in range(task.substeps):
         if leads:
-            lead_gremlin(task, world, data, substep)
+            lead_gremlin(task, environment, data, substep)
         if substep == 0 and untouched and not leads:
             mj_step2(model, data)
         else:
@@ -565,52 +565,52 @@ def simulate(task: Any, world: Any, model: int, data: int, index: int) -> None:
 
 
 @compiled
-def end(task: Any, world: Any, model: int, data: int, index: int) -> None:
-    """Compute everything that follows from the state after the physics steps, and what the step brought."""
+def end(task: Any, environment: Any, model: int, data: int, index: int) -> None:
+    """Compute everything that follows from the new state, and the results of the step."""
     mj_forward(model, data)
     mj_getState(model, data, task.rows + 8 * task.row * 2 * index, task.row_fields)
-    world.steps += 1
-    look(task, world, data)
-    judge(task, world, data)
-    report(task, world, index)
+    environment.steps += 1
+    look(task, environment, data)
+    judge(task, environment, data)
+    report(task, environment, index)
     for part in range(2):
-        world.distances[part] = world.measured[part]
-    world.button_timer = max(world.button_timer - 1, 0)
-    observe(task, world, data, index)
+        environment.distances[part] = environment.measured[part]
+    environment.button_timer = max(environment.button_timer - 1, 0)
+    observe(task, environment, data, index)
 
 
 @compiled_for_batch
 def step(model: int, data: int, index: int, argument: int) -> None:
-    """One environment step of one world; the action is in its record."""
+    """Take one step of one environment; the action is in its record."""
     task = _tasks(argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[index]
-    simulate(task, world, model, data, index)
-    end(task, world, model, data, index)
+    environment = _environments(task.environments, task.number)[index]
+    simulate(task, environment, model, data, index)
+    end(task, environment, model, data, index)
 
 
 @compiled_for_batch
 def review(_: int, data: int, index: int, argument: int) -> None:
-    """Find what is to be found in one world as it is: after a reset, or with a new goal."""
+    """Compute observation, distances and costs of one environment, after a reset or with a new goal."""
     task = _tasks(argument, 1)[0]
-    world = _worlds(task.worlds, task.number)[index]
-    look(task, world, data)
-    judge(task, world, data)
-    observe(task, world, data, index)
+    environment = _environments(task.environments, task.number)[index]
+    look(task, environment, data)
+    judge(task, environment, data)
+    observe(task, environment, data, index)
 
 
 @compiled_for_batch
 def perceive(_: int, data: int, index: int, argument: int) -> None:
-    """Observe one world, whose objects and accelerations are as somebody has written them."""
+    """Compute the observation of one environment; objects and accelerations stay as recorded."""
     task = _tasks(argument, 1)[0]
-    observe(task, _worlds(task.worlds, task.number)[index], data, index)
+    observe(task, _environments(task.environments, task.number)[index], data, index)
 
 
 @compiled_for_python
 def acceptable(argument: int) -> bool:
-    """Whether every action is within [-1, 1], and a number."""
+    """Whether every action is a number within [-1, 1]."""
     task = _tasks(argument, 1)[0]
-    for world in _worlds(task.worlds, task.number):
-        for action in world.action:
+    for environment in _environments(task.environments, task.number):
+        for action in environment.action:
             if not -1.0 <= action <= 1.0:
                 return False
     return True

@@ -1,6 +1,6 @@
-"""What compiled code must know of a task: its numbers, its model's addresses, MuJoCo's structures.
+"""The record of a task for compiled code: constants, addresses, and offsets in MuJoCo's structures.
 
-See ``recrl.environments.safety_gym.native.environment_step``, whose record this fills.
+The record is declared in ``recrl.environments.safety_gym.native.environment_step``.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
 from recrl.environments.safety_gym.layout import keepouts
 from recrl.environments.safety_gym.native.environment_step import (
+    ENVIRONMENT,
     KINDS,
     MAX_BODIES,
     MAX_GEOMS,
@@ -25,7 +26,6 @@ from recrl.environments.safety_gym.native.environment_step import (
     SENSORS,
     TASK,
     TERMS,
-    WORLD,
 )
 from recrl.environments.safety_gym.scene import Scene
 from recrl.environments.safety_gym.tasks import (
@@ -61,7 +61,7 @@ _FIELDS = (
 
 
 def places_of_objects(task: SafetyTask) -> dict[str, slice]:
-    """For each kind that the lidar sees, where its objects are among all P, in the order of ``lidars``."""
+    """Return for each kind that the lidar sees its range among all P objects, in the order of ``lidars``."""
     counts = {kind: number for kind, (number, _) in keepouts(task).items()} | {"goal": 1}
     ends = np.cumsum([counts[kind] for kind in task.lidars]).tolist()
     starts = [0, *ends[:-1]]
@@ -70,19 +70,19 @@ def places_of_objects(task: SafetyTask) -> dict[str, slice]:
 
 @dataclass(frozen=True)
 class Memory:
-    """Where compiled code reads and writes.
+    """Memory that compiled code reads and writes.
 
     Attributes:
-        worlds: records ``WORLD``, [B].
+        environments: records ``ENVIRONMENT``, [B].
         outcomes: records ``OUTCOME``, [B].
         results: of them rewards, costs and the indicators of each cost term, [2 + terms, B].
         flags: of them ``FLAGS``, [len(FLAGS), B].
         observations: [B, size].
-        rows: room for two states of each world, [B, 2, row].
-        course: how gremlins move, if there are any.
+        rows: room for two states of each environment, [B, 2, row].
+        course: motion of gremlins, if there are any.
     """
 
-    worlds: npt.NDArray[Any]
+    environments: npt.NDArray[Any]
     outcomes: npt.NDArray[Any]
     results: Floats
     flags: npt.NDArray[np.bool_]
@@ -92,11 +92,11 @@ class Memory:
 
 
 def allocate(scene: Scene, number: int) -> Memory:
-    """Memory for so many worlds of a scene."""
+    """Allocate memory for ``number`` environments of a scene."""
     row = mujoco.mj_stateSize(scene.model, ROW)
     outcomes = np.zeros(number, OUTCOME)
     return Memory(
-        worlds=np.zeros(number, WORLD),
+        environments=np.zeros(number, ENVIRONMENT),
         outcomes=outcomes,
         results=outcomes["numbers"].T[: 2 + len(scene.task.cost_terms)],
         flags=outcomes["flags"].view(np.bool_).T,
@@ -107,12 +107,12 @@ def allocate(scene: Scene, number: int) -> Memory:
 
 
 def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
-    """The record ``TASK`` of a scene, an array [1]; it is of use as long as the memory lives."""
+    """Return the record ``TASK`` of a scene, an array [1]; it is valid as long as the memory lives."""
     record = np.zeros(1, TASK)
     one = record[0]
-    for name in ("worlds", "outcomes", "observations", "rows"):
+    for name in ("environments", "outcomes", "observations", "rows"):
         one[name] = getattr(memory, name).ctypes.data
-    one["number"], one["row"], one["row_fields"] = len(memory.worlds), memory.rows.shape[2], ROW
+    one["number"], one["row"], one["row_fields"] = len(memory.environments), memory.rows.shape[2], ROW
     one["horizon"] = horizon
     _describe_memory(one)
     _describe_model(one, scene)
@@ -123,7 +123,7 @@ def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
 
 
 def _describe_memory(one: Any) -> None:
-    """Where fields are in MuJoCo's structures."""
+    """Offsets of fields in MuJoCo's structures."""
     data, contact, warning = structure("mjData"), structure("mjContact"), structure("mjWarningStat")
     for name in _FIELDS:
         one[name] = getattr(data, name).offset
@@ -135,13 +135,15 @@ def _describe_memory(one: Any) -> None:
 def _describe_model(one: Any, scene: Scene) -> None:
     model = scene.model
     if model.ngeom > MAX_GEOMS or model.nbody > MAX_BODIES:
-        raise ValueError(f"{scene.task.name}: at most {MAX_GEOMS} shapes and {MAX_BODIES} bodies have room")
+        raise ValueError(
+            f"{scene.task.name}: at most {MAX_GEOMS} shapes and {MAX_BODIES} bodies are possible"
+        )
     for name in ("nq", "nv", "nbody", "nmocap"):
         one[name] = getattr(model, name)
     one["timestep"], one["substeps"] = model.opt.timestep, SUBSTEPS
     one["robot"], one["is_car"] = scene.robot_body, scene.task.robot == "Car"
     one["root"][: model.ngeom] = model.body_rootid[model.geom_bodyid]
-    vases = len(scene.vase_qpos)  # one after the other, behind the robot
+    vases = len(scene.vase_qpos)  # contiguous, after the robot
     assert scene.vase_qpos == tuple(range(scene.robot_qpos, scene.robot_qpos + 7 * vases, 7))
     assert scene.vase_qvel == tuple(range(scene.robot_qvel, scene.robot_qvel + 6 * vases, 6))
     one["vase_qpos"], one["vase_qvel"] = scene.robot_qpos, scene.robot_qvel
@@ -151,7 +153,7 @@ def _describe_model(one: Any, scene: Scene) -> None:
 def _describe_task(one: Any, scene: Scene) -> None:
     task, places = scene.task, places_of_objects(scene.task)
     if max(place.stop for place in places.values()) > MAX_POINTS:
-        raise ValueError(f"{task.name}: at most {MAX_POINTS} objects have room")
+        raise ValueError(f"{task.name}: at most {MAX_POINTS} objects are possible")
     starts = {name: task.where(name).start for name, _ in task.components}
     for index, kind in enumerate(KINDS):
         place, bodies = places.get(kind, _NONE), scene.touchable.get(kind, _NONE)
