@@ -11,9 +11,10 @@ receive
 The task declares which numbers are a lidar, and its range (``CMDPSpec.components``). Without this, or with
 ``encoder: none``, there are no such features.
 
-Normalisation. With ``normalise_observations`` each number is standardised by its mean and standard deviation
-over all observations of training so far, and clipped. The statistics are updated after each policy update, so
-that acting and learning on a rollout use the same ones. Evaluation does not change them.
+Normalisation. Numbers of unknown scale (``normalise_observations``) are standardised by their mean and
+standard deviation over all observations of training so far, and clipped. The statistics are updated after
+each policy update, so that acting and learning on a rollout use the same ones. Evaluation does not change
+them.
 
 Notation: N observations, n numbers in each, L lidar numbers, S length scales.
 """
@@ -85,7 +86,7 @@ class Encoder:
         num_observations: n.
         components: the declared slices of an observation; empty if the task declares none.
         scales: length scales l of the proximity features in metres, each above 0; none for no features.
-        normalise: whether to standardise observations by running statistics.
+        normalise: which numbers are standardised by running statistics, [n].
 
     Attributes:
         size: number of inputs of the networks, n + S L.
@@ -97,19 +98,22 @@ class Encoder:
         components: Sequence[ObservationComponent],
         *,
         scales: Sequence[float],
-        normalise: bool,
+        normalise: npt.NDArray[np.bool_],
     ) -> None:
         self._lidar, ranges = lidar_numbers(components)
         self._rates = [(ranges / scale).astype(np.float32) for scale in scales] if len(ranges) else []
-        self._moments = RunningMoments(num_observations) if normalise else None
-        self._is_identity = not self._rates and not normalise
+        self._normalise = normalise
+        self._moments = RunningMoments(num_observations) if normalise.any() else None
+        self._is_identity = not self._rates and self._moments is None
         self.size = num_observations + len(self._rates) * len(ranges)
 
     def __call__(self, observations: Rows) -> Rows:
         """Encode observations, [N, n] -> [N, ``size``]."""
         if self._is_identity:
             return observations
-        kept = observations if self._moments is None else self._moments.standardised(observations)
+        kept = observations
+        if self._moments is not None:
+            kept = np.where(self._normalise, self._moments.standardised(observations), observations)
         if not self._rates:
             return kept
         values = observations[:, self._lidar]
@@ -173,7 +177,9 @@ class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
                 f"proximity features need observations that are vectors with a declared lidar, got {space}; "
                 "give components"
             )
-        self._encoder = Encoder(space.shape[0], components or (), scales=scales, normalise=False)
+        self._encoder = Encoder(
+            space.shape[0], components or (), scales=scales, normalise=np.zeros(space.shape[0], np.bool_)
+        )
         added = self._encoder.size - space.shape[0]
         self.observation_space = Box(
             np.concatenate([space.low, np.zeros(added, np.float32)]),

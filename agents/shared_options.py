@@ -30,6 +30,7 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "value_target": "reward-to-go",
     "value_scale": "none",
     "encoder": "none",
+    "normalise_observations": "none",
     "constraint_window": 1,
     "policy_average": 0.0,
     "noise_form": "match-mixture",
@@ -92,9 +93,11 @@ class ActorCriticConfig(BaseModel):
         default=(0.15, 0.4),
         description="Length scales of the proximity features, metres (ours).",
     )
-    normalise_observations: bool = Field(
-        default=False,
-        description="Standardise observations by their running mean and standard deviation (ours).",
+    normalise_observations: Literal["unbounded", "all", "none"] = Field(
+        default="unbounded",
+        description="Observation numbers that are standardised by their running mean and standard deviation: "
+        "unbounded, those without finite bounds if the task does not declare what they are (ours); all; or "
+        "none (paper).",
     )
     discount: Share = Field(default=0.99, description="Discount gamma of the critics, per step (paper).")
     reward_trace_decay: Share = Field(

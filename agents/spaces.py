@@ -32,6 +32,18 @@ def observation_size(space: gymnasium.Space[Any]) -> int:
     raise UnsupportedSpaceError(f"observation space must be Discrete, Box or MultiBinary, got {space}")
 
 
+def unbounded_numbers(space: gymnasium.Space[Any]) -> npt.NDArray[np.bool_]:
+    """Return which components of an observation row have an infinite bound, [n].
+
+    >>> unbounded_numbers(Box(np.array([0.0, -np.inf]), np.array([1.0, np.inf]))).tolist()
+    [False, True]
+    """
+    if isinstance(space, Box):
+        unbounded: npt.NDArray[np.bool_] = ~(np.isfinite(space.low) & np.isfinite(space.high)).reshape(-1)
+        return unbounded
+    return np.zeros(observation_size(space), np.bool_)
+
+
 def observation_rows(space: gymnasium.Space[Any], observations: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
     """Return B observations of ``space``, [B, ...], as float32 rows, [B, n].
 

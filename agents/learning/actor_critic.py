@@ -38,7 +38,7 @@ from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
 from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.agents.shared_options import ActorCriticConfig
-from recrl.agents.spaces import observation_size
+from recrl.agents.spaces import observation_size, unbounded_numbers
 from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
 from recrl.environments.plugins import trusted_attribute
 
@@ -281,6 +281,14 @@ class ActorCritic:
         return nullcontext() if device.type == "cpu" else device
 
 
+def _normalised_numbers(cmdp: CMDPSpec, config: ActorCriticConfig) -> npt.NDArray[np.bool_]:
+    """Return which numbers of an observation are standardised, [n]."""
+    size = observation_size(cmdp.observation_space)
+    if config.normalise_observations == "unbounded" and not cmdp.components:
+        return unbounded_numbers(cmdp.observation_space)
+    return np.full(size, config.normalise_observations == "all")
+
+
 def fresh_agent(
     cmdp: CMDPSpec,
     config: ActorCriticConfig,
@@ -300,7 +308,7 @@ def fresh_agent(
         observation_size(cmdp.observation_space),
         cmdp.components,
         scales=config.proximity_scales if config.encoder == "proximity" else (),
-        normalise=config.normalise_observations,
+        normalise=_normalised_numbers(cmdp, config),
     )
     form = NetworkForm(
         config.hidden_sizes,

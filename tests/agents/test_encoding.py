@@ -18,7 +18,7 @@ WALLS = ObservationComponent("walls_lidar", 2, lidar_range=3.0)
 
 
 def encoder(*, normalise: bool = False, scales: tuple[float, ...] = (0.15, 0.4)) -> Encoder:
-    return Encoder(3, (SPEED, WALLS), scales=scales, normalise=normalise)
+    return Encoder(3, (SPEED, WALLS), scales=scales, normalise=np.full(3, normalise))
 
 
 def test_proximity_features_are_the_ones_computed_by_hand() -> None:
@@ -36,7 +36,7 @@ def test_at_a_distance_of_0_every_proximity_is_1() -> None:
 
 def test_without_a_declared_lidar_nothing_is_added() -> None:
     observations = np.ones((2, 3), np.float32)
-    plain = Encoder(3, (), scales=(0.15,), normalise=False)
+    plain = Encoder(3, (), scales=(0.15,), normalise=np.zeros(3, np.bool_))
     assert plain.size == 3
     assert plain(observations) is observations
     assert encoder(scales=()).size == 3
@@ -100,7 +100,7 @@ def test_the_wrapper_gives_other_libraries_agents_the_same_numbers() -> None:
     wrapped = ProximityObservation(gymnasium.make("recrl.environments.registration:recrl/CarGoal2-v0"))
     seen, shown = plain.reset(seed=3)[0], wrapped.reset(seed=3)[0]
     components = make_vector("CarGoal2", 1).cmdp.components
-    expected = Encoder(72, components, scales=(0.15, 0.4), normalise=False)(seen[None])[0]
+    expected = Encoder(72, components, scales=(0.15, 0.4), normalise=np.zeros(72, np.bool_))(seen[None])[0]
     assert shown.tobytes() == expected.tobytes()
     assert wrapped.observation_space.contains(shown)
     assert wrapped.observation_space.shape == (168,)
@@ -109,3 +109,28 @@ def test_the_wrapper_gives_other_libraries_agents_the_same_numbers() -> None:
 def test_the_wrapper_refuses_observations_in_which_nothing_is_a_lidar() -> None:
     with pytest.raises(ValueError, match="with a declared lidar"):
         ProximityObservation(gymnasium.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize(
+    ("task", "option", "expected"),
+    [
+        ("SafetyHopperVelocity", "unbounded", 11),
+        ("SafetyHopperVelocity", "none", 0),
+        ("CarGoal1", "unbounded", 0),  # its numbers are declared
+        ("CarGoal1", "all", 72),
+        ("rivergrid-1a", "unbounded", 0),  # its numbers are bounded
+    ],
+)
+def test_numbers_of_unknown_scale_are_standardised(task: str, option: str, expected: int) -> None:
+    environments = make_vector(task, 1)
+    agent = make_agent(
+        "ppo-lag", environments.cmdp, {"normalise_observations": option}, np.random.SeedSequence(0)
+    )
+    state = agent.state_dict()["encoder"]
+    assert len(state.get("mean", ())) == expected
+
+
+def test_only_the_chosen_numbers_are_standardised() -> None:
+    one = Encoder(2, (), scales=(), normalise=np.array([False, True]))
+    one.learn(np.array([[1.0, 0.0], [3.0, 4.0]], np.float32))
+    assert one(np.array([[7.0, 4.0]], np.float32))[0] == pytest.approx([7.0, 1.0], 1e-5)
