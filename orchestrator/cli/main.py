@@ -11,9 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from recrl.orchestrator.cli.arguments import parse
+from recrl.orchestrator.cli.arguments import parse, readable
 from recrl.orchestrator.cli.requests import LaunchRequest, Request
-from recrl.orchestrator.cli.shared_arguments import readable
 from recrl.orchestrator.errors import (
     ClusterError,
     GridError,
