@@ -27,9 +27,10 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
 from recrl.orchestrator.files.locks import open_lock
 from recrl.orchestrator.files.small_files import read_sealed, write_atomically, write_sealed
+from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.places import LocalSweep, StopSign
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.patience import patiently
@@ -47,8 +48,8 @@ STORAGE_FORMAT = 2
 logger = logging.getLogger("recrl.sweep")
 
 
-class RemoteSweep:
-    """One sweep in an object store; a ``SweepPlace``.
+class RemoteSweep(SweepPlace):
+    """One sweep in an object store.
 
     Attributes:
         uri: the address of all sweeps there.
@@ -63,9 +64,9 @@ class RemoteSweep:
         Raises:
             RecrlError: the address is none, or needs a package that is not installed.
         """
+        super().__init__(store)
         root = ObjectStore(uri)
         self.uri = root.uri
-        self.store = store
         self.objects = root.below(store.name)
         self.lease = LaunchLease(self.objects)
         self._pulled: dict[str, list[str]] = {}
@@ -97,17 +98,13 @@ class RemoteSweep:
         )
 
     def held(self, stop: threading.Event) -> AbstractContextManager[None]:
-        """Be the one launch, on all machines, that runs the sweep; see ``LaunchLease.held``."""
+        """See ``SweepPlace`` and ``LaunchLease.held``."""
         return self.lease.held(stop)
 
     def request_stop(self) -> Callable[[], bool]:
-        """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
-
-        Raises:
-            StorageError: the store cannot be read or written.
-        """
+        """See ``SweepPlace``; the launch may run on another machine."""
         if self.store.is_locked() or not self.lease.is_held():
-            return LocalSweep(self.store).request_stop()
+            return super().request_stop()
         self.lease.request_stop()
         return self.lease.is_held
 
@@ -139,15 +136,15 @@ class RemoteSweep:
     def working_copy(
         self, spec: TrialSpec, should_stop: Callable[[], bool]
     ) -> AbstractContextManager[TrialStore]:
-        """Return a folder on this machine for one attempt at a trial; see ``upload.working_copy``."""
+        """See ``SweepPlace`` and ``upload.working_copy``."""
         return working_copy(self.trial(spec.folder_name), spec, should_stop)
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:
-        """Return the stop sign of a new run; see ``StopObject.open``."""
+        """See ``SweepPlace`` and ``StopObject.open``."""
         return StopObject.open(self.objects)
 
     def stop_sign_at(self, place: str) -> StopSign:
-        """Return the stop sign that a run has made."""
+        """See ``SweepPlace``."""
         return StopObject(self.objects, place)
 
     def refresh(self, *, checkpoints: bool = False) -> None:
