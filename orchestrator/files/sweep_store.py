@@ -62,6 +62,7 @@ from recrl.orchestrator.files.small_files import (
     write_atomically,
     write_sealed,
 )
+from recrl.orchestrator.files.trial_paths import Below
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 
@@ -73,65 +74,26 @@ _TRIAL = re.compile(r"__[0-9a-f]{10}$")
 
 
 class SweepStore:
-    """The folder of one sweep; every path in it is a property here.
+    """The folder of one sweep; every path in it is an attribute here, and the module says what it holds.
 
     Attributes:
         folder: ``<root>/<sweep>``.
     """
 
+    grid_path = Below("grid.yaml")
+    specs_path = Below("trials.jsonl")
+    info_path = Below("sweep.json")
+    trials_folder = Below("trials")
+    figures_folder = Below("figures")
+    mlflow_database = Below("mlflow.db")
+    mlflow_artifacts = Below("mlartifacts")
+    mirror_folder = Below("mirror")
+    stop_request_path = Below("stop.request")
+    storage_path = Below("storage.json")
+
     def __init__(self, root: Path, name: str) -> None:
         self.folder = root.absolute() / name
         self.name = name
-
-    @property
-    def grid_path(self) -> Path:
-        """The grid file as given to the last launch."""
-        return self.folder / "grid.yaml"
-
-    @property
-    def specs_path(self) -> Path:
-        """The trials of the last launch's grid, a TrialSpec a line."""
-        return self.folder / "trials.jsonl"
-
-    @property
-    def info_path(self) -> Path:
-        """Name, creation time and version."""
-        return self.folder / "sweep.json"
-
-    @property
-    def trials_folder(self) -> Path:
-        """One folder a trial."""
-        return self.folder / "trials"
-
-    @property
-    def figures_folder(self) -> Path:
-        """What ``recrl-sweep figures`` draws."""
-        return self.folder / "figures"
-
-    @property
-    def mlflow_database(self) -> Path:
-        """The default MLflow store (sqlite)."""
-        return self.folder / "mlflow.db"
-
-    @property
-    def mlflow_artifacts(self) -> Path:
-        """The default place of MLflow's artifacts."""
-        return self.folder / "mlartifacts"
-
-    @property
-    def mirror_folder(self) -> Path:
-        """How far MLflow has been told; may be deleted at any time."""
-        return self.folder / "mirror"
-
-    @property
-    def stop_request_path(self) -> Path:
-        """Whether the process that runs the sweep is asked to stop."""
-        return self.folder / "stop.request"
-
-    @property
-    def storage_path(self) -> Path:
-        """Where the sweep is kept, if this folder only mirrors it."""
-        return self.folder / "storage.json"
 
     def trial(self, spec: TrialSpec) -> TrialStore:
         """The trial's folder; it need not exist yet."""

@@ -14,7 +14,6 @@ videos are in it alone.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import threading
 import time
@@ -25,7 +24,7 @@ from pathlib import Path
 
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
-from recrl.orchestrator.files.locks import open_lock
+from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.small_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -291,8 +290,7 @@ class RemoteSweep(SweepPlace):
     def _alone(self) -> Iterator[None]:
         """Be the only process and thread that writes the copy."""
         self.store.folder.mkdir(parents=True, exist_ok=True)
-        with open_lock(self.store.folder / ".pull") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with locked(self.store.folder / ".pull"):
             yield
 
 
