@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
 from recrl.orchestrator.cli import requests
@@ -53,27 +53,29 @@ Exit codes:
   5    plan --check: a launch would have something to do
   130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
 
-COMMANDS: tuple[type[Request], ...] = (
-    requests.InitRequest,
-    requests.ListRequest,
-    requests.OptionsRequest,
-    requests.SchemaRequest,
-    requests.ValidateRequest,
-    requests.PlanRequest,
-    requests.LaunchRequest,
-    requests.StatusRequest,
-    requests.CheckRequest,
-    requests.StopRequest,
-    requests.LogsRequest,
-    requests.EvaluateRequest,
-    requests.FiguresRequest,
-    requests.ExportRequest,
-    requests.MergeRequest,
-    requests.BoundRequest,
-    requests.ReplayRequest,
-    requests.UIRequest,
-    requests.SyncRequest,
-)  # in the order of the help
+# Each command and the function that does it, in the order of the help. The function's module is imported when
+# it is needed.
+COMMANDS: Mapping[type[Request], str] = {
+    requests.InitRequest: "init:run_init",
+    requests.ListRequest: "catalogue:run_list",
+    requests.OptionsRequest: "catalogue:run_options",
+    requests.SchemaRequest: "catalogue:run_schema",
+    requests.ValidateRequest: "plan:run_validate",
+    requests.PlanRequest: "plan:run_plan",
+    requests.LaunchRequest: "launch:run_launch",
+    requests.StatusRequest: "status:run_status",
+    requests.CheckRequest: "status:run_check",
+    requests.StopRequest: "status:run_stop",
+    requests.LogsRequest: "status:run_logs",
+    requests.EvaluateRequest: "evaluate:run_evaluate",
+    requests.FiguresRequest: "results:run_figures",
+    requests.ExportRequest: "results:run_export",
+    requests.MergeRequest: "results:run_merge",
+    requests.BoundRequest: "curricula:run_bound",
+    requests.ReplayRequest: "curricula:run_replay",
+    requests.UIRequest: "tracking:run_ui",
+    requests.SyncRequest: "tracking:run_sync",
+}
 LISTS = ("--only", "--option")  # each takes several KEY=VALUE
 PAIR = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*=.*(?<!\.yaml)(?<!\.yml)")
 LONGEST_LINE = 1000  # characters of an error
