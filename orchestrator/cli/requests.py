@@ -19,6 +19,7 @@ from recrl.orchestrator.cli import argument_types as types
 
 VIDEOS = ("gif", "mp4")
 TEMPLATES = ("demo", "safety-gym", "velocity", "own-task")
+DEFAULT_ROOT = Path("runs")
 KINDS = ("tasks", "agents", "curricula", "methods")  # methods: as in a grid
 SWEEP_HELP = "a sweep's name, folder or grid file; may be left out where there is only one"
 
@@ -114,7 +115,7 @@ class PlaceRequest(Request):
     """Where sweeps are."""
 
     root: Path = by_flag(
-        type=types.folder, default=Path("runs"), help="the folder of all sweeps (default: runs)"
+        type=types.folder, default=DEFAULT_ROOT, help="the folder of all sweeps (default: runs)"
     )
     storage: str | None = by_flag(
         metavar="URI",

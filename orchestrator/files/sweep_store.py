@@ -50,15 +50,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from recrl.orchestrator.errors import DamagedError, OtherFormatError, StorageError, SweepBusyError
+from recrl.orchestrator.errors import DamagedError, StorageError, SweepBusyError
 from recrl.orchestrator.files.aside import move_aside
 from recrl.orchestrator.files.locks import look_at_lock, open_lock
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.small_files import (
-    parsed_object,
     read_sealed,
     read_whole,
     sealed,
+    unsealed,
     write_atomically,
     write_sealed,
 )
@@ -149,14 +149,8 @@ class SweepStore:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs).encode()
-        of_lines, of_grid = Extent.of(lines).sha256, Extent.of(grid_text).sha256
-        told = {
-            "name": self.name,
-            "created": self._created(),
-            "trials": len(specs),
-            "lines": of_lines,
-            "grid": of_grid,
-        }
+        told = {"name": self.name, "created": self._created(), "trials": len(specs)}
+        told |= {"lines": Extent.of(lines).sha256, "grid": Extent.of(grid_text).sha256}
         header = sealed(told, version=SPECS_FORMAT)
         if grid_text:
             write_atomically(self.grid_path, grid_text)
@@ -188,15 +182,8 @@ class SweepStore:
         """
         name = self.specs_path.name
         first, _, lines = read_whole(self.specs_path).partition(b"\n")
-        header = parsed_object(first, name)
-        found = header.get("format")
-        if found != SPECS_FORMAT:
-            raise OtherFormatError(
-                f"{name} has format {found!r}, of another version of recrl, and this one reads format "
-                f"{SPECS_FORMAT}"
-            )
-        told = {key: value for key, value in header.items() if key not in ("format", "sha256")}
-        if header != sealed(told, version=SPECS_FORMAT) or Extent.of(lines).sha256 != told["lines"]:
+        told = unsealed(first, name, version=SPECS_FORMAT)
+        if Extent.of(lines).sha256 != told["lines"]:
             raise DamagedError(f"{name} is not what was written: its checksum differs")
         created = self._created()
         if told["name"] != self.name or (created and told["created"] not in (None, created)):

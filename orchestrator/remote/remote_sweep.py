@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 
 from recrl.orchestrator.background import beside
@@ -32,14 +33,13 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.remote.patience import patiently
+from recrl.orchestrator.remote.patience import patiently, repeatedly
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
 from recrl.orchestrator.remote.stop_object import StopObject
 from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 PULL_SECONDS = 10.0  # between two looks at the trials that run
-LONGEST_PAUSE_SECONDS = 60.0  # between two looks while the store is down
 PULLS_AT_ONCE = 8
 
 STORAGE_FORMAT = 2
@@ -225,19 +225,7 @@ class RemoteSweep(SweepPlace):
         Raises:
             StorageError: the store cannot be read at the end.
         """
-
-        def follow(over: threading.Event) -> None:
-            pause = every
-            while not over.wait(pause):
-                try:
-                    self._pull_trials()
-                except (StorageError, OSError) as error:
-                    if pause == every:
-                        logger.warning("%s; the trials go on", error)
-                    pause = min(2.0 * pause, LONGEST_PAUSE_SECONDS)
-                else:
-                    pause = every
-
+        follow = partial(repeatedly, self._pull_trials, every=every, hint="the trials go on")
         with beside(follow, name="mirror"):
             yield
         patiently(self._pull_trials, stop.is_set)
