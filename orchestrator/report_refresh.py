@@ -15,7 +15,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
+from recrl.orchestrator.background import beside
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 FIRST_SECONDS = 120.0
@@ -35,14 +37,9 @@ def refreshing(
         first_seconds: until the first time.
         interval_seconds: between two times, at least.
     """
-    over = threading.Event()
-    thread = threading.Thread(target=_refresh, args=(store, over, first_seconds, interval_seconds))
-    thread.start()
-    try:
+    work = partial(_refresh, store, first_seconds, interval_seconds)
+    with beside(work, name="report"):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def sketch_command(store: SweepStore) -> list[str]:
@@ -60,7 +57,7 @@ def sketch_command(store: SweepStore) -> list[str]:
     ]
 
 
-def _refresh(store: SweepStore, over: threading.Event, wait: float, interval: float) -> None:
+def _refresh(store: SweepStore, wait: float, interval: float, over: threading.Event) -> None:
     while not over.wait(wait):
         began = time.monotonic()
         process = subprocess.Popen(

@@ -14,7 +14,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
@@ -154,19 +154,8 @@ class TrialSpec:
 
     def to_json(self) -> dict[str, Any]:
         """The spec as strict JSON values; ``from_json`` is its inverse."""
-        return {
-            "task": self.task.to_json(),
-            "agent": self.agent.to_json(),
-            "method": self.method.to_json(),
-            "train_limits": self.train_limits.to_json(),
-            "deploy_limits": self.deploy_limits.to_json(),
-            "train_steps": self.train_steps,
-            "deploy_steps": self.deploy_steps,
-            "num_envs": self.num_envs,
-            "rollout_steps": self.rollout_steps,
-            "evaluation_episodes": self.evaluation_episodes,
-            "seed": self.seed,
-        }
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: value if isinstance(value, int) else value.to_json() for name, value in values.items()}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrialSpec:

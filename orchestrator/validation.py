@@ -74,7 +74,7 @@ def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
         if model is None:
             return []
         if isinstance(part, str) and part in model.model_fields:
-            model = _model_in(model.model_fields[part].annotation)
+            model = model_in(model.model_fields[part].annotation)
     return list(model.model_fields) if model else []
 
 
@@ -100,12 +100,12 @@ def _unknown_key(key: str, known: list[str]) -> str:
     return f"unknown key{hint}"
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def model_in(annotation: Any) -> type[BaseModel] | None:
     """The pydantic model that an annotation is about: itself, in a list, optional or annotated."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in typing.get_args(annotation):
-        found = _model_in(argument)
+        found = model_in(argument)
         if found is not None:
             return found
     return None

@@ -33,22 +33,11 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-from recrl.teachers.static import Decay, cosine, exponential, hold, limit_at, linear
-
 # Time of a policy's progress: p = b / n (Algorithm 1) or p = (b - 1) / n (a trial).
 Clock = Literal["start", "end"]
 
-# Curricula with a bound known in advance. The limits of ``dynamic`` are unknown, but at most d_t like those
-# of ``step``.
-DECAYS: dict[str, Decay] = {
-    "step": hold,
-    "dynamic": hold,
-    "linear": linear,
-    "cosine": cosine,
-    "exponential": exponential,
-}
-
-# integral_0^1 w(p) dp
+# integral_0^1 w(p) dp, of the curricula with a bound known in advance. The limits of ``dynamic`` are unknown,
+# but at most d_t like those of ``step``.
 MEAN_WEIGHTS: dict[str, float] = {
     "none": 0.0,
     "step": 1.0,
@@ -102,33 +91,6 @@ def undiscounted_excess(kl: float, advantage: float, *, horizon: int) -> float:
     12.0
     """
     return math.sqrt(2 * kl) * horizon * (horizon - 1) * advantage
-
-
-def worst_case_cost(limit: float, excess: float) -> float:
-    """Return the bound of Lemma 1: J_C(pi_{b+1}) <= d + excess, discounted or not like the excess."""
-    return limit + excess
-
-
-def summed_limits(
-    curriculum: str, train_limit: float, deploy_limit: float, *, policies: int, clock: Clock
-) -> float:
-    """Return the sum of a curriculum's limits, sum_b D(b), by adding them up.
-
-    Args:
-        curriculum: a key of ``MEAN_WEIGHTS``; for ``dynamic`` an upper bound.
-        train_limit: d_t, finite.
-        deploy_limit: d_d, at most d_t.
-        policies: n, at least 1.
-        clock: time of a policy's progress.
-    """
-    _require_bound(curriculum)
-    if curriculum == "none":
-        return policies * deploy_limit
-    first = 1 if clock == "end" else 0
-    return math.fsum(
-        limit_at(b / policies, train_limit, deploy_limit, DECAYS[curriculum])
-        for b in range(first, policies + first)
-    )
 
 
 def weight_sum(curriculum: str, *, policies: int, clock: Clock) -> float:

@@ -32,7 +32,6 @@ from recrl.analysis.data.sweep_data import (
     EVENT_COLUMNS,
     PHASE_COLUMNS,
     ROWS,
-    Rows,
     Sweep,
     TrialFacts,
     assemble,
@@ -146,7 +145,7 @@ def load(path: Path) -> Sweep:
         raise RecrlError(f"{path}: sweep.json: {'.'.join(map(str, place))}: {sentence}") from error
     except (ValueError, IndexError, OverflowError) as error:
         raise RecrlError(f"{path}: is no sweep's compact file: {error}") from error
-    return assemble(checked.name, facts, Rows(**rows), grid=checked.grid, notes=checked.notes)
+    return assemble(checked.name, facts, rows, grid=checked.grid, notes=checked.notes)
 
 
 class _TrialFile(BaseModel):

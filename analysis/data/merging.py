@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.labels import TRIAL
-from recrl.analysis.data.sweep_data import ROWS, Rows, Sweep, TrialFacts, assemble, is_made_again
+from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble, is_made_again
 from recrl.orchestrator.spec import TrialState
 
 OUTCOMES = ("phases", "evaluations")  # the frames that every source has unrounded
@@ -47,7 +47,7 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
     return assemble(
         parts[0].name,
         [trials[number][trial_id] for trial_id, number in taken.items()],
-        Rows(**{name: _taken(parts, name, taken) for name in ROWS}),
+        {name: _taken(parts, name, taken) for name in ROWS},
         grid=next((part.grid for part in parts if part.grid), ""),
         notes=[*notes, *_disagreements(parts, having)],
     )

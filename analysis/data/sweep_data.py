@@ -76,11 +76,8 @@ PHASE_COST_COLUMNS = (("cost", ""), ("cost", "_std"), ("cost", "_total"), ("exce
 EVENT_COLUMNS = ("update", "end_step", "event")
 ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the frames that are given to it
 
-# Notes of ``assemble`` say one of these.
-
 # The agents' metrics that figures and tables read; MLflow and the compact file give no others.
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
-
 
 logger = logging.getLogger("recrl.frames")
 
@@ -107,25 +104,6 @@ class TrialFacts:
     cpu_seconds: float = 0.0
     start_limits: Sequence[float | str] | None = None
     provenance: str = ""
-
-
-@dataclass(frozen=True)
-class Rows:
-    """The tables but ``trials`` as a source knows them: a column TRIAL, and the table's own but KEY.
-
-    Attributes:
-        phases: a row a trial and phase.
-        updates: a row a policy update.
-        evaluations: a row an episode of the final policy.
-        events: a row an event.
-        policies: a row a state of a final policy.
-    """
-
-    phases: pd.DataFrame
-    updates: pd.DataFrame
-    evaluations: pd.DataFrame
-    events: pd.DataFrame
-    policies: pd.DataFrame
 
 
 @dataclass(frozen=True)
@@ -212,7 +190,7 @@ def load(store: SweepStore) -> Sweep:
     return assemble(
         store.name,
         [facts for facts, _ in read],
-        Rows(**{name: joined([rows[name] for _, rows in read]) for name in ROWS}),
+        {name: joined([rows[name] for _, rows in read]) for name in ROWS},
         grid=grid,
         notes=[problem] if problem else [],
     )
@@ -245,14 +223,19 @@ def load_episodes(
 
 
 def assemble(
-    name: str, facts: Sequence[TrialFacts], rows: Rows, *, grid: str = "", notes: Sequence[str] = ()
+    name: str,
+    facts: Sequence[TrialFacts],
+    rows: Mapping[str, pd.DataFrame],
+    *,
+    grid: str = "",
+    notes: Sequence[str] = (),
 ) -> Sweep:
     """Return the tables of a sweep from what a source knows of it.
 
     Args:
         name: of the sweep.
         facts: its trials, in the order of the grid.
-        rows: of the other tables, in order for each trial.
+        rows: the tables ROWS, in order for each trial, with a column TRIAL instead of KEY.
         grid: the grid file, or empty.
         notes: what the source has to say.
     """
@@ -272,11 +255,11 @@ def assemble(
     return Sweep(
         name=name,
         trials=keys.put_before(pd.DataFrame(trials), TRIAL_COLUMNS),
-        phases=keys.put_before(rows.phases, PHASE_COLUMNS, phase_columns),
-        updates=keys.put_before(rows.updates, UPDATE_COLUMNS, (*cost_columns, *limit_columns)),
-        evaluations=keys.put_before(rows.evaluations, EVALUATION_COLUMNS, cost_columns),
-        events=keys.put_before(rows.events, EVENT_COLUMNS),
-        policies=keys.put_before(rows.policies, ("state",)),
+        phases=keys.put_before(rows["phases"], PHASE_COLUMNS, phase_columns),
+        updates=keys.put_before(rows["updates"], UPDATE_COLUMNS, (*cost_columns, *limit_columns)),
+        evaluations=keys.put_before(rows["evaluations"], EVALUATION_COLUMNS, cost_columns),
+        events=keys.put_before(rows["events"], EVENT_COLUMNS),
+        policies=keys.put_before(rows["policies"], ("state",)),
         facts=tuple(facts),
         grid=grid,
         notes=tuple(dict.fromkeys((*notes, *doubles, *unknown))),

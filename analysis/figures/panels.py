@@ -172,7 +172,6 @@ def legend(
     *,
     optimum: bool,
     title: str,
-    shaded: bool = True,
 ) -> None:
     """The methods, in their order, above all panels, and the reference lines below."""
     lines = [
@@ -181,10 +180,9 @@ def legend(
     ]
     references: list[Line2D | Patch] = [
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=DASHED, label="limit $d_d$"),
+        infeasible_patch(),
         Line2D([], [], color="black", linewidth=0.8, linestyle=DASHED, label="deployment begins"),
     ]
-    if shaded:
-        references.insert(1, infeasible_patch())
     if optimum:
         references.append(Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.7, label="optimum $J^*(d_d)$"))
     figure.legend(

@@ -37,8 +37,6 @@ horizon, c_max largest cost of a step, delta, eps, gamma as in ``bounds``.
 
 from __future__ import annotations
 
-import functools
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -47,13 +45,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from recrl.analysis.data.exact_values import finite_model
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report_tables import number
 from recrl.environments.cmdp import Floats, Phase
-from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError
-from recrl.environments.registry import find_task, make_vector, task_options
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
     MEAN_WEIGHTS,
@@ -262,21 +258,8 @@ def policies_of(sweep: Sweep, trial: pd.Series, updates: pd.DataFrame, *, cost: 
 
 def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | None:
     """Horizon and largest cost of a step of a finite task; None for others."""
-    try:
-        if find_task(name).optimum is None:  # no finite task is without, and others can be slow to build
-            return None
-    except (UnknownNameError, UntrustedNameError):  # not installed here
-        return None
-    return _sizes_of(name, task_options(name, options).model_dump_json(), cost)
-
-
-@functools.lru_cache(maxsize=256)
-def _sizes_of(name: str, canonical: str, cost: int) -> TaskSizes | None:
-    environment = make_vector(name, 1, options=json.loads(canonical))
-    if not isinstance(environment, FiniteVectorEnv):
-        return None
-    model = environment.finite_cmdp()
-    return TaskSizes(model.horizon, float(model.costs[:, :, cost].max()))
+    model = finite_model(name, options)
+    return None if model is None else TaskSizes(model.horizon, float(model.costs[:, :, cost].max()))
 
 
 def _discount(sweep: Sweep, trial: pd.Series) -> float | None:

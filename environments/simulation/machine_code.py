@@ -1,9 +1,9 @@
 """Python functions compiled to machine code, for stepping MuJoCo simulations.
 
 Numba compiles them at the first import, which takes some seconds, and caches the result beside their file. If
-that folder is not writable, it uses the user's cache folder; see Numba's NUMBA_CACHE_DIR. It compiles anew
-when that file or anything that the function depends on changes: see
-``recrl.environments.simulation.code_digest``.
+that folder is not writable, it uses the user's cache folder; see Numba's NUMBA_CACHE_DIR. Numba itself
+compiles anew only when that file changes. But machine code also contains constants, record layouts and
+helpers of other files: ``salted`` makes Numba compare the digest of all of them.
 
 Floating-point operations are done as written (no ``fastmath``), so that results are equal to the last bit in
 every process and thread.
@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import hashlib
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, get_type_hints
@@ -20,11 +22,11 @@ from typing import Any, ParamSpec, TypeVar, get_type_hints
 import mujoco
 import numba
 import numpy as np
-from numba.core import types
+from numba.core import types as numba_types
 from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
-from recrl.environments.simulation.code_digest import salted
+FOLDERS = ("safety_gym", "simulation", "velocity")  # of ``recrl.environments``: who uses this module
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -42,15 +44,15 @@ def mujoco_library() -> Any:
 
 mujoco_library()
 # Pointers are addresses: 64-bit integers, which are passed in the same way.
-_ADDRESS = types.int64
-mj_step: Any = types.ExternalFunction("mj_step", types.void(_ADDRESS, _ADDRESS))
-mj_step2: Any = types.ExternalFunction("mj_step2", types.void(_ADDRESS, _ADDRESS))
-mj_forward: Any = types.ExternalFunction("mj_forward", types.void(_ADDRESS, _ADDRESS))
-mj_rnePostConstraint: Any = types.ExternalFunction(  # noqa: N816  # MuJoCo's name
-    "mj_rnePostConstraint", types.void(_ADDRESS, _ADDRESS)
+_ADDRESS = numba_types.int64
+mj_step: Any = numba_types.ExternalFunction("mj_step", numba_types.void(_ADDRESS, _ADDRESS))
+mj_step2: Any = numba_types.ExternalFunction("mj_step2", numba_types.void(_ADDRESS, _ADDRESS))
+mj_forward: Any = numba_types.ExternalFunction("mj_forward", numba_types.void(_ADDRESS, _ADDRESS))
+mj_rnePostConstraint: Any = numba_types.ExternalFunction(  # noqa: N816  # MuJoCo's name
+    "mj_rnePostConstraint", numba_types.void(_ADDRESS, _ADDRESS)
 )
-mj_getState: Any = types.ExternalFunction(  # noqa: N816  # MuJoCo's name
-    "mj_getState", types.void(_ADDRESS, _ADDRESS, _ADDRESS, types.int32)
+mj_getState: Any = numba_types.ExternalFunction(  # noqa: N816  # MuJoCo's name
+    "mj_getState", numba_types.void(_ADDRESS, _ADDRESS, _ADDRESS, numba_types.int32)
 )
 
 
@@ -66,7 +68,7 @@ def compiled_for_batch(function: Callable[[int, int, int, int], None]) -> Any:
 
     ``model`` and ``data`` are addresses, and ``argument`` is that of ``apply``.
     """
-    signature = types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
+    signature = numba_types.void(_ADDRESS, _ADDRESS, numba_types.int32, _ADDRESS)
     return kept(functools.partial(numba.cfunc, signature), function)
 
 
@@ -82,8 +84,8 @@ def compiled_for_python(function: Callable[Parameters, Result]) -> Callable[Para
     It returns a bool or None. Numba does not inspect the arguments, and other Python threads continue
     meanwhile.
     """
-    result = types.void if get_type_hints(function)["return"] is type(None) else types.boolean
-    signature = result(*(types.int64,) * function.__code__.co_argcount)
+    result = numba_types.void if get_type_hints(function)["return"] is type(None) else numba_types.boolean
+    signature = result(*(numba_types.int64,) * function.__code__.co_argcount)
     call: Callable[Parameters, Result] = kept(functools.partial(numba.cfunc, signature), function).ctypes
     return call
 
@@ -97,7 +99,7 @@ def array_at(kind: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
-        signature: Any = types.CPointer(element)  # type: ignore[no-untyped-call]
+        signature: Any = numba_types.CPointer(element)  # type: ignore[no-untyped-call]
         return signature(address), generate
 
     @numba.njit
@@ -113,3 +115,33 @@ def kept(compiler: Any, function: Any) -> Any:
         return compiler(cache=True)(salted(function))
     except RuntimeError:  # there is no writable folder
         return compiler()(function)
+
+
+def salted(function: Any) -> Any:
+    """The same function to Numba, but that machine code kept for it is found under ``source_digest`` only.
+
+    Numba compares what a function's free variables hold, so the digest becomes one that nobody reads.
+    """
+    code = function.__code__
+    found = types.FunctionType(
+        code.replace(co_freevars=(*code.co_freevars, "_salt")),
+        function.__globals__,
+        function.__name__,
+        function.__defaults__,
+        (*(function.__closure__ or ()), types.CellType(source_digest())),
+    )
+    found.__kwdefaults__, found.__qualname__ = function.__kwdefaults__, function.__qualname__
+    found.__annotations__, found.__doc__ = function.__annotations__, function.__doc__
+    return found
+
+
+@functools.cache
+def source_digest(folder: Path = Path(__file__).parents[1]) -> str:
+    """A digest of all that compiled functions are made of: the Python files of FOLDERS, MuJoCo and NumPy."""
+    digest = hashlib.sha256(f"{mujoco.__version__} {np.__version__}".encode())
+    for name in FOLDERS:
+        for path in sorted((folder / name).rglob("*.py")):
+            digest.update(
+                f"{path.relative_to(folder)} ".encode() + hashlib.sha256(path.read_bytes()).digest()
+            )
+    return digest.hexdigest()

@@ -8,11 +8,11 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NoReturn
 
 from recrl.orchestrator.cli import requests
-from recrl.orchestrator.cli.command_arguments import COMMANDS, VIDEOS
-from recrl.orchestrator.cli.shared_arguments import new_parser
+from recrl.orchestrator.cli.requests import VIDEOS, Request
 
 DESCRIPTION = """\
 Run constrained reinforcement learning under cost-limit curricula: every task x agent x method x seed of a
@@ -53,11 +53,49 @@ Exit codes:
   5    plan --check: a launch would have something to do
   130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
 
+# Each command and the function that does it, in the order of the help. The function's module is imported when
+# it is needed.
+COMMANDS: Mapping[type[Request], str] = {
+    requests.InitRequest: "init:run_init",
+    requests.ListRequest: "catalogue:run_list",
+    requests.OptionsRequest: "catalogue:run_options",
+    requests.SchemaRequest: "catalogue:run_schema",
+    requests.ValidateRequest: "plan:run_validate",
+    requests.PlanRequest: "plan:run_plan",
+    requests.LaunchRequest: "launch:run_launch",
+    requests.StatusRequest: "status:run_status",
+    requests.CheckRequest: "status:run_check",
+    requests.StopRequest: "status:run_stop",
+    requests.LogsRequest: "status:run_logs",
+    requests.EvaluateRequest: "evaluate:run_evaluate",
+    requests.FiguresRequest: "results:run_figures",
+    requests.ExportRequest: "results:run_export",
+    requests.MergeRequest: "results:run_merge",
+    requests.BoundRequest: "curricula:run_bound",
+    requests.ReplayRequest: "curricula:run_replay",
+    requests.UIRequest: "tracking:run_ui",
+    requests.SyncRequest: "tracking:run_sync",
+}
 LISTS = ("--only", "--option")  # each takes several KEY=VALUE
 PAIR = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*=.*(?<!\.yaml)(?<!\.yml)")
+LONGEST_LINE = 1000  # characters of an error
 
 
-def parse(given: Sequence[str]) -> requests.Request:
+def readable(sentence: str) -> str:
+    """What may be shown of a sentence, its lines cut where they quote something endless."""
+    from recrl.orchestrator.redaction import shown  # noqa: PLC0415  (--help is to be quick)
+
+    lines = shown(sentence).split("\n")
+    return "\n".join(line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..." for line in lines)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong with the arguments, which may hold a password, and exit."""
+        super().error(readable(message))
+
+
+def parse(given: Sequence[str]) -> Request:
     """The request that the arguments make.
 
     Raises:
@@ -65,17 +103,26 @@ def parse(given: Sequence[str]) -> requests.Request:
     """
     parsed = parser().parse_args(spread(given))
     parsed.given = tuple(given)
-    request: requests.Request = parsed.request.of(parsed)
+    request: Request = parsed.request.of(parsed)
     return request
 
 
 def parser() -> argparse.ArgumentParser:
     """Everything that can be asked."""
-    top = new_parser("recrl-sweep", DESCRIPTION, EPILOG)
+    top = _Parser(
+        prog="recrl-sweep",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     top.add_argument("--version", action="version", version=f"recrl {importlib.metadata.version('recrl')}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in COMMANDS:
-        add(commands)
+    for request in COMMANDS:
+        name, summary = request.__name__.removesuffix("Request").lower(), request.__doc__ or ""
+        short = summary[:1].lower() + summary[1:].removesuffix(".")
+        command = commands.add_parser(name, help=short, description=summary)
+        command.set_defaults(request=request)
+        request.add_to(command)
     return top
 
 

@@ -15,10 +15,10 @@ from rich.console import Console
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.plan import room, say_plan
-from recrl.orchestrator.cli.requests import LaunchRequest
+from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
 from recrl.orchestrator.cli.results import draw
 from recrl.orchestrator.cli.status import say_failures
-from recrl.orchestrator.cli.sweeps import DEFAULT_ROOT, wanted
+from recrl.orchestrator.cli.sweeps import wanted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode

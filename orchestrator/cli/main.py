@@ -8,12 +8,12 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from recrl.orchestrator.cli.arguments import parse
+from recrl.orchestrator.cli.arguments import COMMANDS, parse, readable
 from recrl.orchestrator.cli.requests import LaunchRequest, Request
-from recrl.orchestrator.cli.shared_arguments import readable
 from recrl.orchestrator.errors import (
     ClusterError,
     GridError,
@@ -23,6 +23,9 @@ from recrl.orchestrator.errors import (
     TrackingError,
 )
 from recrl.orchestrator.exit_codes import ExitCode
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 # Paths that cannot be: a file for a folder, a name that is too long, links in a circle.
 NO_PATH = (
@@ -75,8 +78,11 @@ def main(given: Sequence[str] | None = None) -> int:
 
 def _run(request: Request) -> ExitCode:
     """Do it, without code that a file names unless that is asked for."""
-    from recrl.environments.plugins import modules_in, refuse_import_paths  # noqa: PLC0415  (--help is to be quick)
-    from recrl.orchestrator.cli.commands import COMMANDS  # noqa: PLC0415
+    from recrl.environments.plugins import (  # noqa: PLC0415  (--help is to be quick)
+        load_attribute,
+        modules_in,
+        refuse_import_paths,
+    )
     from recrl.orchestrator.cli.output import TextConsole, logging_to_stderr  # noqa: PLC0415
 
     # a file or a pipe has no width that tables would have to fit in
@@ -84,7 +90,10 @@ def _run(request: Request) -> ExitCode:
     followed = modules_in(Path.cwd()) if request.follows_import_paths else refuse_import_paths()
     try:
         with logging_to_stderr(), followed:
-            return COMMANDS[type(request)](request, console)
+            run: Callable[[Request, Console], ExitCode] = load_attribute(
+                f"recrl.orchestrator.cli.{COMMANDS[type(request)]}"
+            )
+            return run(request, console)
     except SystemExit as error:
         raise RecrlError(f"something that the sweep names ended the process ({error.code})") from error
 

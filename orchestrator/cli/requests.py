@@ -1,14 +1,67 @@
-"""What each command of ``recrl-sweep`` is asked for: one frozen, typed value a command.
+"""What each command of ``recrl-sweep`` is asked for: one frozen, typed value a command, with its arguments.
 
-``arguments`` fills them in. Imports nothing but the standard library, so that ``--help`` is quick.
+A class is a command: its name is the command's, its docstring the summary, and each field an argument, with
+what ``argparse`` has to know of it. ``arguments`` makes the parser. Imports next to nothing, so that
+``--help`` is quick.
 """
+
+# ruff: noqa: RUF009  (what looks like a default is a dataclass field)
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
+
+from recrl.orchestrator.cli import argument_types as types
+
+VIDEOS = ("gif", "mp4")
+TEMPLATES = ("demo", "safety-gym", "velocity", "own-task")
+DEFAULT_ROOT = Path("runs")
+KINDS = ("tasks", "agents", "curricula", "methods")  # methods: as in a grid
+SWEEP_HELP = "a sweep's name, folder or grid file; may be left out where there is only one"
+
+# Settings that several commands have.
+_GRID: Mapping[str, Any] = {
+    "type": types.path_of,
+    "metavar": "GRID.yaml",
+    "help": "what the sweep is made of",
+}
+_TRUST: Mapping[str, Any] = {
+    "action": "store_true",
+    "help": "import and call what the file names by an import path, package.module:attribute: do so only "
+    "with files whose author you trust; launch always does",
+}
+_ONLY: Mapping[str, Any] = {
+    "action": "append",
+    "default": [],
+    "metavar": "KEY=VALUE",
+    "help": "only these trials: task, agent or method by label, or seed; several values with commas, "
+    "method=none,dynamic",
+}
+_TRACKING: Mapping[str, Any] = {
+    "metavar": "URI",
+    "help": "an MLflow server (http://host:port) or database (sqlite:///file.db); "
+    "by default one in the sweep's folder",
+}
+
+
+def by_place(**settings: Any) -> Any:
+    """A field that is given by its place; ``settings`` are those of ``add_argument``."""
+    return field(metadata={"flag": None, "settings": settings})
+
+
+def by_flag(flag: str = "", *, group: str = "", **settings: Any) -> Any:
+    """A field that is given by a flag.
+
+    Args:
+        flag: by default ``--`` and the field's name.
+        group: options of one group exclude each other.
+        settings: those of ``add_argument``.
+    """
+    return field(metadata={"flag": flag, "group": group, "settings": settings})
 
 
 @dataclass(frozen=True)
@@ -28,10 +81,28 @@ class Request:
         values = {field.name: getattr(parsed, field.name) for field in fields(cls)}
         return cls(**{key: tuple(it) if isinstance(it, list) else it for key, it in values.items()})
 
+    @classmethod
+    def add_to(cls, command: argparse.ArgumentParser) -> None:
+        """Add the arguments of all fields."""
+        groups: dict[str, Any] = {"": command}
+        for each in fields(cls):
+            settings = each.metadata.get("settings")
+            if settings is None:
+                continue
+            flag, group = each.metadata["flag"], each.metadata.get("group", "")
+            if flag is None:
+                command.add_argument(each.name, **settings)
+                continue
+            if group not in groups:
+                groups[group] = command.add_mutually_exclusive_group()
+            flag = flag or f"--{each.name.replace('_', '-')}"
+            groups[group].add_argument(flag, dest=each.name, **settings)
+
     @property
     def about(self) -> Path | str | None:
-        """The grid or the sweep, as it was typed."""
-        return None
+        """The grid, the sweep, or the file to write, as it was typed."""
+        names = (name for name in ("grid", "sweep", "to") if hasattr(self, name))
+        return getattr(self, next(names, ""), None)
 
     @property
     def follows_import_paths(self) -> bool:
@@ -41,326 +112,305 @@ class Request:
 
 @dataclass(frozen=True)
 class PlaceRequest(Request):
-    """Where sweeps are.
+    """Where sweeps are."""
 
-    Attributes:
-        root: the folder of all sweeps.
-        storage: the address of an object store, or None.
-    """
-
-    root: Path
-    storage: str | None
+    root: Path = by_flag(
+        type=types.folder, default=DEFAULT_ROOT, help="the folder of all sweeps (default: runs)"
+    )
+    storage: str | None = by_flag(
+        metavar="URI",
+        help="keep the sweep in an object store (s3://bucket/folder, gs://, abfs://...) that all nodes "
+        "reach; its folder under --root is then a mirror, and remembers the address",
+    )
 
 
 @dataclass(frozen=True)
 class GridRequest(PlaceRequest):
-    """A grid, and which of its trials.
+    """A grid, and which of its trials."""
 
-    Attributes:
-        grid: its file.
-        only: the trials to work on, each ``KEY=VALUE``.
-        retry_failed: whether to try failed trials again.
-        rerun_damaged: whether to run damaged trials again that were complete or failed.
-        rerun_changed: whether to run trials again that ran other code than is installed now.
-        max_concurrent: trials at once, at most.
-        address: of an existing Ray cluster.
-    """
-
-    grid: Path
-    only: tuple[str, ...]
-    retry_failed: bool
-    rerun_damaged: bool
-    rerun_changed: bool
-    max_concurrent: int | None
-    address: str | None
-
-    @property
-    def about(self) -> Path:
-        """The grid file."""
-        return self.grid
+    grid: Path = by_place(**_GRID)
+    only: tuple[str, ...] = by_flag(**_ONLY)
+    retry_failed: bool = by_flag(
+        action="store_true", help="try failed trials again, from their last checkpoint"
+    )
+    rerun_damaged: bool = by_flag(
+        action="store_true",
+        help="run damaged trials again that were complete or had failed; others are by themselves",
+    )
+    rerun_changed: bool = by_flag(
+        action="store_true",
+        help="run trials again that ran other code than is installed now; what they left is kept aside",
+    )
+    max_concurrent: int | None = by_flag(
+        type=types.at_least_one,
+        metavar="N",
+        help="trials at once, at most; by default as many as fit (or as the grid says)",
+    )
+    address: str | None = by_flag()
 
 
 @dataclass(frozen=True)
 class LaunchRequest(GridRequest):
-    """``launch``.
-
-    Attributes:
-        tracking_uri: of MLflow; None for a database in the sweep's folder.
-        executor: ``ray`` or ``inline``.
-        ship_package: whether to send recrl itself to the cluster.
-        mlflow: whether MLflow is told.
-        figures: whether to draw figures at the end.
-    """
+    """Run what is not complete, draw the figures, print the results."""
 
     trusted: ClassVar[bool] = True
-    tracking_uri: str | None
-    executor: str
-    ship_package: bool
-    mlflow: bool
-    figures: bool
+    address: str | None = by_flag(
+        metavar="HOST:PORT",
+        help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
+        "is started here",
+    )
+    tracking_uri: str | None = by_flag(**_TRACKING)
+    executor: str = by_flag(
+        choices=("ray", "inline"),
+        default="ray",
+        help="ray: side by side on all cores or a cluster (default); inline: one after the other in this "
+        "process, for debuggers",
+    )
+    ship_package: bool = by_flag(
+        action="store_true",
+        help="with --address: send recrl itself, without its dependencies, to the cluster's nodes",
+    )
+    mlflow: bool = by_flag(
+        "--no-mlflow", action="store_false", help="send nothing to MLflow; 'sync' can do it later"
+    )
+    figures: bool = by_flag("--no-figures", action="store_false", help="draw no figures at the end")
 
 
 @dataclass(frozen=True)
 class PlanRequest(GridRequest):
-    """``plan``.
+    """Say what a launch would do, and about how long it takes."""
 
-    Attributes:
-        trust: whether to follow import paths.
-        check: whether to end with 5 if there is something to do.
-        cores: to estimate for.
-        measure: whether to run a second of each cell to learn its speed.
-    """
-
-    trust: bool
-    check: bool
-    cores: int | None
-    measure: bool
+    address: str | None = by_flag(
+        group="room",
+        metavar="HOST:PORT",
+        help="estimate for this Ray cluster, which is asked; by default for this machine",
+    )
+    cores: int | None = by_flag(
+        group="room", type=types.at_least_one, metavar="N", help="estimate for so many cores"
+    )
+    check: bool = by_flag(action="store_true", help="end with 5 if a launch would have something to do")
+    measure: bool = by_flag(
+        action="store_true",
+        help="run about a second of each task and agent that has not run yet, to estimate the time",
+    )
+    trust: bool = by_flag(**_TRUST)
 
 
 @dataclass(frozen=True)
 class ValidateRequest(Request):
-    """``validate``.
+    """Check a grid file; all mistakes at once, with their lines."""
 
-    Attributes:
-        grid: the file.
-        trust: whether to follow import paths.
-    """
-
-    grid: Path
-    trust: bool
-
-    @property
-    def about(self) -> Path:
-        """The grid file."""
-        return self.grid
+    grid: Path = by_place(**_GRID)
+    trust: bool = by_flag(**_TRUST)
 
 
 @dataclass(frozen=True)
 class SweepRequest(PlaceRequest):
-    """A sweep.
+    """A sweep."""
 
-    Attributes:
-        sweep: its name, folder or grid file; None for the only one there.
-    """
-
-    sweep: str | None
-
-    @property
-    def about(self) -> str | None:
-        """The sweep as it was typed."""
-        return self.sweep
+    sweep: str | None = by_place(nargs="?", metavar="SWEEP", help=SWEEP_HELP)
 
 
 @dataclass(frozen=True)
 class StatusRequest(SweepRequest):
-    """``status``.
+    """Say how far a sweep is, from its files alone."""
 
-    Attributes:
-        brief: whether to leave out the table of trials.
-    """
-
-    brief: bool
+    brief: bool = by_flag(action="store_true", help="one line, without the table of trials")
 
 
 class CheckRequest(SweepRequest):
-    """``check``."""
+    """Check every file of a sweep against the length and digest that were committed."""
 
 
 class StopRequest(SweepRequest):
-    """``stop``."""
+    """Ask the launch that runs a sweep to save its trials and end, and wait."""
 
 
 @dataclass(frozen=True)
 class LogsRequest(SweepRequest):
-    """``logs``.
+    """Print a trial's log."""
 
-    Attributes:
-        trial: words of its id, title or folder.
-        follow: whether to wait for more.
-        folder: whether to print the trial's folder instead.
-    """
-
-    trial: tuple[str, ...]
-    follow: bool
-    folder: bool
+    trial: tuple[str, ...] = by_place(
+        nargs="*",
+        metavar="TRIAL",
+        help="the beginning of its id, title or folder, as status shows them; default: the one that runs",
+    )
+    follow: bool = by_flag(
+        action="store_true",
+        help="wait until the trial starts, and for more lines as long as it runs",
+    )
+    folder: bool = by_flag(action="store_true", help="print the trial's folder instead")
 
 
 @dataclass(frozen=True)
 class EvaluateRequest(SweepRequest):
-    """``evaluate``.
+    """Evaluate the policies of trials without learning; film them on demand."""
 
-    Attributes:
-        trial: words of the beginning of the trials' ids, titles or folders.
-        only: the trials, each ``KEY=VALUE``.
-        trust: whether to follow import paths.
-        episodes: of each policy; None for as many as the trial itself evaluates.
-        seed: of the episodes; None for the trial's own.
-        policy: ``stochastic``, ``deterministic`` or ``both``.
-        video: ``gif``, ``mp4`` or None.
-        tracking_uri: of MLflow.
-    """
-
-    trial: tuple[str, ...]
-    only: tuple[str, ...]
-    trust: bool
-    episodes: int | None
-    seed: int | None
-    policy: str
-    video: str | None
-    tracking_uri: str | None
+    trial: tuple[str, ...] = by_place(
+        nargs="*",
+        metavar="TRIAL",
+        help="the beginning of its id, title or folder, or of several; by default all that have a checkpoint",
+    )
+    only: tuple[str, ...] = by_flag(**_ONLY)
+    trust: bool = by_flag(**_TRUST)
+    episodes: int | None = by_flag(
+        type=types.at_least_one,
+        metavar="N",
+        help="of each policy; by default as many as the trial itself evaluates at its end",
+    )
+    seed: int | None = by_flag(
+        type=types.at_least_zero,
+        metavar="S",
+        help="of the episodes; by default that of the trial's own evaluation, which then comes out again",
+    )
+    policy: str = by_flag(
+        choices=("stochastic", "deterministic", "both"),
+        default="both",
+        help="act as in training, by the most likely action, or one after the other (default)",
+    )
+    video: str | None = by_flag(
+        choices=VIDEOS,
+        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; MLflow gets it",
+    )
+    tracking_uri: str | None = by_flag(**_TRACKING)
 
 
 @dataclass(frozen=True)
 class SourceRequest(SweepRequest):
-    """A sweep in its folder, in an exported file, or in MLflow.
+    """A sweep in its folder, in an exported file, or in MLflow."""
 
-    Attributes:
-        tracking_uri: read MLflow alone.
-    """
-
-    tracking_uri: str | None
+    sweep: str | None = by_place(
+        nargs="?", metavar="SWEEP", help=f"{SWEEP_HELP}; or a file that export wrote (.zip)"
+    )
+    tracking_uri: str | None = by_flag(
+        metavar="URI",
+        help="read MLflow alone, no files: a server (http://host:port) or database (sqlite:///file.db)",
+    )
 
 
 @dataclass(frozen=True)
 class FiguresRequest(SourceRequest):
-    """``figures``.
+    """Draw the figures, tables and report of what is there so far."""
 
-    Attributes:
-        trust: whether to follow import paths.
-        to: the folder to draw into; None for the sweep's own.
-        band: ``mean`` or ``iqm``.
-        sketch: whether to draw only what is quick.
-    """
-
-    trust: bool
-    to: Path | None
-    band: str
-    sketch: bool
+    trust: bool = by_flag(**_TRUST)
+    to: Path | None = by_flag(
+        type=types.folder, metavar="FOLDER", help="where to; by default the sweep's figures folder"
+    )
+    band: str = by_flag(
+        choices=("mean", "iqm"),
+        default="mean",
+        help="of learning curves: mean and standard error (default), or interquartile mean and 95%% "
+        "bootstrap band",
+    )
+    sketch: bool = by_flag(
+        action="store_true",
+        help="only learning curves, limits and tables, no PDF: quick, as launch does while it runs",
+    )
 
 
 @dataclass(frozen=True)
 class ExportRequest(SourceRequest):
-    """``export``.
+    """Write one small file that figures and tables can be drawn from."""
 
-    Attributes:
-        to: the file to write; None for the sweep's name in this folder.
-    """
-
-    to: Path | None
+    to: Path | None = by_flag(
+        type=types.zip_file, metavar="FILE.zip", help="by default the sweep's name, in this folder"
+    )
 
 
 @dataclass(frozen=True)
 class MergeRequest(Request):
-    """``merge``.
+    """Join files that export wrote, of a sweep that ran in several places."""
 
-    Attributes:
-        parts: the files to join.
-        to: the file to write.
-    """
-
-    parts: tuple[Path, ...]
-    to: Path
-
-    @property
-    def about(self) -> Path:
-        """The file to write."""
-        return self.to
+    parts: tuple[Path, ...] = by_place(
+        type=types.path_of,
+        nargs="+",
+        metavar="FILE.zip",
+        help="the first gives the name; of a trial that several have, the one that got furthest is taken",
+    )
+    to: Path = by_flag(type=types.zip_file, metavar="FILE.zip", required=True, help="what to write")
 
 
 @dataclass(frozen=True)
 class BoundRequest(SourceRequest):
-    """``bound``.
+    """Compare the cost of training with its bounds; find the largest training limit for a budget."""
 
-    Attributes:
-        trust: whether to follow import paths.
-        budget: cost above the deployment limit that may be spent in training; None for no answer.
-        cost: which of the costs, from 1.
-    """
-
-    trust: bool
-    budget: float | None
-    cost: int
+    trust: bool = by_flag(**_TRUST)
+    budget: float | None = by_flag(
+        type=types.cost,
+        metavar="COST",
+        help="cost above the deployment limit that all training episodes may have together: find the largest "
+        "training limit d_t",
+    )
+    cost: int = by_flag(
+        type=types.at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
+    )
 
 
 @dataclass(frozen=True)
 class ReplayRequest(SweepRequest):
-    """``replay``.
+    """The limits that another curriculum would have set on recorded episodes."""
 
-    Attributes:
-        trust: whether to follow import paths.
-        teacher: a method of the sweep, or any teacher by its name.
-        option: its options, each ``KEY=VALUE``.
-        only: the trials, each ``KEY=VALUE``.
-    """
-
-    trust: bool
-    teacher: str
-    option: tuple[str, ...]
-    only: tuple[str, ...]
+    trust: bool = by_flag(**_TRUST)
+    teacher: str = by_flag(
+        required=True, metavar="NAME", help="a method of the sweep, or any curriculum by its name"
+    )
+    option: tuple[str, ...] = by_flag(
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="its options where they differ from the sweep's, window=8",
+    )
+    only: tuple[str, ...] = by_flag(**_ONLY)
 
 
 @dataclass(frozen=True)
 class UIRequest(SweepRequest):
-    """``ui``.
+    """Open MLflow's pages about a sweep, on this machine only."""
 
-    Attributes:
-        tracking_uri: of MLflow.
-        port: of 127.0.0.1.
-    """
-
-    tracking_uri: str | None
-    port: int
+    tracking_uri: str | None = by_flag(**_TRACKING)
+    port: int = by_flag(type=types.port, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)")
 
 
 @dataclass(frozen=True)
 class SyncRequest(SweepRequest):
-    """``sync``.
+    """Bring MLflow up to the files, for example after it was unreachable."""
 
-    Attributes:
-        tracking_uri: of MLflow.
-        rebuild: whether to send everything again.
-    """
-
-    tracking_uri: str | None
-    rebuild: bool
+    tracking_uri: str | None = by_flag(**_TRACKING)
+    rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
 
 
 @dataclass(frozen=True)
 class InitRequest(Request):
-    """``init``.
+    """Write a grid file with comments to start from."""
 
-    Attributes:
-        template: which grid to write.
-        file: where to; None for the template's name.
-    """
-
-    template: str
-    file: Path | None
+    file: Path | None = by_place(
+        nargs="?",
+        type=types.path_of,
+        metavar="FILE",
+        help="default: the template's name; never overwritten",
+    )
+    template: str = by_flag(
+        choices=TEMPLATES,
+        default=TEMPLATES[0],
+        help="demo: RiverGrid in a few minutes (default); safety-gym and velocity: MuJoCo tasks; "
+        "own-task: an environment of your own, with a small Python file that holds one",
+    )
 
 
 @dataclass(frozen=True)
 class ListRequest(Request):
-    """``list``.
+    """List the tasks, agents or curricula."""
 
-    Attributes:
-        kind: ``tasks``, ``agents`` or ``curricula``.
-    """
-
-    kind: str
+    kind: str = by_place(choices=KINDS, help="what to list")
 
 
 @dataclass(frozen=True)
 class OptionsRequest(Request):
-    """``options``.
+    """List the options of a task, an agent or a curriculum."""
 
-    Attributes:
-        name: of a task, an agent or a curriculum.
-        trust: whether to follow import paths.
-    """
-
-    name: str
-    trust: bool
+    name: str = by_place(metavar="NAME", help="as 'list' shows it, or package.module:attribute")
+    trust: bool = by_flag(**_TRUST)
 
 
 class SchemaRequest(Request):
-    """``schema``."""
+    """Print a JSON schema of grid files, for editors."""

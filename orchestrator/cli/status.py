@@ -56,10 +56,9 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
     """Check every file of a sweep against what was committed; print a line for each that is wrong."""
     store = open_store(request)
     problems = [f"{store.name}: {problem}" for problem in store.damages()]
-    with contextlib.suppress(StorageError):  # said above
-        for spec in store.specs():
-            problems += [f"{spec.title}: {problem}" for problem in store.trial(spec).damages()]
-    listed = {spec.folder_name for spec in _listed(store)}
+    specs = _listed(store)
+    problems += [f"{spec.title}: {it}" for spec in specs for it in store.trial(spec).damages()]
+    listed = {spec.folder_name for spec in specs}
     orphans = [trial for trial in store.trials() if trial.folder.name not in listed]
     problems += [f"{trial.title}: {problem}" for trial in orphans for problem in trial.damages()]
     for problem in problems:
@@ -76,7 +75,7 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
 
 
 def _listed(store: SweepStore) -> list[TrialSpec]:
-    """The trials of the last launch, none where the file that lists them is damaged."""
+    """The trials of the last launch, none where the file that lists them is damaged: that is said already."""
     try:
         return store.specs()
     except StorageError:

@@ -12,8 +12,6 @@ from recrl.orchestrator.grid.grid import read_name
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.validation import nearest
 
-DEFAULT_ROOT = Path("runs")
-
 
 def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
     """The sweep that a person means.

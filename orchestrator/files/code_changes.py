@@ -8,7 +8,6 @@ files of its top-level package are in it, or its one module. Nothing is imported
 from __future__ import annotations
 
 import functools
-import hashlib
 import importlib.machinery
 import importlib.util
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +18,7 @@ from typing import Any
 from recrl.agents.registry import AGENTS
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import StorageError
-from recrl.orchestrator.files.own_package import folder_of
+from recrl.orchestrator.files.own_package import digest_of_files, folder_of
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
@@ -133,7 +132,7 @@ def _own_digest() -> str:
     trial = {f"orchestrator/{module}": folder_of("orchestrator") / module for module in MODULES}
     if missing := [str(path) for path in trial.values() if not path.is_file()]:
         raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is not there")
-    return _digest({**files, **trial})
+    return digest_of_files({**files, **trial})[:16]
 
 
 def _package_digest(package: str) -> str:
@@ -148,16 +147,4 @@ def _package_digest(package: str) -> str:
     files = {str(path.relative_to(folder)): path for folder in folders for path in folder.rglob("*.py")}
     if not folders and spec.origin and spec.origin.endswith(tuple(importlib.machinery.SOURCE_SUFFIXES)):
         files = {Path(spec.origin).name: Path(spec.origin)}
-    return _digest(files) if files else ""
-
-
-def _digest(files: Mapping[str, Path]) -> str:
-    digest = hashlib.sha256()
-    for name, path in sorted(files.items()):
-        try:
-            data = path.read_bytes()
-        except OSError:  # an editor's file that came and went
-            continue
-        digest.update(f"{name}\n".encode())
-        digest.update(hashlib.sha256(data).digest())
-    return digest.hexdigest()[:16]
+    return digest_of_files(files)[:16] if files else ""

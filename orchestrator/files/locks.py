@@ -7,8 +7,11 @@ would empty the file that it points to.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -24,6 +27,18 @@ def open_lock(path: Path) -> IO[str]:
         StorageError: it is a link, a folder or no file at all.
     """
     return os.fdopen(_opened(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "a+")
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock alone; waits for it.
+
+    Raises:
+        StorageError: it is a link, a folder or no file at all.
+    """
+    with open_lock(path) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def look_at_lock(path: Path) -> IO[str]:

@@ -6,6 +6,8 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import shutil
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 DISTRIBUTION = "recrl"
@@ -15,15 +17,20 @@ METADATA = ("METADATA", "PKG-INFO", "entry_points.txt")  # an editable install h
 
 def source_digest() -> str:
     """Ten hex digits that differ whenever a Python file of recrl does: a version alone does not say it."""
-    digest = hashlib.sha256()
-    for path in _own_files():
-        digest.update(f"{path.name}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+    files = {path.name: path for path in _own_files()}
     for name in FOLDERS:  # links in a source checkout: a walk from the parent would not enter them
         folder = folder_of(name)
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode())
-            digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()[:10]
+        files |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in folder.rglob("*.py")}
+    return digest_of_files(files)[:10]
+
+
+def digest_of_files(files: Mapping[str, Path]) -> str:
+    """64 hex digits that differ whenever a name or what is in a file does."""
+    digest = hashlib.sha256()
+    for name, path in sorted(files.items()):
+        with suppress(OSError):  # an editor's file that came and went
+            digest.update(hashlib.sha256(path.read_bytes()).digest() + f"{name}\n".encode())
+    return digest.hexdigest()
 
 
 def copy_package(parent: Path) -> list[Path]:

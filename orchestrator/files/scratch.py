@@ -42,18 +42,25 @@ def scratch_folder(parent: str) -> Iterator[Path]:
 
 def remove_dead(parent: str) -> None:
     """Remove this user's scratch folders that no process holds any more."""
-    for lock_path in Path(parent).glob(f"{PREFIX}*/{LOCK}"):
-        with suppress(OSError), lock_path.open("r+") as lock:
-            if os.fstat(lock.fileno()).st_uid == os.getuid():
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails where its process lives
-                if os.fstat(lock.fileno()).st_nlink:  # nobody else was quicker
-                    _remove(lock_path.parent)
+    for folder in dead_folders(parent):
+        with suppress(OSError):
+            _remove(folder)
     for folder in Path(parent).glob(f"{PREFIX}*"):  # its process died before its lock was there, or after
         with suppress(OSError):
             status = folder.stat()
             is_old = time.time() - status.st_mtime > EMPTY_SECONDS
             if _MADE_HERE.fullmatch(folder.name) and status.st_uid == os.getuid() and is_old:
                 folder.rmdir()  # fails unless it is empty
+
+
+def dead_folders(parent: str) -> Iterator[Path]:
+    """This user's scratch folders that no process holds any more, each locked until the next is asked for."""
+    for lock_path in Path(parent).glob(f"{PREFIX}*/{LOCK}"):
+        with suppress(OSError), lock_path.open("r+") as lock:
+            if os.fstat(lock.fileno()).st_uid == os.getuid():
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails where its process lives
+                if os.fstat(lock.fileno()).st_nlink:  # nobody else was quicker
+                    yield lock_path.parent
 
 
 def _remove(folder: Path) -> None:

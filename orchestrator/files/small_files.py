@@ -63,15 +63,24 @@ def read_sealed(path: Path, *, version: int) -> dict[str, Any]:
         DamagedError: it is not what was written.
         StorageError: the disk does not give it.
     """
-    value = parsed_object(read_whole(path), path.name)
+    return unsealed(read_whole(path), path.name, version=version)
+
+
+def unsealed(data: bytes, name: str, *, version: int) -> dict[str, Any]:
+    """Return the value in some bytes that ``sealed`` was given.
+
+    Raises:
+        OtherFormatError: they have another format; the sentence begins with ``name``.
+        DamagedError: they are not what was written; likewise.
+    """
+    value = parsed_object(data, name)
     found, seal = value.pop(FORMAT_KEY, None), value.pop(SEAL_KEY, None)
     if found != version and (seal is None or seal == _seal(value, found)):
         raise OtherFormatError(
-            f"{path.name} has format {found!r}, of another version of recrl, and this one reads format "
-            f"{version}"
+            f"{name} has format {found!r}, of another version of recrl, and this one reads format {version}"
         )
     if seal != _seal(value, version):
-        raise DamagedError(f"{path.name} is not what was written: its checksum differs")
+        raise DamagedError(f"{name} is not what was written: its checksum differs")
     return value
 
 

@@ -1,38 +1,62 @@
-"""A file by which one run of a sweep tells its workers to save and stop."""
+"""How one run of a sweep tells its workers to save and stop: by a file, or by what stands for one."""
 
 from __future__ import annotations
 
 import secrets
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-STOP_QUESTION_SECONDS = 0.5
+
+class StopSign(ABC):
+    """How one run of a sweep tells its workers, on any node, to save and stop.
+
+    Attributes:
+        place: by which workers find it: see ``SweepPlace.stop_sign_at``.
+        uri: the address of the sweep in an object store, or empty.
+        question_seconds: between two looks of a worker, at least.
+    """
+
+    uri = ""
+    question_seconds = 0.5
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+        self._answer = False
+        self._asked_at = float("-inf")
+
+    @abstractmethod
+    def set(self) -> None:
+        """Tell the workers to stop."""
+
+    def is_set(self) -> bool:
+        """Return whether to stop; may be asked often."""
+        if not self._answer and time.monotonic() >= self._asked_at + self.question_seconds:
+            self._asked_at = time.monotonic()
+            self._answer = self._says_stop()
+        return self._answer
+
+    @abstractmethod
+    def _says_stop(self) -> bool:
+        """Look at the sign."""
 
 
-class StopFile:
-    """How one run of a sweep tells its workers, on any node, to checkpoint and stop.
+class StopFile(StopSign):
+    """A stop sign in the sweep's folder.
 
     The file is empty as long as they are to go on; they stop when it says anything, or is gone. It is there
     from the beginning because a network file system may remember for a minute that a file is absent,
     whereas opening one asks the server.
 
     Attributes:
-        path: the file, in the sweep's folder.
+        path: the file.
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__(str(path))
         self.path = path
-        self._answer = False
-        self._asked_at = float("-inf")
-
-    uri = ""  # it is in no object store
-
-    @property
-    def place(self) -> str:
-        """By which workers find it."""
-        return str(self.path)
 
     @classmethod
     @contextmanager
@@ -52,12 +76,8 @@ class StopFile:
         """Tell the workers to stop."""
         self.path.write_text("stop\n")
 
-    def is_set(self) -> bool:
-        """Whether to stop; looks at the file every ``STOP_QUESTION_SECONDS`` at most."""
-        if not self._answer and time.monotonic() >= self._asked_at + STOP_QUESTION_SECONDS:
-            self._asked_at = time.monotonic()
-            try:
-                self._answer = bool(self.path.read_bytes())
-            except FileNotFoundError:
-                self._answer = True
-        return self._answer
+    def _says_stop(self) -> bool:
+        try:
+            return bool(self.path.read_bytes())
+        except FileNotFoundError:
+            return True

@@ -50,18 +50,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from recrl.orchestrator.errors import DamagedError, OtherFormatError, StorageError, SweepBusyError
+from recrl.orchestrator.errors import DamagedError, StorageError, SweepBusyError
 from recrl.orchestrator.files.aside import move_aside
 from recrl.orchestrator.files.locks import look_at_lock, open_lock
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.small_files import (
-    parsed_object,
     read_sealed,
     read_whole,
     sealed,
+    unsealed,
     write_atomically,
     write_sealed,
 )
+from recrl.orchestrator.files.trial_paths import Below
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 
@@ -73,65 +74,26 @@ _TRIAL = re.compile(r"__[0-9a-f]{10}$")
 
 
 class SweepStore:
-    """The folder of one sweep; every path in it is a property here.
+    """The folder of one sweep; every path in it is an attribute here, and the module says what it holds.
 
     Attributes:
         folder: ``<root>/<sweep>``.
     """
 
+    grid_path = Below("grid.yaml")
+    specs_path = Below("trials.jsonl")
+    info_path = Below("sweep.json")
+    trials_folder = Below("trials")
+    figures_folder = Below("figures")
+    mlflow_database = Below("mlflow.db")
+    mlflow_artifacts = Below("mlartifacts")
+    sync_folder = Below("mirror")
+    stop_request_path = Below("stop.request")
+    storage_path = Below("storage.json")
+
     def __init__(self, root: Path, name: str) -> None:
         self.folder = root.absolute() / name
         self.name = name
-
-    @property
-    def grid_path(self) -> Path:
-        """The grid file as given to the last launch."""
-        return self.folder / "grid.yaml"
-
-    @property
-    def specs_path(self) -> Path:
-        """The trials of the last launch's grid, a TrialSpec a line."""
-        return self.folder / "trials.jsonl"
-
-    @property
-    def info_path(self) -> Path:
-        """Name, creation time and version."""
-        return self.folder / "sweep.json"
-
-    @property
-    def trials_folder(self) -> Path:
-        """One folder a trial."""
-        return self.folder / "trials"
-
-    @property
-    def figures_folder(self) -> Path:
-        """What ``recrl-sweep figures`` draws."""
-        return self.folder / "figures"
-
-    @property
-    def mlflow_database(self) -> Path:
-        """The default MLflow store (sqlite)."""
-        return self.folder / "mlflow.db"
-
-    @property
-    def mlflow_artifacts(self) -> Path:
-        """The default place of MLflow's artifacts."""
-        return self.folder / "mlartifacts"
-
-    @property
-    def sync_folder(self) -> Path:
-        """How far MLflow has been told; may be deleted at any time."""
-        return self.folder / "mirror"
-
-    @property
-    def stop_request_path(self) -> Path:
-        """Whether the process that runs the sweep is asked to stop."""
-        return self.folder / "stop.request"
-
-    @property
-    def storage_path(self) -> Path:
-        """Where the sweep is kept, if this folder only mirrors it."""
-        return self.folder / "storage.json"
 
     def trial(self, spec: TrialSpec) -> TrialStore:
         """The trial's folder; it need not exist yet."""
@@ -187,14 +149,8 @@ class SweepStore:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs).encode()
-        of_lines, of_grid = Extent.of(lines).sha256, Extent.of(grid_text).sha256
-        told = {
-            "name": self.name,
-            "created": self._created(),
-            "trials": len(specs),
-            "lines": of_lines,
-            "grid": of_grid,
-        }
+        told = {"name": self.name, "created": self._created(), "trials": len(specs)}
+        told |= {"lines": Extent.of(lines).sha256, "grid": Extent.of(grid_text).sha256}
         header = sealed(told, version=SPECS_FORMAT)
         if grid_text:
             write_atomically(self.grid_path, grid_text)
@@ -226,15 +182,8 @@ class SweepStore:
         """
         name = self.specs_path.name
         first, _, lines = read_whole(self.specs_path).partition(b"\n")
-        header = parsed_object(first, name)
-        found = header.get("format")
-        if found != SPECS_FORMAT:
-            raise OtherFormatError(
-                f"{name} has format {found!r}, of another version of recrl, and this one reads format "
-                f"{SPECS_FORMAT}"
-            )
-        told = {key: value for key, value in header.items() if key not in ("format", "sha256")}
-        if header != sealed(told, version=SPECS_FORMAT) or Extent.of(lines).sha256 != told["lines"]:
+        told = unsealed(first, name, version=SPECS_FORMAT)
+        if Extent.of(lines).sha256 != told["lines"]:
             raise DamagedError(f"{name} is not what was written: its checksum differs")
         created = self._created()
         if told["name"] != self.name or (created and told["created"] not in (None, created)):

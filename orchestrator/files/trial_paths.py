@@ -1,96 +1,49 @@
-"""The paths in a trial's folder; ``sweep_store`` says what each file holds."""
+"""The paths in a trial's folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 PROVENANCE = "provenance.json"
 
 
+class Below:
+    """The path of a file or folder, an attribute of what has a ``folder``."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, owner: Any, kind: type[Any]) -> Path:
+        folder: Path = owner.folder
+        return folder / self._name
+
+
 class TrialPaths:
-    """The paths in the folder of one trial.
+    """The paths in the folder of one trial; ``sweep_store`` says what each holds.
 
     Attributes:
         folder: the trial's folder; its name is ``TrialSpec.folder_name``.
     """
 
+    spec_path = Below("spec.json")
+    state_path = Below("state.json")
+    episodes_path = Below("episodes.csv")
+    updates_path = Below("updates.csv")
+    events_path = Below("events.jsonl")
+    evaluation_path = Below("evaluation.csv")
+    policy_path = Below("policy.csv")
+    evaluations_folder = Below("evaluations")
+    videos_folder = Below("videos")
+    checkpoints_folder = Below("checkpoints")
+    provenance_path = Below(PROVENANCE)
+    log_path = Below("log.txt")
+    error_path = Below("error.txt")
+    reserve_path = Below(".reserve")
+    aside_folder = Below("aside")
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-
-    @property
-    def spec_path(self) -> Path:
-        """The TrialSpec as JSON."""
-        return self.folder / "spec.json"
-
-    @property
-    def state_path(self) -> Path:
-        """The TrialRecord as JSON."""
-        return self.folder / "state.json"
-
-    @property
-    def episodes_path(self) -> Path:
-        """A row an episode."""
-        return self.folder / "episodes.csv"
-
-    @property
-    def updates_path(self) -> Path:
-        """A row a policy update."""
-        return self.folder / "updates.csv"
-
-    @property
-    def events_path(self) -> Path:
-        """A line an event."""
-        return self.folder / "events.jsonl"
-
-    @property
-    def evaluation_path(self) -> Path:
-        """A row an episode of the frozen-policy evaluations."""
-        return self.folder / "evaluation.csv"
-
-    @property
-    def policy_path(self) -> Path:
-        """The final policy's table, where the task is finite."""
-        return self.folder / "policy.csv"
-
-    @property
-    def evaluations_folder(self) -> Path:
-        """What ``recrl-sweep evaluate`` measured afterwards."""
-        return self.folder / "evaluations"
-
-    @property
-    def videos_folder(self) -> Path:
-        """Filmed episodes."""
-        return self.folder / "videos"
-
-    @property
-    def checkpoints_folder(self) -> Path:
-        """The newest checkpoints."""
-        return self.folder / "checkpoints"
-
-    @property
-    def provenance_path(self) -> Path:
-        """Versions, commit and machine."""
-        return self.folder / PROVENANCE
-
-    @property
-    def log_path(self) -> Path:
-        """The trial's log."""
-        return self.folder / "log.txt"
-
-    @property
-    def error_path(self) -> Path:
-        """The traceback of a failed trial."""
-        return self.folder / "error.txt"
-
-    @property
-    def reserve_path(self) -> Path:
-        """Room that is given up to say, on a full disk, how a trial ended."""
-        return self.folder / ".reserve"
-
-    @property
-    def aside_folder(self) -> Path:
-        """What was damaged or replaced, as it was when an attempt began."""
-        return self.folder / "aside"
 
     @property
     def trial_id(self) -> str:

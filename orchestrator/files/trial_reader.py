@@ -6,11 +6,11 @@ trial's status is then DAMAGED, and nothing is made of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from recrl.orchestrator.errors import CheckpointError, DamagedError, OtherFormatError, StorageError
 from recrl.orchestrator.files import checkpoint_format
@@ -23,6 +23,8 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 RECORD_FORMAT = 2
 SPEC_FORMAT = 2
 LOOKS = 3  # at files that an attempt may be changing, before they are called damaged
+
+Found = TypeVar("Found")
 
 
 class TrialReader(TrialPaths):
@@ -68,16 +70,22 @@ class TrialReader(TrialPaths):
         damaged, or a committed file is shorter than it was. Digests are compared where rows are read, and by
         ``damages``.
         """
-        stated = TrialRecord()
-        for _ in range(LOOKS):
-            try:
-                stated, before = self._stated(), stated
-            except StorageError as error:
-                return self._damaged(TrialRecord(), error)
-            wrong = self._short(stated)
-            if wrong is None or stated == before:
-                break
+        try:
+            stated, wrong = self._looked_at(self._short)
+        except StorageError as error:
+            return self._damaged(TrialRecord(), error)
         return self._damaged(stated, wrong) if wrong else stated
+
+    def _looked_at(self, look: Callable[[TrialRecord], Found]) -> tuple[TrialRecord, Found]:
+        """The record, and what is wrong with the files by it; looked at again where the record changes."""
+        stated = None
+        for _ in range(LOOKS):
+            stated, before = self._stated(), stated
+            found = look(stated)
+            if not found or stated == before:
+                break
+        assert stated is not None
+        return stated, found
 
     def stated(self) -> TrialRecord:
         """What ``state.json`` says, whatever the other files are; a blank record if there is none.
@@ -140,17 +148,10 @@ class TrialReader(TrialPaths):
 
         Empty for a whole trial, and for one that was never started.
         """
-        found: list[str] = []
-        stated = TrialRecord()
-        for _ in range(LOOKS):
-            try:
-                stated, before = self._stated(), stated
-            except StorageError as error:
-                return [str(error)]
-            found = list(self._wrong_files(stated))
-            if not found or stated == before:
-                break
-        return found
+        try:
+            return self._looked_at(lambda stated: list(self._wrong_files(stated)))[1]
+        except StorageError as error:
+            return [str(error)]
 
     def _wrong_files(self, record: TrialRecord) -> Iterator[str]:
         for name, extent in record.extents.items():

@@ -6,25 +6,20 @@ raise StorageError, and the last commit stands.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import secrets
 import socket
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.files.aside import move_aside
-from recrl.orchestrator.files.locks import open_lock
 from recrl.orchestrator.files.row_files import Extent, digest_of
 from recrl.orchestrator.files.small_files import parsed_object, read_whole, write_sealed
-from recrl.orchestrator.files.trial_reader import RECORD_FORMAT, SPEC_FORMAT
+from recrl.orchestrator.files.trial_folder import TrialFolder
+from recrl.orchestrator.files.trial_reader import SPEC_FORMAT
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
-from recrl.orchestrator.files.trial_tables import TrialTables
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
@@ -33,13 +28,8 @@ RESERVE_BYTES = 16 * 1024  # a record and a traceback
 logger = logging.getLogger("recrl.trial")
 
 
-class TrialStore(TrialTables):
+class TrialStore(TrialFolder):
     """The folder of one trial: readers' methods, and those of whoever takes the trial over."""
-
-    def write_record(self, record: TrialRecord) -> None:
-        """Write ``state.json``; whoever does it holds ``locked``."""
-        value = {"trial_id": self.trial_id, **record.to_json()}
-        write_sealed(self.state_path, value, version=RECORD_FORMAT)
 
     def begin(self, spec: TrialSpec) -> TrialWriter:
         """Take the trial over: from now on only the returned writer may write.
@@ -130,10 +120,6 @@ class TrialStore(TrialTables):
             if path.is_dir():
                 self.move_aside(path)
 
-    def move_aside(self, path: Path, *, copy: bool = False) -> None:
-        """Keep a file of the trial, or what is in its place, in ``aside/``; nothing if it is not there."""
-        move_aside(path, self.aside_folder, copy=copy)
-
     def set_all_aside(self) -> None:
         """Move everything that attempts have left aside: the next one begins at the beginning.
 
@@ -174,23 +160,3 @@ class TrialStore(TrialTables):
                 self.move_aside(self.state_path)
                 stated = TrialRecord(attempt=self._attempts_made())
             self.write_record(replace(stated, status=status, error=error, token=""))
-
-    @contextmanager
-    def writing(self) -> Iterator[None]:
-        """Turn what a full or lost disk raises into a StorageError that says how to go on."""
-        try:
-            yield
-        except OSError as error:
-            update = self.saved_update
-            saved = f"it goes on from update {update}" if update else "it starts anew"
-            raise StorageError(
-                f"{self.folder.name}: its files cannot be written ({error.strerror or error}); "
-                f"{saved} when there is room and the sweep is launched again"
-            ) from error
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Exclude other writers of this trial on the same file system, for a moment."""
-        with open_lock(self.folder / ".lock") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield

@@ -17,20 +17,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from recrl.environments.cmdp import EpisodeStats
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, RowError
 from recrl.orchestrator.files import checkpoint_format
 from recrl.orchestrator.files.row_files import Extent, RowFile, rows_text
 from recrl.orchestrator.files.small_files import write_atomically, write_sealed
+from recrl.orchestrator.files.trial_folder import TrialFolder
 from recrl.orchestrator.files.trial_paths import PROVENANCE
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
 from recrl.orchestrator.files.trial_tables import EPISODE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialState
-
-if TYPE_CHECKING:
-    from recrl.orchestrator.files.trial_store import TrialStore
 
 KEPT_CHECKPOINTS = 2
 PROVENANCE_FORMAT = 2
@@ -48,7 +46,7 @@ class TrialWriter:
         record: the last record this writer wrote.
     """
 
-    def __init__(self, store: TrialStore, record: TrialRecord, spec: TrialSpec) -> None:
+    def __init__(self, store: TrialFolder, record: TrialRecord, spec: TrialSpec) -> None:
         self.store = store
         self.record = record
         self._agent = f"agent {spec.agent.label}"

@@ -20,7 +20,7 @@ from recrl.agents.registry import AGENTS, find_agent
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import TASKS, find_task, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
-from recrl.orchestrator.validation import nearest
+from recrl.orchestrator.validation import model_in, nearest
 from recrl.teachers.registry import TEACHERS, find_teacher
 
 REQUIRED = "required"
@@ -163,7 +163,7 @@ def _options(model: type[BaseModel], defaults: BaseModel | None, prefix: str) ->
         )
         default = REQUIRED if value is PydanticUndefined else _json(value)
         yield Option(f"{prefix}{name}", type_text(field.annotation), default, field.description or "")
-        inner = _inner_model(field.annotation)
+        inner = model_in(field.annotation)
         if inner is not None:
             shown = value if isinstance(value, BaseModel) else None
             yield from _options(inner, shown, f"{prefix}{name}.")
@@ -176,16 +176,6 @@ def _json(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False)
     except TypeError:
         return str(value)
-
-
-def _inner_model(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for part in typing.get_args(annotation):
-        found = _inner_model(part)
-        if found is not None:
-            return found
-    return None
 
 
 _WORDS: Mapping[Any, str] = {
@@ -217,6 +207,6 @@ def type_text(annotation: Any) -> str:
     if origin in (list, tuple):
         inner = dict.fromkeys(type_text(each) for each in arguments if each is not Ellipsis)
         return f"list of {' and '.join(inner)}"
-    if (origin is not None and issubclass(origin, Mapping)) or _inner_model(annotation):
+    if (origin is not None and issubclass(origin, Mapping)) or model_in(annotation):
         return "mapping"
     return _WORDS.get(annotation) or str(getattr(annotation, "__name__", annotation))

@@ -117,14 +117,12 @@ class Estimate:
     """About what a plan takes.
 
     Attributes:
-        cpu_seconds: CPU time of the trials, or None where no trial of some task and agent has run yet.
-        wall_seconds: with ``concurrent`` trials at once, or None.
+        wall_seconds: with ``concurrent`` trials at once; None where no trial of some task and agent has run.
         concurrent: trials at once.
         gigabytes: main memory while they run.
         unknown: the tasks and agents without a measured speed, as ``task agent``.
     """
 
-    cpu_seconds: float | None
     wall_seconds: float | None
     concurrent: int
     gigabytes: float
@@ -198,7 +196,6 @@ def estimate(plan: Plan, *, concurrent: int, speeds: Mapping[str, float] | None 
             unknown[kind] = f"{trial.spec.task.label} {trial.spec.agent.label}"
     running = min(concurrent, len(plan.to_do))
     return Estimate(
-        cpu_seconds=None if unknown else cpu_seconds,
         wall_seconds=None if unknown else cpu_seconds / max(1, running),
         concurrent=running,
         gigabytes=GIGABYTES_AROUND + running * GIGABYTES_PER_TRIAL if running else 0.0,

@@ -17,7 +17,7 @@ import ray
 
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.own_package import copy_package
-from recrl.orchestrator.files.scratch import scratch_folder
+from recrl.orchestrator.files.scratch import dead_folders, scratch_folder
 from recrl.orchestrator.ray.private_api import (
     at_loopback,
     fewer_processes,
@@ -31,7 +31,6 @@ from recrl.orchestrator.ray.services import (
     TOKEN,
     TOKEN_VARIABLE,
     end_processes,
-    end_processes_of_the_dead,
 )
 
 CONNECT_SECONDS = 5.0
@@ -86,7 +85,8 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
     Raises:
         ClusterError: Ray does not start.
     """
-    end_processes_of_the_dead(_short_folder())
+    for dead in dead_folders(_short_folder()):
+        end_processes(dead)
     with scratch_folder(_short_folder()) as folder:
         token_path = folder / TOKEN
         with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:

@@ -36,7 +36,8 @@ from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
-from recrl.orchestrator.places import StopSign, SweepPlace
+from recrl.orchestrator.files.stop_file import StopSign
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit

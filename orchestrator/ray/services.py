@@ -7,7 +7,6 @@ then. A service that takes a connection counts as alive: one that hangs is left 
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import signal
@@ -25,7 +24,6 @@ import ray
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.scratch import LOCK, PREFIX
 
 LOOK_SECONDS = 3.0  # between two looks
 CONNECT_SECONDS = 2.0
@@ -149,18 +147,6 @@ def end_processes(folder: Path) -> None:
                 _is_below(it, folder / RAY_FOLDER) for it in descriptors.iterdir()
             ):
                 os.kill(number, signal.SIGKILL)
-
-
-def end_processes_of_the_dead(parent: str) -> None:
-    """Kill what is left of the local clusters of processes that were killed.
-
-    Args:
-        parent: the folder that the clusters' own folders are in.
-    """
-    for lock_path in Path(parent).glob(f"{PREFIX}*/{LOCK}"):
-        with suppress(OSError), lock_path.open("r+") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails where its process lives
-            end_processes(lock_path.parent)
 
 
 def _is_below(link: Path, folder: Path) -> bool:

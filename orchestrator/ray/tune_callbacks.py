@@ -21,7 +21,8 @@ from ray.exceptions import (
 from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import StorageError, TeacherUnavailableError
-from recrl.orchestrator.places import StopSign, SweepPlace
+from recrl.orchestrator.files.stop_file import StopSign
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import first_line
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.services import LostServices

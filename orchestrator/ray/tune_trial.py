@@ -17,7 +17,7 @@ from ray import tune
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
-from recrl.orchestrator.remote.opening import place_at
+from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialSpec
 
 
@@ -60,7 +60,7 @@ class TuneTrial(tune.Trainable):
     def _take(self, config: Mapping[str, Any]) -> None:
         self._spec = TrialSpec.from_json(json.loads(config["spec"]))
         sweep = Path(config["sweep"])
-        self._place = place_at(SweepStore(sweep.parent, sweep.name), config["storage"])
+        self._place = sweep_place(SweepStore(sweep.parent, sweep.name), config["storage"])
         self._stop_sign = self._place.stop_sign_at(config["stop_sign"])
         self._commit_seconds: float = config["commit_seconds"]
         name = config["teacher_service"]

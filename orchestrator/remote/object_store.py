@@ -197,7 +197,7 @@ def _require_package(uri: str, protocol: str) -> None:
         fsspec.get_filesystem_class(protocol)
     except ValueError as error:
         raise RecrlError(
-            f"{uri}: no kind of storage is called {protocol!r}; fsspec knows {', '.join(_kinds())}"
+            f"{uri}: no kind of storage is called {protocol!r}; fsspec knows abfs, file, gs, s3"
         ) from error
     except ImportError as error:
         package = _package(protocol)
@@ -209,10 +209,6 @@ def _package(protocol: str) -> str:
     """The package that a kind of store is in, empty if that is fsspec itself."""
     package: str = known_implementations[protocol]["class"].partition(".")[0]
     return "" if package == "fsspec" else package
-
-
-def _kinds() -> list[str]:
-    return sorted({"s3", "gs", "abfs", "file"} & set(known_implementations))
 
 
 def _reason(error: BaseException) -> str:

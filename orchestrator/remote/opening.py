@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import LocalSweep, SweepPlace
+from recrl.orchestrator.places import SweepPlace
 
 
 def sweep_place(store: SweepStore, given: str | None = None) -> SweepPlace:
@@ -16,17 +16,9 @@ def sweep_place(store: SweepStore, given: str | None = None) -> SweepPlace:
     Raises:
         RecrlError: the address is none, needs a package that is not installed, or cannot be read.
     """
-    if given or store.storage_path.exists():
-        from recrl.orchestrator.remote.remote_sweep import remembered_uri  # noqa: PLC0415
+    if not given and not store.storage_path.exists():
+        return SweepPlace(store)
+    from recrl.orchestrator.remote.remote_sweep import RemoteSweep, remembered_uri  # noqa: PLC0415
 
-        return place_at(store, given or remembered_uri(store) or "")
-    return LocalSweep(store)
-
-
-def place_at(store: SweepStore, uri: str) -> SweepPlace:
-    """Return the place at an address; the folder itself if the address is empty."""
-    if not uri:
-        return LocalSweep(store)
-    from recrl.orchestrator.remote.remote_sweep import RemoteSweep  # noqa: PLC0415
-
-    return RemoteSweep(uri, store)
+    uri = given or remembered_uri(store)
+    return RemoteSweep(uri, store) if uri else SweepPlace(store)

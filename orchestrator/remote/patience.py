@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 
@@ -42,3 +43,26 @@ def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
                 logger.warning("%s; it is tried again for %.0f minutes", error, left / 60.0)
             time.sleep(min(pause, left))
             pause = min(2.0 * pause, LONGEST_PAUSE_SECONDS)
+
+
+def repeatedly(act: Callable[[], None], over: threading.Event, *, every: float, hint: str) -> None:
+    """Do what needs the store again and again until it is over; less often while the store is down.
+
+    Args:
+        act: what to do.
+        over: ends it.
+        every: seconds between two times.
+        hint: what is said once of a store that is down.
+    """
+    pause = every
+    while not over.wait(pause):
+        try:
+            act()
+        except (StorageError, OSError) as error:
+            if pause == every:
+                logger.warning("%s; %s", error, hint)
+            pause = min(2.0 * max(pause, FIRST_PAUSE_SECONDS / 2.0), LONGEST_PAUSE_SECONDS)
+        else:
+            if pause > every:
+                logger.info("the storage answers again")
+            pause = every

@@ -14,32 +14,32 @@ videos are in it alone.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
-from recrl.orchestrator.files.locks import open_lock
+from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.small_files import read_sealed, write_atomically, write_sealed
+from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.places import LocalSweep, StopSign
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.remote.patience import patiently
+from recrl.orchestrator.remote.patience import patiently, repeatedly
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
 from recrl.orchestrator.remote.stop_object import StopObject
 from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 PULL_SECONDS = 10.0  # between two looks at the trials that run
-LONGEST_PAUSE_SECONDS = 60.0  # between two looks while the store is down
 PULLS_AT_ONCE = 8
 
 STORAGE_FORMAT = 2
@@ -47,8 +47,8 @@ STORAGE_FORMAT = 2
 logger = logging.getLogger("recrl.sweep")
 
 
-class RemoteSweep:
-    """One sweep in an object store; a ``SweepPlace``.
+class RemoteSweep(SweepPlace):
+    """One sweep in an object store.
 
     Attributes:
         uri: the address of all sweeps there.
@@ -63,9 +63,9 @@ class RemoteSweep:
         Raises:
             RecrlError: the address is none, or needs a package that is not installed.
         """
+        super().__init__(store)
         root = ObjectStore(uri)
         self.uri = root.uri
-        self.store = store
         self.objects = root.below(store.name)
         self.lease = LaunchLease(self.objects)
         self._pulled: dict[str, list[str]] = {}
@@ -97,17 +97,13 @@ class RemoteSweep:
         )
 
     def held(self, stop: threading.Event) -> AbstractContextManager[None]:
-        """Be the one launch, on all machines, that runs the sweep; see ``LaunchLease.held``."""
+        """See ``SweepPlace`` and ``LaunchLease.held``."""
         return self.lease.held(stop)
 
     def request_stop(self) -> Callable[[], bool]:
-        """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
-
-        Raises:
-            StorageError: the store cannot be read or written.
-        """
+        """See ``SweepPlace``; the launch may run on another machine."""
         if self.store.is_locked() or not self.lease.is_held():
-            return LocalSweep(self.store).request_stop()
+            return super().request_stop()
         self.lease.request_stop()
         return self.lease.is_held
 
@@ -139,15 +135,15 @@ class RemoteSweep:
     def working_copy(
         self, spec: TrialSpec, should_stop: Callable[[], bool]
     ) -> AbstractContextManager[TrialStore]:
-        """Return a folder on this machine for one attempt at a trial; see ``upload.working_copy``."""
+        """See ``SweepPlace`` and ``upload.working_copy``."""
         return working_copy(self.trial(spec.folder_name), spec, should_stop)
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:
-        """Return the stop sign of a new run; see ``StopObject.open``."""
+        """See ``SweepPlace`` and ``StopObject.open``."""
         return StopObject.open(self.objects)
 
     def stop_sign_at(self, place: str) -> StopSign:
-        """Return the stop sign that a run has made."""
+        """See ``SweepPlace``."""
         return StopObject(self.objects, place)
 
     def refresh(self, *, checkpoints: bool = False) -> None:
@@ -229,19 +225,7 @@ class RemoteSweep:
         Raises:
             StorageError: the store cannot be read at the end.
         """
-
-        def follow(over: threading.Event) -> None:
-            pause = every
-            while not over.wait(pause):
-                try:
-                    self._pull_trials()
-                except (StorageError, OSError) as error:
-                    if pause == every:
-                        logger.warning("%s; the trials go on", error)
-                    pause = min(2.0 * pause, LONGEST_PAUSE_SECONDS)
-                else:
-                    pause = every
-
+        follow = partial(repeatedly, self._pull_trials, every=every, hint="the trials go on")
         with beside(follow, name="local copy"):
             yield
         patiently(self._pull_trials, stop.is_set)
@@ -294,8 +278,7 @@ class RemoteSweep:
     def _alone(self) -> Iterator[None]:
         """Be the only process and thread that writes the copy."""
         self.store.folder.mkdir(parents=True, exist_ok=True)
-        with open_lock(self.store.folder / ".pull") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with locked(self.store.folder / ".pull"):
             yield
 
 

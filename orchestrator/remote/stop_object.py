@@ -4,40 +4,25 @@ from __future__ import annotations
 
 import logging
 import secrets
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from recrl.orchestrator.errors import StorageError
+from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.remote.object_store import ObjectStore
-
-STOP_QUESTION_SECONDS = 5.0  # between two questions of a worker whether to stop
 
 logger = logging.getLogger("recrl.sweep")
 
 
-class StopObject:
-    """How one run of a sweep tells its workers, on any node, to save and stop: see ``stop_file``.
+class StopObject(StopSign):
+    """A stop sign in the object store; its place is the object's key, below the sweep."""
 
-    Attributes:
-        key: of the object, below the sweep.
-    """
+    question_seconds = 5.0
 
     def __init__(self, objects: ObjectStore, key: str) -> None:
+        super().__init__(key)
         self._objects = objects
-        self.key = key
-        self._answer = False
-        self._asked_at = float("-inf")
-
-    @property
-    def place(self) -> str:
-        """By which workers find it, beside the sweep's address."""
-        return self.key
-
-    @property
-    def uri(self) -> str:
-        """The sweep's address."""
-        return self._objects.uri
+        self.uri = objects.uri
 
     @classmethod
     @contextmanager
@@ -49,12 +34,12 @@ class StopObject:
         """
         objects.delete(key for key in objects.names("file") if key.startswith("stop-"))
         sign = cls(objects, f"stop-{secrets.token_hex(4)}")
-        objects.write(sign.key, b"go on\n")
+        objects.write(sign.place, b"go on\n")
         try:
             yield sign
         finally:
             try:
-                objects.delete([sign.key])
+                objects.delete([sign.place])
             except StorageError as error:
                 logger.warning("%s", error)
 
@@ -63,17 +48,15 @@ class StopObject:
         if self._answer:
             return
         try:
-            self._objects.write(self.key, b"stop\n")
+            self._objects.write(self.place, b"stop\n")
             self._answer = True
         except StorageError as error:
             logger.debug("%s", error)
 
-    def is_set(self) -> bool:
-        """Whether to stop; asks every ``STOP_QUESTION_SECONDS`` at most. No answer is none."""
-        if not self._answer and time.monotonic() >= self._asked_at + STOP_QUESTION_SECONDS:
-            self._asked_at = time.monotonic()
-            try:
-                self._answer = self._objects.read(self.key) != b"go on\n"
-            except StorageError as error:
-                logger.debug("%s", error)
-        return self._answer
+    def _says_stop(self) -> bool:
+        """Look at the object; no answer is none."""
+        try:
+            return self._objects.read(self.place) != b"go on\n"
+        except StorageError as error:
+            logger.debug("%s", error)
+            return False

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from recrl.orchestrator.background import beside
-from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError
+from recrl.orchestrator.errors import CheckpointError, LostLeaseError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_record import TrialRecord
@@ -211,22 +211,12 @@ def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:
 
 def _follow(upload: Upload, over: threading.Event) -> None:
     """Send what is committed, until it is over."""
-    pause = LOOK_SECONDS
-    while not over.wait(pause):
-        try:
-            upload.follow()
-        except LostLeaseError as error:
-            logger.warning("%s", error)
-            upload.revoke()
-            return
-        except (StorageError, OSError) as error:
-            if pause == LOOK_SECONDS:
-                logger.warning("%s; the trial goes on, this is tried again", error)
-            pause = min(2.0 * max(pause, patience.FIRST_PAUSE_SECONDS / 2.0), patience.LONGEST_PAUSE_SECONDS)
-        else:
-            if pause > LOOK_SECONDS:
-                logger.info("the storage takes everything again")
-            pause = LOOK_SECONDS
+    hint = "the trial goes on, this is tried again"
+    try:
+        patience.repeatedly(upload.follow, over, every=LOOK_SECONDS, hint=hint)
+    except LostLeaseError as error:
+        logger.warning("%s", error)
+        upload.revoke()
 
 
 def _commit_of(record: TrialRecord) -> tuple[Any, ...]:

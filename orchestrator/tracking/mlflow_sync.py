@@ -21,7 +21,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
 from recrl.orchestrator.files.small_files import write_json
@@ -31,7 +32,6 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter
-from recrl.orchestrator.tracking.points import Summary
 from recrl.orchestrator.tracking.positions import exclusive, sync_folder
 from recrl.orchestrator.tracking.runs import SweepRuns
 from recrl.orchestrator.tracking.sweep_sync import SweepSync
@@ -50,7 +50,6 @@ class SyncReport:
         remark: one line saying why the export file could not be uploaded, or empty.
         finished_at: when the pass ended, seconds since 1970.
         experiment_id: the sweep's experiment, or empty if MLflow could not be reached.
-        parent_run_id: the sweep's run, likewise.
     """
 
     trials: int = 0
@@ -60,7 +59,6 @@ class SyncReport:
     remark: str = ""
     finished_at: float = 0.0
     experiment_id: str = ""
-    parent_run_id: str = ""
 
     @property
     def is_up_to_date(self) -> bool:
@@ -110,26 +108,30 @@ class Tracker:
             rebuild: delete what MLflow has of the sweep first.
         """
         trials = [trial for trial in self.store.trials() if _has_begun(trial.record())]
-        done = _Pass()
+        points: list[int] = []  # of each trial that is shown
+        problems: list[str] = []
+        remark = ""
         with exclusive(self.store, self.uri):
             view, self._view = self._view, None  # to be made anew should anything go wrong
             try:
                 view = view or _View(self.store, self.uri, self._write_export, rebuild=rebuild)
-                done.show(view, trials, live=live)
+                for trial in trials:
+                    with _kept(problems, trial):
+                        points.append(view.trials.show(trial, live=live))
+                remark = view.sweep.show(live=live)
             except Exception as error:
-                done.problems.append(one_line(error))
+                problems.append(one_line(error))
             report = SyncReport(
                 trials=len(trials),
-                behind=len(trials) - done.trials,
-                points=done.points,
-                problem=done.problems[0] if done.problems else "",
-                remark=done.remark,
+                behind=len(trials) - len(points),
+                points=sum(points),
+                problem=problems[0] if problems else "",
+                remark=remark,
                 finished_at=time.time(),
                 experiment_id=view.runs.experiment_id if view else "",
-                parent_run_id=view.runs.parent_id if view else "",
             )
             write_json(sync_folder(self.store, self.uri) / "report.json", asdict(report))
-        self._view = None if done.problems else view
+        self._view = None if problems else view
         return report
 
 
@@ -144,35 +146,19 @@ class _View:
             folder = sync_folder(store, uri)
             for path in (folder / "sweep.json", *folder.glob("trial-*.json")):
                 path.unlink(missing_ok=True)
-        self._store = store
         self.trials = TrialSync(store, uri, self.runs)
-        self.sweep = SweepSync(store, uri, self.runs, summaries=self._summaries, write_export=write_export)
-
-    def _summaries(self) -> list[Summary]:
-        found = (self.trials.summary(trial) for trial in self._store.trials())
-        return [summary for summary in found if summary]
+        self.sweep = SweepSync(store, uri, self.runs, self.trials.summary, write_export)
 
 
-class _Pass:
-    """What a pass has done so far."""
-
-    def __init__(self) -> None:
-        self.trials = 0
-        self.points = 0
-        self.problems: list[str] = []
-        self.remark = ""
-
-    def show(self, view: _View, trials: Sequence[TrialStore], *, live: bool) -> None:
-        """Show the trials, then the sweep; a trial that MLflow refuses does not stop the others."""
-        for trial in trials:
-            try:
-                self.points += view.trials.show(trial, live=live)
-                self.trials += 1
-            except Exception as error:
-                if is_away(error):
-                    raise
-                self.problems.append(f"{trial.folder.name}: {one_line(error)}")
-        self.remark = view.sweep.show(live=live)
+@contextmanager
+def _kept(problems: list[str], trial: TrialStore) -> Iterator[None]:
+    """Keep why MLflow refuses a trial: that does not stop the others."""
+    try:
+        yield
+    except Exception as error:
+        if is_away(error):
+            raise
+        problems.append(f"{trial.folder.name}: {one_line(error)}")
 
 
 def _has_begun(record: TrialRecord) -> bool:

@@ -7,7 +7,6 @@ everything is sent again.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from recrl.orchestrator.files.locks import open_lock
+from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.small_files import write_json
 from recrl.orchestrator.files.sweep_store import SweepStore
 
@@ -71,8 +70,7 @@ def exclusive(store: SweepStore, uri: str) -> Iterator[None]:
     """Wait until no other process sends this sweep to this store; two would make every run twice."""
     folder = sync_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
-    with open_lock(folder / "lock") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with locked(folder / "lock"):
         yield
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.points import Summary, charts_page, note
@@ -25,8 +26,7 @@ class SweepSync:
         store: SweepStore,
         uri: str,
         runs: SweepRuns,
-        *,
-        summaries: Callable[[], Sequence[Summary]],
+        summary: Callable[[TrialStore], Summary | None],
         write_export: ExportWriter | None,
     ) -> None:
         """Go on from the position of an earlier process.
@@ -35,12 +35,12 @@ class SweepSync:
             store: the sweep.
             uri: of ``address.tracking_uri``.
             runs: its runs.
-            summaries: returns the means of all complete trials.
+            summary: returns the means of a trial that is complete.
             write_export: writes the export file; None to upload none.
         """
         self._store = store
         self._runs = runs
-        self._summaries = summaries
+        self._summary = summary
         folder = sync_folder(store, uri)
         self._path = folder / "sweep.json"
         known = read_position(self._path)
@@ -70,10 +70,11 @@ class SweepSync:
 
         counts = Counter(display_status(record, now=time.time()) for record in records.values())
         status = sweep_status(counts, live=live)
+        summaries = filter(None, map(self._summary, self._store.trials()))
         text = note(
             self._store.name,
             {status: counts[status] for status in DisplayStatus},
-            self._summaries(),
+            list(summaries),
             charts=f"#{charts_page(self._runs.experiment_id)}",
         )
         if position.shown.get("note") != text:

@@ -22,12 +22,7 @@ SETTINGS = ("DO_NOT_TRACK=true", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER
 
 
 def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
-    """The command that shows the sweep in a browser, on this machine only.
-
-    A database gets a server of one process; a server has its own pages.
-    """
-    if is_server(uri):
-        return [sys.executable, "-m", "webbrowser", "-t", ui_url(store, uri)]
+    """The command that serves a database's pages on this machine only, in one process."""
     stores = ["--artifacts-destination", str(store.mlflow_artifacts)]
     if "@" not in uri and "?" not in uri:  # else it goes in the environment, which other users cannot see
         stores += ["--backend-store-uri", uri]

@@ -11,8 +11,10 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
+from contextlib import AbstractContextManager
+from functools import partial
 
+from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import LostLeaseError, StorageError
 
 LEAST_WORK_SECONDS = 1e-3  # CPU time between two beats; what only looks for signals uses less
@@ -21,7 +23,7 @@ logger = logging.getLogger("recrl.trial")
 
 
 class Heartbeat:
-    """Beats beside the thread that enters this context, while that one works.
+    """Beats for one thread while that one works.
 
     Args:
         beat: says that the trial lives; may raise LostLeaseError.
@@ -31,30 +33,22 @@ class Heartbeat:
     def __init__(self, beat: Callable[[], None], *, seconds: float) -> None:
         self._beat = beat
         self._seconds = seconds
-        self._over = threading.Event()
         self._lost: LostLeaseError | None = None
-        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
-    def __enter__(self) -> Heartbeat:
-        self._clock = time.pthread_getcpuclockid(threading.get_ident())
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join()
+    def beating(self) -> AbstractContextManager[None]:
+        """Beat beside the thread that calls this, until the end of the ``with`` block."""
+        clock = time.pthread_getcpuclockid(threading.get_ident())
+        return beside(partial(self._run, clock), name="heartbeat")
 
     def check(self) -> None:
         """Raise LostLeaseError if a beat met it: another attempt runs the trial."""
         if self._lost is not None:
             raise self._lost
 
-    def _run(self) -> None:
-        worked = time.clock_gettime(self._clock)
-        while not self._over.wait(self._seconds):
-            now = time.clock_gettime(self._clock)
+    def _run(self, clock: int, over: threading.Event) -> None:
+        worked = time.clock_gettime(clock)
+        while not over.wait(self._seconds):
+            now = time.clock_gettime(clock)
             if now - worked < LEAST_WORK_SECONDS:
                 continue
             worked = now

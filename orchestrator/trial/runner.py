@@ -63,7 +63,8 @@ def run_trial(
             commit stands.
     """
     life = _Life(writer)
-    with Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS) as heartbeat:  # to get ready may take minutes
+    heartbeat = Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS)
+    with heartbeat.beating():  # to get ready may take minutes
         trial = life.of(Trial(spec, writer, teacher))
         committed = time.monotonic()
         while not trial.learned and not should_stop():

@@ -1,7 +1,12 @@
 """The table of what the presets differ in is complete."""
 
-from recrl.agents.presets import deviations, options_of
+import runpy
+from pathlib import Path
+
 from recrl.agents.registry import AGENTS
+
+PRESETS = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "_ext" / "presets.py"))
+deviations, options_of = PRESETS["deviations"], PRESETS["options_of"]
 
 
 def test_paper_is_recommended_with_every_deviation_switched() -> None:

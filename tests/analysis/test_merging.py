@@ -10,7 +10,7 @@ import pytest
 from recrl.analysis import report
 from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.merging import merge
-from recrl.analysis.data.sweep_data import Rows, Sweep, TrialFacts
+from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -37,9 +37,7 @@ def part(tmp_path: Path) -> Part:
 def without_rows(trials: Sequence[TrialFacts]) -> Sweep:
     """A part whose trials have learnt nothing yet."""
     none = pd.DataFrame()
-    return sweep_data.assemble(
-        "part", trials, Rows(phases=none, updates=none, evaluations=none, events=none, policies=none)
-    )
+    return sweep_data.assemble("part", trials, dict.fromkeys(ROWS, none))
 
 
 def assert_equal(one: Sweep, other: Sweep) -> None:

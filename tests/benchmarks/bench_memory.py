@@ -22,7 +22,7 @@ from pathlib import Path
 
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.executor import RayExecutor
 from recrl.orchestrator.spec import Choice, TrialSpec
@@ -129,7 +129,7 @@ def bench(spec: TrialSpec, root: Path) -> None:
     store = SweepStore(root, "memory")
     sync = start_sync(store, tracking_uri(store, None), interval_seconds=5.0)
     with local_cluster(num_cpus=1), MemoryWatch() as watch:
-        RayExecutor(num_cpus=1).run([spec], LocalSweep(store), threading.Event())
+        RayExecutor(num_cpus=1).run([spec], SweepPlace(store), threading.Event())
     synced = sync.stop(timeout=600.0)
     record = store.trial(spec).record()
     episodes = len(store.trial(spec).episodes())

@@ -23,7 +23,7 @@ import ray
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.executor import RayExecutor
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
@@ -107,7 +107,7 @@ def bench_sweep(*, cores: int, trials: int, updates: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         store = SweepStore(Path(folder), "bench")
         started = time.time()
-        RayExecutor(num_cpus=cores).run(specs, LocalSweep(store), threading.Event())
+        RayExecutor(num_cpus=cores).run(specs, SweepPlace(store), threading.Event())
         ended = time.time()
         records = [store.trial(spec).record() for spec in specs]
     wall = ended - started

@@ -26,7 +26,7 @@ from typing import Any
 
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray import executor
 from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.executor import RayExecutor
@@ -103,7 +103,7 @@ def watch_trials(specs: Sequence[TrialSpec], root: Path, title: str, seconds: fl
         stop.set()
 
     with beside(watch, name="watch"):
-        RayExecutor(num_cpus=len(specs)).run(specs, LocalSweep(store), stop)
+        RayExecutor(num_cpus=len(specs)).run(specs, SweepPlace(store), stop)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

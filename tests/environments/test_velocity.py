@@ -19,8 +19,8 @@ from recrl.environments.simulation.camera import RenderingUnavailableError
 from recrl.environments.velocity.batch import VelocityBatch
 from recrl.environments.velocity.environments import VelocityEnv, VelocityVectorEnv
 from recrl.environments.velocity.model import make_model
-from recrl.environments.velocity.parity import compare_velocity_recording
 from recrl.environments.velocity.tasks import VELOCITY_TASKS
+from tests.benchmarks.velocity_parity import compare_velocity_recording
 
 ROBOTS = list(VELOCITY)
 TASKS = [f"Safety{robot}Velocity" for robot in ROBOTS]

@@ -32,7 +32,7 @@ from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.places import LocalSweep, SweepPlace
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep import LaunchSettings, launch
 from recrl.orchestrator.tracking.address import tracking_uri
@@ -203,7 +203,7 @@ def make(folder: Path, *, interrupted: bool, limit: float = 0.5) -> Path:
     grid = read_grid(folder / "grid.yaml")
     store = SweepStore(folder / "runs", NAME)
     executor = _Interrupted() if interrupted else InlineExecutor()
-    launch(LaunchSettings(grid, LocalSweep(store), executor), stop=threading.Event())
+    launch(LaunchSettings(grid, SweepPlace(store), executor), stop=threading.Event())
     return folder
 
 

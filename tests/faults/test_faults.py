@@ -22,7 +22,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.scratch import EMPTY_SECONDS, LOCK, scratch_folder
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.places import LocalSweep, SweepPlace
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, launch
 from recrl.orchestrator.trial.heartbeat import Heartbeat
@@ -180,7 +180,7 @@ def test_what_a_full_disk_keeps_from_being_said_hides_nothing(
     )
     grid = parse_grid(text.encode(), source="grid.yaml")
     with pytest.raises(ArithmeticError, match="the first error"):
-        place = LocalSweep(SweepStore(small_disk, "sweep"))
+        place = SweepPlace(SweepStore(small_disk, "sweep"))
         launch(LaunchSettings(grid, place, Dying()), stop=threading.Event())
     with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\); it starts anew"):
         SweepStore(small_disk, "sweep").trial(SPEC).set_status(TrialState.WAITING)
@@ -226,13 +226,13 @@ def test_numbers_that_break_down_are_located(tmp_path: Path, monkeypatch: pytest
 
 def test_a_thread_that_works_is_heard_and_one_that_waits_is_not() -> None:
     heard = threading.Event()
-    with Heartbeat(heard.set, seconds=0.005):
+    with Heartbeat(heard.set, seconds=0.005).beating():
         end = time.monotonic() + 30.0
         while not heard.is_set() and time.monotonic() < end:
             pass  # works
         assert heard.is_set()
     heard.clear()
-    with Heartbeat(heard.set, seconds=0.05):
+    with Heartbeat(heard.set, seconds=0.05).beating():
         assert not heard.wait(0.5)
 
 
@@ -260,7 +260,8 @@ def test_a_trial_that_was_taken_over_learns_it_from_its_heartbeat() -> None:
         while time.monotonic() < end:
             heartbeat.check()
 
-    with Heartbeat(refuse, seconds=0.005) as heartbeat, pytest.raises(LostLeaseError):
+    heartbeat = Heartbeat(refuse, seconds=0.005)
+    with heartbeat.beating(), pytest.raises(LostLeaseError):
         work(heartbeat)
     assert asked.is_set()
 

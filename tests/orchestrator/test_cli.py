@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from recrl.analysis.figures import learning_curves
+from recrl.environments.plugins import load_attribute
+from recrl.orchestrator.cli.arguments import COMMANDS
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -87,6 +89,11 @@ def test_help_names_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
     assert end.value.code == 0
     epilog = capsys.readouterr().out.partition("Exit codes:")[2]
     assert [int(line.split()[0]) for line in epilog.splitlines() if line.strip()] == [*ExitCode]
+
+
+@pytest.mark.parametrize("place", COMMANDS.values())
+def test_every_command_has_its_function(place: str) -> None:
+    assert callable(load_attribute(f"recrl.orchestrator.cli.{place}"))
 
 
 def test_a_right_grid_is_confirmed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

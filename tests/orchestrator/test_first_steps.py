@@ -12,8 +12,8 @@ import yaml
 
 from recrl.agents.registry import AGENTS
 from recrl.environments.registry import TASKS
-from recrl.orchestrator.cli.command_arguments import TEMPLATES
 from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.cli.requests import TEMPLATES
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.grid.json_schema import grid_schema

@@ -24,7 +24,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.plan import PlannedAction, make_plan
-from recrl.orchestrator.places import LocalSweep, SweepPlace
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
 from recrl.orchestrator.trial.runner import run_recorded
@@ -58,7 +58,7 @@ def run(store: SweepStore, *, updates: int | None = None, **options: Any) -> Swe
 
     executor: Executor = InlineExecutor() if updates is None else Stopping()
     grid = parse_grid(GRID.encode(), source="grid.yaml")
-    settings = LaunchSettings(grid, LocalSweep(store), executor, **options)
+    settings = LaunchSettings(grid, SweepPlace(store), executor, **options)
     return launch(settings, stop=threading.Event())
 
 

@@ -22,7 +22,7 @@ from recrl.orchestrator.files.code_changes import (
 )
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.places import LocalSweep, SweepPlace
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.sweep import LaunchSettings, launch
 
 TASK = """\
@@ -117,10 +117,10 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
             answers = iter([False])
             run_recorded(spec, place.store.trial(spec), should_stop=lambda: next(answers, True))
 
-    launch(LaunchSettings(grid, LocalSweep(store), Stopping()), stop=threading.Event())
+    launch(LaunchSettings(grid, SweepPlace(store), Stopping()), stop=threading.Event())
     first = code_of(spec)
     change(folder)
-    launch(LaunchSettings(grid, LocalSweep(store), InlineExecutor()), stop=threading.Event())
+    launch(LaunchSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     attempts = store.trial(spec).provenance()
     assert [attempt["attempt"] for attempt in attempts] == [1, 2]
     assert [attempt["code"] for attempt in attempts] == [first, code_of(spec)]

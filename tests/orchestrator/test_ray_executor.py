@@ -26,7 +26,7 @@ from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.stop_file import StopFile
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray import hang_watchdog
 from recrl.orchestrator.ray.clusters import existing_cluster, local_cluster
 from recrl.orchestrator.ray.executor import (
@@ -71,7 +71,7 @@ def cluster() -> Iterator[None]:
 def inline(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     """The undisturbed trials, one after the other in this process."""
     store = SweepStore(tmp_path_factory.mktemp("inline"), "sweep")
-    InlineExecutor().run((*SWEEP, LONG), LocalSweep(store), threading.Event())
+    InlineExecutor().run((*SWEEP, LONG), SweepPlace(store), threading.Event())
     return store
 
 
@@ -104,7 +104,7 @@ def test_equal_bytes_in_reused_workers_and_failures_stop_nobody(
     tmp_path: Path, inline: SweepStore, capfd: pytest.CaptureFixture[str]
 ) -> None:
     store = SweepStore(tmp_path, "sweep")
-    RayExecutor(max_failures=0).run((BROKEN, *SWEEP, CRASHING), LocalSweep(store), threading.Event())
+    RayExecutor(max_failures=0).run((BROKEN, *SWEEP, CRASHING), SweepPlace(store), threading.Event())
     assert_equal_bytes(SWEEP, store, inline)
     assert len({store.trial(spec).record().pid for spec in SWEEP}) <= 2
     failed = store.trial(BROKEN).record()
@@ -134,13 +134,13 @@ def test_a_stopped_sweep_is_finished_by_the_next_run_with_other_workers(
         stop.set()
 
     with once(lambda: store.trial(LONG).record().update >= 20, ask_to_stop):
-        RayExecutor().run((LONG, *SWEEP), LocalSweep(store), stop)
+        RayExecutor().run((LONG, *SWEEP), SweepPlace(store), stop)
     assert time.monotonic() - stopped_at[0] < 20.0
     record = store.trial(LONG).record()
     assert record.status is TrialState.WAITING
     assert 20 <= record.update < LONG.num_updates
     left = [spec for spec in (*reversed(SWEEP), LONG) if not store.trial(spec).record().status.is_finished]
-    RayExecutor(max_concurrent=1, teacher="inline").run(left, LocalSweep(store), threading.Event())
+    RayExecutor(max_concurrent=1, teacher="inline").run(left, SweepPlace(store), threading.Event())
     assert_equal_bytes((LONG, *SWEEP), store, inline)
 
 
@@ -157,7 +157,7 @@ def test_a_killed_worker_and_a_killed_teacher_leave_no_trace(tmp_path: Path, inl
         os.kill(killed[0], signal.SIGKILL)
 
     with once(lambda: store.trial(LONG).record().update >= 40, kill):
-        RayExecutor(commit_seconds=0.1).run([LONG], LocalSweep(store), threading.Event())
+        RayExecutor(commit_seconds=0.1).run([LONG], SweepPlace(store), threading.Event())
     assert killed
     assert store.trial(LONG).record().attempt == 2
     assert store.trial(LONG).record().pid not in killed
@@ -273,7 +273,7 @@ def test_what_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
         ClusterError,
         match=r"^a trial asks for 3 CPU, 0 GPU, this cluster has 2 CPU, 0 GPU; ask for less or add machines$",
     ):
-        RayExecutor(cpus_per_trial=3).run(SWEEP, LocalSweep(SweepStore(tmp_path, "sweep")), threading.Event())
+        RayExecutor(cpus_per_trial=3).run(SWEEP, SweepPlace(SweepStore(tmp_path, "sweep")), threading.Event())
 
 
 @pytest.mark.usefixtures("cluster")
@@ -390,7 +390,7 @@ def test_a_process_is_silent_only_after_it_has_spoken_of_its_trial(tmp_path: Pat
     process = subprocess.Popen(["ray::trial", "60"], executable=shutil.which("sleep"))
     try:
         files.begin(LONG)  # by a process that is dead, and left its record so
-        silence = HangWatchdog(LocalSweep(store), 0.0)
+        silence = HangWatchdog(SweepPlace(store), 0.0)
         silence.begin(tune_trial)
         files.write_record(replace(files.record(), pid=process.pid))
         for _ in range(3):
@@ -421,7 +421,7 @@ def test_a_process_that_never_speaks_of_its_trial_is_ended_by_ray_after_a_longer
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(hang_watchdog, "time", SimpleNamespace(monotonic=lambda: clock.now))
     monkeypatch.setattr(ray, "kill", ended.append)
-    silence = HangWatchdog(LocalSweep(store), 100.0)
+    silence = HangWatchdog(SweepPlace(store), 100.0)
     silence.begin(tune_trial)
     found = []
     for clock.now in (101.0, 490.0, 501.0, 510.0, 2000.0):

@@ -26,7 +26,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
@@ -83,7 +83,7 @@ def machine(folder: Path, name: str, kind: str = "file") -> Machine:
 def local(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     """The same sweep in a folder."""
     store = SweepStore(tmp_path_factory.mktemp("local"), "small")
-    launch(LaunchSettings(grid(), LocalSweep(store), InlineExecutor()), stop=threading.Event())
+    launch(LaunchSettings(grid(), SweepPlace(store), InlineExecutor()), stop=threading.Event())
     return store
 
 
@@ -176,13 +176,13 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
         "import json, sys, threading\n"
         "from pathlib import Path\n"
         "from recrl.orchestrator.files.sweep_store import SweepStore\n"
-        "from recrl.orchestrator.remote.opening import place_at\n"
+        "from recrl.orchestrator.remote.opening import sweep_place\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
         "from recrl.orchestrator.trial.runner import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
         "asked = iter(range(99))\n"
         "hang = lambda: next(asked) >= 3 and threading.Event().wait()\n"
-        "place = place_at(SweepStore(Path('nowhere'), 'small'), sys.argv[1])\n"
+        "place = sweep_place(SweepStore(Path('nowhere'), 'small'), sys.argv[1])\n"
         "with place.working_copy(spec, hang) as trial:\n"
         "    run_recorded(spec, trial, should_stop=hang, commit_seconds=0.0)\n"
     )
@@ -330,7 +330,7 @@ def test_workers_hear_of_the_end_of_their_own_run_and_of_all_earlier_ones(
             assert not sign.is_set()
             sign.set()
             assert not worker.is_set()  # it asked a moment ago
-            monkeypatch.setattr("recrl.orchestrator.remote.stop_object.STOP_QUESTION_SECONDS", 0.0)
+            monkeypatch.setattr(StopObject, "question_seconds", 0.0)
             assert worker.is_set()
     assert objects.keys_in() == []
 

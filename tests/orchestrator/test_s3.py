@@ -12,7 +12,7 @@ from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.places import LocalSweep
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from recrl.orchestrator.sweep import LaunchSettings, launch
@@ -58,7 +58,7 @@ def server() -> Iterator[Any]:
 def test_a_sweep_on_s3_is_the_sweep_of_a_folder(tmp_path: Path) -> None:
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     local = SweepStore(tmp_path / "local", "small")
-    launch(LaunchSettings(grid, LocalSweep(local), InlineExecutor()), stop=threading.Event())
+    launch(LaunchSettings(grid, SweepPlace(local), InlineExecutor()), stop=threading.Event())
     copy = SweepStore(tmp_path / "copy", "small")
     place = RemoteSweep("s3://results/runs", copy)
     place.prepare()

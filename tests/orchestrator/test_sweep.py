@@ -16,7 +16,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import parse_grid
 from recrl.orchestrator.grid.grid_spec import GridSpec
 from recrl.orchestrator.grid.plan import Plan, PlannedAction
-from recrl.orchestrator.places import LocalSweep, SweepPlace
+from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch, stopping_on_signals
 from recrl.orchestrator.sweep_progress import SweepProgress
@@ -57,7 +57,7 @@ def _grid(text: str = GRID) -> GridSpec:
 
 def _launch(store: SweepStore, grid: GridSpec | None = None, *, retry_failed: bool = False) -> SweepResult:
     stop = threading.Event()
-    settings = LaunchSettings(grid or _grid(), LocalSweep(store), InlineExecutor(), retry_failed=retry_failed)
+    settings = LaunchSettings(grid or _grid(), SweepPlace(store), InlineExecutor(), retry_failed=retry_failed)
     return launch(settings, stop=stop)
 
 
@@ -130,7 +130,7 @@ def test_the_folder_says_what_was_launched(store: SweepStore) -> None:
 
 
 def test_a_stopped_sweep_goes_on_with_the_same_call(store: SweepStore, tmp_path: Path) -> None:
-    stopped = launch(LaunchSettings(_grid(), LocalSweep(store), StopAfterOne()), stop=threading.Event())
+    stopped = launch(LaunchSettings(_grid(), SweepPlace(store), StopAfterOne()), stop=threading.Event())
     assert stopped.stopped
     assert not stopped.progress.is_complete
     again = _launch(store)
@@ -183,7 +183,7 @@ def test_two_launches_of_a_sweep_at_once_are_refused(store: SweepStore) -> None:
 def test_a_wrong_selection_leaves_no_trace(store: SweepStore) -> None:
     with pytest.raises(RecrlError, match="--only: no trial has method 'dynamic'"):
         only = {"method": ["dynamic"]}
-        settings = LaunchSettings(_grid(), LocalSweep(store), InlineExecutor(), only=only)
+        settings = LaunchSettings(_grid(), SweepPlace(store), InlineExecutor(), only=only)
         launch(settings, stop=threading.Event())
     assert not store.folder.exists()
 
@@ -200,7 +200,7 @@ def test_the_sync_gets_its_full_timeout_after_the_figures(store: SweepStore) -> 
 
     settings = LaunchSettings(
         _grid(),
-        LocalSweep(store),
+        SweepPlace(store),
         InlineExecutor(),
         start_sync=lambda _: sync,
         watch=watch,
@@ -216,7 +216,7 @@ def test_the_sync_gets_its_full_timeout_after_the_figures(store: SweepStore) -> 
 def test_the_sync_gets_a_short_timeout_otherwise(store: SweepStore, executor: Executor) -> None:
     sync = Bystander()
     try:
-        settings = LaunchSettings(_grid(), LocalSweep(store), executor, start_sync=lambda _: sync)
+        settings = LaunchSettings(_grid(), SweepPlace(store), executor, start_sync=lambda _: sync)
         launch(settings, stop=threading.Event())
     except ClusterError:
         assert isinstance(executor, Unavailable)

@@ -39,7 +39,7 @@ ADAPTERS = {
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\.rivergrid\..*",
     "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
-    "numba": r"environments\.simulation\.(machine_code|code_digest)",
+    "numba": r"environments\.simulation\.machine_code",
     "ray": r"orchestrator\.ray\..*",
     "mlflow": r"orchestrator\.tracking\.(client|read|runs|sweep_sync|trial_sync)",
     "matplotlib": r"analysis\..*",

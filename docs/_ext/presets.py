@@ -1,7 +1,4 @@
-"""Differences between the two presets: all options of agents whose value in ``paper`` is not ours.
-
-python -m recrl.agents.presets     prints the table of the README
-"""
+"""Differences between the two presets: all options of agents whose value in ``paper`` is not ours."""
 
 from __future__ import annotations
 
@@ -52,7 +49,3 @@ def table() -> str:
         agents = "all" if set(each.agents) == set(AGENTS) else ", ".join(each.agents)
         rows.append(f"| `{each.option}` | {each.recommended} | {each.paper} | {agents} |")
     return "\n".join(rows)
-
-
-if __name__ == "__main__":
-    print(table())
