@@ -177,8 +177,8 @@ def _markdown(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
     lines += ["", "## Warnings", "", _count(sweep), "", *_list(missing(sweep)), "", "## Figures", ""]
     for path in pictures:
         lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
-    for heading, table in tables.shown:
-        lines += [f"## {heading}", "", report_tables.markdown(table), ""]
+    for it in tables.shown:
+        lines += [f"## {it.heading}", "", report_tables.markdown(it.table), "", *([it.note, ""] if it.note else [])]
     provenance = "\n".join(_provenance(sweep)).splitlines()
     return "\n".join([*lines, "## Provenance", "", *(f"    {line}" for line in provenance)])
 
@@ -286,7 +286,7 @@ def _html(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
     sections = [
         Section("Warnings", report_page.items(sentences, kind="failed" if failed else "plain")),
         Section("Figures", "\n".join(report_page.figure(path, _caption(path)) for path in pictures)),
-        *(Section(heading, report_page.table(table)) for heading, table in tables.shown),
+        *(Section(it.heading, report_page.table(it.table, it.note)) for it in tables.shown),
         Section("Settings", report_page.verbatim(sweep.grid) + report_page.verbatim(_settings(sweep))),
         Section("Provenance", report_page.verbatim("\n".join(_provenance(sweep)))),
     ]

@@ -34,7 +34,8 @@ th { border-bottom: 2px solid #999; vertical-align: bottom; }
 pre { font-size: 0.8rem; background: #f6f6f6; padding: 0.6rem; overflow-x: auto; }
 summary { cursor: pointer; }
 .answers { font-size: 1.1rem; padding-left: 1.2rem; }
-.notes { color: #555; font-size: 0.85rem; padding-left: 1.2rem; }
+.notes { color: #555; font-size: 0.85rem; }
+ul.notes { padding-left: 1.2rem; }
 tr.solved td.verdict { background: #e3f1e3; }
 tr.infeasible td { background: #fbe9e7; }
 tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
@@ -114,9 +115,10 @@ def figure(png: Path, caption: str) -> str:
     )
 
 
-def table(frame: pd.DataFrame) -> str:
-    """A table of finished text."""
-    return _table(frame, [""] * len(frame), "")
+def table(frame: pd.DataFrame, note: str = "") -> str:
+    """A table of finished text, and a sentence below it."""
+    below = f'\n<p class="notes">{escape(note)}</p>' if note else ""
+    return _table(frame, [""] * len(frame), "") + below
 
 
 def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:
