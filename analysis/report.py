@@ -178,7 +178,8 @@ def _markdown(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
     for path in pictures:
         lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
     for it in tables.shown:
-        lines += [f"## {it.heading}", "", report_tables.markdown(it.table), "", *([it.note, ""] if it.note else [])]
+        lines += [f"## {it.heading}", "", report_tables.markdown(it.table), ""]
+        lines += [it.note, ""] if it.note else []
     provenance = "\n".join(_provenance(sweep)).splitlines()
     return "\n".join([*lines, "## Provenance", "", *(f"    {line}" for line in provenance)])
 

@@ -22,8 +22,8 @@ BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 
 TIES = (
-    f"P(higher return): a tie counts half. Returns tie within {OPTIMAL_GAP} of each other where the optimum is "
-    "known, as for solved; elsewhere only where they differ by rounding."
+    f"P(higher return): a tie counts half. Returns tie within {OPTIMAL_GAP} of each other where the optimum "
+    "is known, as for solved; elsewhere only where they differ by rounding."
 )
 
 
