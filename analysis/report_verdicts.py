@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from recrl.analysis.report_tables import DASH, number, with_error, with_interval
-from recrl.analysis.statistics.feasibility import COST_TOLERANCE, OPTIMAL_GAP
+from recrl.analysis.statistics.feasibility import COST_TOLERANCE, OPTIMAL_GAP, is_cost
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
@@ -26,9 +26,12 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     if not verdicts["exact"].all():
         sampled = int(verdicts.loc[~verdicts["exact"], "episodes"].min())
         how = f"means over {sampled} episodes, or exact where the task is finite"
-    interval = ", with its 95% interval (Student's t)" if (verdicts["seeds"] > 1).any() else ""
+    several = bool((verdicts["seeds"] > 1).any())
+    interval = ", with its 95% interval (Student's t)" if several else ""
+    errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
     return [
         f"The verdict, the return and the cost are those of the final policy, without learning: {how}.",
+        *errors,
         f"Solved: feasible, and within {OPTIMAL_GAP} of the constrained optimum, where that is known.",
         f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error.",
         "The return of an infeasible policy may be above the optimum: it is no success.",
@@ -43,7 +46,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
     Args:
         verdicts: of ``verdicts.verdicts``.
     """
-    costs = [str(name) for name in verdicts if str(name).startswith("cost_")]
+    costs = [str(name) for name in verdicts if is_cost(str(name))]
     lines = []
     for _, row in verdicts.iterrows():
         line = {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
@@ -54,11 +57,12 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
         line["optimum"] = number(row["optimal_return"])
         for name in costs:
             title = "cost" if len(costs) == 1 else f"cost {int(name[5:]) + 1}"
-            line[title] = with_error(row[name], math.nan, digits=3)
+            line[title] = with_error(row[name], row[f"{name}_se"], digits=3)
             line[f"limit of {title}" if len(costs) > 1 else "limit"] = number(row[f"deploy_limit_{name[5:]}"])
         line["n"] = str(row["seeds"])
-        deployed = [with_error(row[f"deployment_{name}"], math.nan, digits=3) for name in costs]
-        line[DEPLOYMENT] = f"return {number(row['deployment_return'])}, cost {', '.join(deployed)}"
+        earned = with_error(row["deployment_return"], row["deployment_return_se"])
+        paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"], digits=3) for it in costs]
+        line[DEPLOYMENT] = f"return {earned}, cost {', '.join(paid)}"
         lines.append(line)
     return pd.DataFrame(lines)
 
