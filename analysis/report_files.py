@@ -12,6 +12,7 @@ import pandas as pd
 from recrl.analysis import report_tables
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.data.validity import curriculum_flags
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
 from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
@@ -79,7 +80,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     compared = metrics.comparisons(rows, generator)
     weighed = claims.weigh(rows)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
-    judged = verdicts(rows, compared)
+    judged = verdicts(rows, compared, curriculum_flags(sweep))
     outcomes = _outcome_tables(averaged)
     latex = [f"% {it.heading}.\n{report_tables.latex(it.table)}\n" for it in outcomes]
     shown = [*outcomes, *_comparison_tables(compared)]

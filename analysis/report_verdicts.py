@@ -13,6 +13,16 @@ from recrl.analysis.statistics.feasibility import COST_TOLERANCE, OPTIMAL_GAP, i
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
 SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
+WARNINGS = {
+    "no_curriculum": (
+        "curriculum without effect",
+        "Curriculum without effect: the measured d_t is not above d_d, so the limit was d_d from the start.",
+    ),
+    "hard_landing": (
+        "hard landing",
+        "Hard landing: the last training limit was more than 10% above d_d when deployment began.",
+    ),
+}
 NO_VERDICT = "No trial is complete yet: no verdict."
 
 
@@ -37,6 +47,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         "The return of an infeasible policy may be above the optimum: it is no success.",
         f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
+        *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
     ]
 
 
@@ -47,10 +58,13 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
         verdicts: of ``verdicts.verdicts``.
     """
     costs = [str(name) for name in verdicts if is_cost(str(name))]
+    warned = bool(verdicts[list(WARNINGS)].to_numpy().any())
     lines = []
     for _, row in verdicts.iterrows():
         line = {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
         line["verdict"] = verdict_text(row)
+        if warned:
+            line["warning"] = warning_text(row)
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         all_infeasible = row["infeasible"] == row["seeds"]  # more return is then no gain
         line["difference to none"] = DASH if all_infeasible else with_interval(row, "return_difference")
@@ -99,6 +113,17 @@ def verdict_text(row: pd.Series) -> str:
     names = {FEASIBLE: "feasible, not solved" if counts[SOLVED] else FEASIBLE}
     texts = [f"{names.get(kind, kind)} {count} of {seeds}" for kind, count in counts.items() if count]
     return "; ".join(texts) + (f", by up to {excess}" if counts[INFEASIBLE] else "")
+
+
+def warning_text(row: pd.Series) -> str:
+    """One row's warnings about its curriculum, with counts where not all seeds have them.
+
+    >>> warning_text(pd.Series({"seeds": 5, "no_curriculum": 1, "hard_landing": 5}))
+    'curriculum without effect 1 of 5; hard landing'
+    """
+    seeds = row["seeds"]
+    parts = [(name, row[flag]) for flag, (name, _) in WARNINGS.items() if row[flag]]
+    return "; ".join(name if count == seeds else f"{name} {count} of {seeds}" for name, count in parts)
 
 
 def answers(verdicts: pd.DataFrame) -> list[str]:

@@ -10,27 +10,28 @@ import math
 
 import pandas as pd
 
-from recrl.analysis.data.labels import GROUP
+from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.feasibility import is_cost
 from recrl.analysis.statistics.metrics import Measure
 
 FINAL = Measure.STOCHASTIC
 
 
-def verdicts(rows: pd.DataFrame, compared: pd.DataFrame) -> pd.DataFrame:
+def verdicts(rows: pd.DataFrame, compared: pd.DataFrame, flags: pd.DataFrame) -> pd.DataFrame:
     """Count the verdicts: a row a GROUP.
 
     Args:
         rows: of ``metrics.outcomes``.
         compared: of ``metrics.comparisons``, with the baseline ``none``.
+        flags: of ``validity.curriculum_flags``.
 
     Returns:
         GROUP, seeds, solved, feasible (the solved ones included), infeasible, worst_excess (the largest cost
         above its limit among the infeasible seeds, or NaN), worst_share (the same divided by that limit),
         episode_return and cost_i (means over seeds, with standard errors _se; NaN for one seed),
         deploy_limit_i, optimal_return, exact (whether every seed is), episodes (of a seed),
-        deployment_return and deployment_cost_i (likewise, with _se), return_difference with _low and _high
-        (NaN without a baseline).
+        deployment_return and deployment_cost_i (likewise, with _se), no_curriculum and hard_landing (seeds
+        that have the flag), return_difference with _low and _high (NaN without a baseline).
     """
     final = rows[rows["measure"] == FINAL.value]
     deployed = rows[rows["measure"] == Measure.DEPLOYMENT.value]
@@ -49,6 +50,9 @@ def verdicts(rows: pd.DataFrame, compared: pd.DataFrame) -> pd.DataFrame:
     beside = deployed.rename(columns=renamed).groupby(list(GROUP), observed=True)[list(renamed.values())]
     for statistics in (beside.mean(), beside.sem().add_suffix("_se")):
         table = table.merge(statistics.reset_index(), on=list(GROUP), how="left")
+    flagged = final[list(KEY)].merge(flags, on=list(KEY))
+    counts = flagged.groupby(list(GROUP), observed=True)[["no_curriculum", "hard_landing"]].sum()
+    table = table.merge(counts.reset_index(), on=list(GROUP), how="left")
     return table.merge(_differences(compared), on=list(GROUP), how="left")
 
 
