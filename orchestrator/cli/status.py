@@ -13,9 +13,13 @@ from recrl.orchestrator.cli.output import say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
 from recrl.orchestrator.cli.sweeps import open_store
-from recrl.orchestrator.curriculum_warnings import hard_landing_sentence, landed_hard, no_curriculum_sentence
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.curriculum_warnings import (
+    hard_landing_sentence,
+    landed_hard,
+    no_curriculum_sentence,
+)
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import make_plan

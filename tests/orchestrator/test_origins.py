@@ -13,7 +13,6 @@ from recrl.analysis import report
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.validity import curriculum_flags
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import (
@@ -21,6 +20,7 @@ from recrl.orchestrator.files.code_changes import (
     has_other_code,
     other_code_sentence,
 )
+from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.places import LocalSweep, SweepPlace
