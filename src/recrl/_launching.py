@@ -7,6 +7,7 @@ import logging
 import re
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
 SOURCE = "grid"
+LINE_SECONDS = 60.0  # at most between two lines of progress
 
 
 def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
@@ -147,7 +149,8 @@ def train(
         seed: of the trial, at least 0.
         folder: where to keep the files, as a sweep of one trial; the same call goes on from there. None keeps
             none.
-        progress: whether to print a line that shows return and cost.
+        progress: whether to show return and cost: on a terminal in place, elsewhere as a line for each
+            tenth of the updates.
         **run: other settings of a grid's section ``run``: ``deploy_fraction``, ``num_envs``,
             ``rollout_steps``, ``evaluation_episodes``.
 
@@ -258,25 +261,44 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class _Line(logging.Handler):
-    """Shows the newest line of a trial's log in place."""
+class _LineInPlace(logging.Handler):
+    """Shows the newest line of a trial's log in place, on a terminal."""
 
     def emit(self, record: logging.LogRecord) -> None:
         sys.stderr.write(f"\r{record.getMessage():<79.79}")
         sys.stderr.flush()
 
 
+class _PlainLines(logging.Handler):
+    """Prints a line of a trial's log for each tenth of its updates, and after each minute."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._tenth, self._printed = -1, time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message, now = record.getMessage(), time.monotonic()
+        if not (update := re.match(r"update (\d+) of (\d+)", message)):
+            return
+        tenth = 10 * int(update[1]) // int(update[2])
+        if tenth > self._tenth or now > self._printed + LINE_SECONDS:
+            print(message, file=sys.stderr, flush=True)
+            self._tenth, self._printed = tenth, now
+
+
 @contextmanager
 def shown_progress(wanted: bool) -> Iterator[None]:
-    """Show how far a trial in this process is, on one line of the standard error."""
+    """Show on the standard error how far a trial in this process is: in place, or in plain lines."""
     if not wanted:
         yield
         return
-    trial, line = logging.getLogger("recrl.trial"), _Line()
+    in_place = sys.stderr.isatty()
+    trial, line = logging.getLogger("recrl.trial"), _LineInPlace() if in_place else _PlainLines()
     line.addFilter(lambda record: record.levelno == logging.INFO)
     trial.addHandler(line)
     try:
         yield
     finally:
         trial.removeHandler(line)
-        sys.stderr.write("\n")
+        if in_place:
+            sys.stderr.write("\n")
