@@ -20,7 +20,7 @@ WARNINGS = {
     ),
     "hard_landing": (
         "hard landing",
-        "Hard landing: the last training limit was more than 10% above d_d when deployment began.",
+        "Hard landing: more than 10% of the way from d_t to d_d was left when deployment began.",
     ),
 }
 NO_VERDICT = "No trial is complete yet: no verdict."

@@ -28,9 +28,14 @@ def doubts(sweep: Sweep) -> list[str]:
     """Sentences on trials that ran other code than is installed now, and on curricula that are none."""
     changed = [it for it in sweep.facts if other_code(_attempts(it), it.spec)]
     complete = sum(it.status is TrialState.COMPLETE for it in changed)
+    code = other_code_sentence(complete, len(changed) - complete)
+    return [*([code] if code else []), *curriculum_warnings(sweep)]
+
+
+def curriculum_warnings(sweep: Sweep) -> list[str]:
+    """Sentences on curricula that had no effect or ended far above d_d."""
     flags = curriculum_flags(sweep)
     said = (
-        other_code_sentence(complete, len(changed) - complete),
         no_curriculum_sentence(_titles(flags, "no_curriculum")),
         hard_landing_sentence(_titles(flags, "hard_landing")),
     )

@@ -10,7 +10,7 @@ from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.validity import curriculum_flags
 from recrl.analysis.report_tables import number, with_error
-from recrl.analysis.report_verdicts import verdict_text, warning_text
+from recrl.analysis.report_verdicts import verdict_text
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import verdicts
 
@@ -29,9 +29,7 @@ def result_table(sweep: Sweep) -> pd.DataFrame:
     if sweep.evaluations.empty:
         return pd.DataFrame()
     rows = verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep))
-    lines = [_line(row, sweep.num_costs) for _, row in rows.iterrows()]
-    warned = [warning_text(row) for _, row in rows.iterrows()]
-    return pd.DataFrame(lines).assign(**({"warning": warned} if any(warned) else {}))
+    return pd.DataFrame([_line(row, sweep.num_costs) for _, row in rows.iterrows()])
 
 
 def _line(row: pd.Series, num_costs: int) -> dict[str, str]:

@@ -36,7 +36,7 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
     if not titles:
         return ""
     return (
-        f"hard landing, the last training limit was more than 10% above d_d: {_named(titles)}; give the "
+        f"hard landing, the limit was still far above d_d when deployment began: {_named(titles)}; give the "
         "curriculum more steps, a smaller window or a smaller d_t"
     )
 

@@ -87,7 +87,7 @@ def test_warnings_stand_beside_the_verdict_they_concern() -> None:
     shown = report_verdicts.verdict_table(table)
     assert shown["warning"].tolist() == ["", "", "curriculum without effect 1 of 2; hard landing"]
     assert list(shown).index("warning") == list(shown).index("verdict") + 1
-    assert "Hard landing: the last training limit" in report_verdicts.explanation(table)[-1]
+    assert "Hard landing: more than 10% of the way" in report_verdicts.explanation(table)[-1]
 
 
 def test_one_seed_has_no_interval() -> None:

@@ -107,7 +107,18 @@ def test_training_equals_the_sweeps_trial(folder: Path) -> None:
     assert again.updates.equals(one.updates)
 
 
-def test_progress_is_one_line_with_return_and_cost(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_is_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    train(progress=True, total_steps=1200)
+    lines = capsys.readouterr().err.splitlines()
+    assert "\r" not in "".join(lines)
+    assert [line.split()[1] for line in lines] == ["1", *(str(3 * i) for i in range(1, 11))]
+    assert lines[-1].startswith("update 30 of 30, deployment: return ")
+
+
+def test_progress_is_one_line_with_return_and_cost(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     train(progress=True)
     err = capsys.readouterr().err
     assert err.endswith("\n")
@@ -232,6 +243,7 @@ def test_a_launch_prints_what_the_command_prints(folder: Path, capsys: pytest.Ca
     out = capsys.readouterr().out
     assert "small: 2 trials: 2 new" in out
     assert "task       agent    method  n  return" in out
+    assert "\nwarning: hard landing, " in out
     assert main(["status", "--brief", "runs/small"]) == ExitCode.OK
     assert len(recrl.load_sweep("small").trials) == len(recrl.load_sweep("runs/small").trials) == 2
     with pytest.raises(recrl.RecrlError, match="holds no sweep 'smal'; did you mean 'small'"):
