@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -194,10 +194,13 @@ def train(
             if trial.error_path.exists():
                 failed.add_note(trial.error_path.read_text())
             raise failed
-        return Training(sweep, policy_of(trial, seed=seed), folder=None if folder is None else trial.folder)
+        policy = policy_of(trial, seed=seed)
+        if folder is None:
+            return Training(replace(sweep, folder=None), policy, None)
+        return Training(sweep, policy, trial.folder)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Training:
     """What ``train`` returns.
 
@@ -210,6 +213,10 @@ class Training:
     sweep: Sweep
     policy: Policy
     folder: Path | None
+
+    def __repr__(self) -> str:
+        place = f" in {self.folder}" if self.folder else ""
+        return f"<Training of {self.policy.spec.title}, {len(self.updates)} updates{place}>"
 
     @property
     def updates(self) -> pd.DataFrame:
