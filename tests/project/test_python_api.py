@@ -181,9 +181,7 @@ def test_a_policy_is_loaded_by_its_row_in_trials(
     policy = recrl.load_policy(training.sweep, training.sweep.trials["trial_id"].iloc[0])
     assert repr(policy) == "<Policy of two-state ppo-lag none seed 0 after 4 of 4 updates>"
     assert repr(training) == f"<Training of two-state ppo-lag none seed 0, 4 updates in {training.folder}>"
-    with pytest.raises(
-        recrl.RecrlError, match="one: has no trial '3f2a'; sweep.trials has the column trial_id"
-    ):
+    with pytest.raises(recrl.RecrlError, match="one: has no trial '3f2a'; "):
         recrl.load_policy(training.sweep, "3f2a")
     assert train().sweep.folder is None
     store = made_up_sweep(
