@@ -55,9 +55,16 @@ def _add_catalogue(commands: Commands) -> None:
     catalogue = add_command(commands, "list", requests.ListRequest, "list the tasks, agents or curricula")
     catalogue.add_argument("kind", choices=KINDS, help="what to list")
     options = add_command(
-        commands, "options", requests.OptionsRequest, "list the options of a task, an agent or a curriculum"
+        commands,
+        "options",
+        requests.OptionsRequest,
+        "list the options of a task, an agent, a curriculum or a section of the grid",
     )
-    options.add_argument("name", metavar="NAME", help="as 'list' shows it, or package.module:attribute")
+    options.add_argument(
+        "name",
+        metavar="NAME",
+        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits",
+    )
     add_trust(options)
     add_command(commands, "schema", requests.SchemaRequest, "print a JSON schema of grid files, for editors")
 
