@@ -1,6 +1,6 @@
 """All figures and tables of a sweep in one call, from a finished or a running one.
 
-    report.html                 the answer, the verdicts, and all of what follows on one self-contained page
+    report.html                 answer, verdicts, figures and, folded, the rest on one self-contained page
     report.md                   the same as text, with links to the figures
     return-against-cost         final policies, the infeasible region, and the frontier J*(d) (PDF and PNG)
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
@@ -31,7 +31,7 @@ import dataclasses
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -156,15 +156,24 @@ def _noted(sweep: Sweep, notes: list[str]) -> Sweep:
 def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
     """Write the tables and the two reports that show the figures drawn; all files, the reports first."""
     written, tables = write_tables(sweep, folder)
-    pictures = [path for path in drawn if path.suffix == ".png"]
     reports = [
-        report_tables.write_text(_html(sweep, pictures, tables), folder / "report.html"),
-        report_tables.write_text(_markdown(sweep, pictures, tables), folder / "report.md"),
+        report_tables.write_text(_html(sweep, drawn, tables), folder / "report.html"),
+        report_tables.write_text(_markdown(sweep, drawn, tables), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
 
 
-def _markdown(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
+def _full_sizes(drawn: list[Path]) -> dict[Path, str]:
+    """Every PNG, and the name of the file with its full size: the PDF where one was drawn."""
+    files = set(drawn)
+    return {
+        path: next(it.name for it in (path.with_suffix(".pdf"), path) if it in files)
+        for path in drawn
+        if path.suffix == ".png"
+    }
+
+
+def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     """The report as text: answers, verdicts, warnings, figures, tables, provenance."""
     judged = tables.verdicts
     lines = [f"# {report_tables.markdown_text(sweep.name)}", ""]
@@ -175,10 +184,11 @@ def _markdown(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
     else:
         lines.append(report_verdicts.NO_VERDICT)
     lines += ["", "## Warnings", "", _count(sweep), "", *_list(missing(sweep)), "", "## Figures", ""]
-    for path in pictures:
+    for path in _full_sizes(drawn):
         lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
-    for heading, table in tables.shown:
-        lines += [f"## {heading}", "", report_tables.markdown(table), ""]
+    for it in tables.shown:
+        lines += [f"## {it.heading}", "", report_tables.markdown(it.table), ""]
+        lines += [it.note, ""] if it.note else []
     provenance = "\n".join(_provenance(sweep)).splitlines()
     return "\n".join([*lines, "## Provenance", "", *(f"    {line}" for line in provenance)])
 
@@ -279,21 +289,31 @@ def _count(sweep: Sweep) -> str:
     return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
-def _html(sweep: Sweep, pictures: list[Path], tables: Tables) -> str:
-    """The page: answers, verdicts, warnings, figures, tables, settings, provenance."""
+def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
+    """The page: answers, verdicts, warnings and the first figures; all else is folded."""
     failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
     sentences = [_count(sweep), *missing(sweep)]
+    figures = _full_sizes(drawn)
+    first = {path: file for path, file in figures.items() if SKETCHED.fullmatch(path.stem)}
+    further = {path: file for path, file in figures.items() if path not in first}
+    settings = report_page.verbatim(sweep.grid) + report_page.verbatim(_settings(sweep))
     sections = [
         Section("Warnings", report_page.items(sentences, kind="failed" if failed else "plain")),
-        Section("Figures", "\n".join(report_page.figure(path, _caption(path)) for path in pictures)),
-        *(Section(heading, report_page.table(table)) for heading, table in tables.shown),
-        Section("Settings", report_page.verbatim(sweep.grid) + report_page.verbatim(_settings(sweep))),
-        Section("Provenance", report_page.verbatim("\n".join(_provenance(sweep)))),
+        Section("Figures", _figures(first)),
+        *([Section("More figures", _figures(further), folded=True)] if further else []),
+        *(Section(it.heading, report_page.table(it.table, it.note), folded=True) for it in tables.shown),
+        Section("Settings", settings, folded=True),
+        Section("Provenance", report_page.verbatim("\n".join(_provenance(sweep))), folded=True),
     ]
     goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
     return report_page.page(
         sweep.name, _opening(tables.verdicts), sections, reload_seconds=RELOAD_SECONDS if goes_on else None
     )
+
+
+def _figures(figures: Mapping[Path, str]) -> str:
+    """Figures with their captions, as HTML."""
+    return "\n".join(report_page.figure(path, _caption(path), file) for path, file in figures.items())
 
 
 def _opening(judged: pd.DataFrame) -> str:

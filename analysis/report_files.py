@@ -12,13 +12,35 @@ import pandas as pd
 from recrl.analysis import report_tables
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.data.validity import curriculum_flags
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import verdicts
 
 BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
+
+TIES = (
+    f"P(higher return): a tie counts half. Returns tie within {OPTIMAL_GAP} of each other where the optimum "
+    "is known, as for solved; elsewhere only where they differ by rounding."
+)
+
+
+@dataclass(frozen=True)
+class ShownTable:
+    """A table of the report.
+
+    Attributes:
+        heading: its title.
+        table: finished text.
+        note: a sentence below it, or empty.
+    """
+
+    heading: str
+    table: pd.DataFrame
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -27,11 +49,11 @@ class Tables:
 
     Attributes:
         verdicts: of ``verdicts.verdicts``; empty before a trial is complete.
-        shown: the tables for people, as text, with their headings.
+        shown: the tables for people.
     """
 
     verdicts: pd.DataFrame = field(default_factory=pd.DataFrame)
-    shown: Sequence[tuple[str, pd.DataFrame]] = ()
+    shown: Sequence[ShownTable] = ()
 
 
 def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
@@ -58,17 +80,18 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     compared = metrics.comparisons(rows, generator)
     weighed = claims.weigh(rows)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
-    judged = verdicts(rows, compared)
+    judged = verdicts(rows, compared, curriculum_flags(sweep))
     outcomes = _outcome_tables(averaged)
-    latex = [f"% {heading}.\n{report_tables.latex(table)}\n" for heading, table in outcomes]
+    latex = [f"% {it.heading}.\n{report_tables.latex(it.table)}\n" for it in outcomes]
     shown = [*outcomes, *_comparison_tables(compared)]
     if len(weighed):
         written.append(report_tables.write_csv(weighed, folder / "claims.csv"))
-        shown.append(("What the paper says of these maps", claims.claims_table(weighed)))
+        shown.append(ShownTable("What the paper says of these maps", claims.claims_table(weighed)))
     for i, costs in enumerate(bounds):
         which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
         if len(costs):
-            shown.append((f"Cumulative cost of training against its bounds{which}", bound_table(costs)))
+            heading = f"Cumulative cost of training against its bounds{which}"
+            shown.append(ShownTable(heading, bound_table(costs)))
     written += [
         report_tables.write_csv(judged, folder / "verdicts.csv"),
         report_tables.write_csv(rows, folder / "outcomes.csv"),
@@ -80,18 +103,20 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     return written, Tables(judged, shown)
 
 
-def _outcome_tables(averaged: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+def _outcome_tables(averaged: pd.DataFrame) -> list[ShownTable]:
     """The outcomes, those of the final policy first."""
     tables = [(measure, report_tables.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
-    return [(_heading(measure), table) for measure, table in tables if len(table)]
+    return [ShownTable(_heading(measure), table) for measure, table in tables if len(table)]
 
 
-def _comparison_tables(compared: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+def _comparison_tables(compared: pd.DataFrame) -> list[ShownTable]:
     """Differences to the agent without a curriculum, those of the final policy first."""
     if not len(compared):
         return []
     return [
-        (f"{_heading(measure)}, minus none", report_tables.comparison_table(compared, measure))
+        ShownTable(
+            f"{_heading(measure)}, minus none", report_tables.comparison_table(compared, measure), TIES
+        )
         for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     ]
 

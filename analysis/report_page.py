@@ -1,7 +1,7 @@
 """A sweep's report as one self-contained HTML page: nothing is fetched, no script runs, it prints.
 
-Figures are embedded PNGs. What is too wide for a phone scrolls by itself, so that the page never does; in
-print it shrinks instead. All text is escaped.
+Figures are embedded PNGs; a click magnifies one. What is too wide for a phone scrolls by itself, so that the
+page never does; in print it shrinks instead, and what is folded is printed as well. All text is escaped.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ STYLE = """\
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
 body { font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; background: #fff; margin: 0 auto;
-       max-width: 70rem; padding: 1rem; overflow-wrap: anywhere; }
+       max-width: 74rem; padding: 1rem; overflow-wrap: anywhere; }
 h1 { font-size: 1.6rem; line-height: 1.2; margin: 0.5rem 0; }
 h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; border-top: 1px solid #ddd; padding-top: 1rem; }
-nav a { display: inline-block; margin: 0 1rem 0.3rem 0; }
 a { color: #00548f; }
 figure { margin: 1rem 0; }
-figure img { width: 100%; min-width: 42rem; height: auto; display: block; }
+figure img { width: 100%; min-width: 42rem; height: auto; display: block; cursor: zoom-in; }
+figure input { position: absolute; opacity: 0; }
+figure input:focus-visible + .scroll { outline: 2px solid #00548f; }
+figure input:checked + .scroll img { width: 250%; min-width: 105rem; cursor: zoom-out; }
 figcaption { color: #555; font-size: 0.85rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
@@ -32,13 +34,17 @@ th, td { text-align: left; overflow-wrap: normal; padding: 0.2rem 0.6rem 0.2rem 
          border-bottom: 1px solid #e6e6e6; }
 th { border-bottom: 2px solid #999; vertical-align: bottom; }
 pre { font-size: 0.8rem; background: #f6f6f6; padding: 0.6rem; overflow-x: auto; }
+details { border-top: 1px solid #ddd; padding: 0.5rem 0; }
 summary { cursor: pointer; }
+summary h2 { display: inline; font-size: 1rem; border: 0; }
 .answers { font-size: 1.1rem; padding-left: 1.2rem; }
-.notes { color: #555; font-size: 0.85rem; padding-left: 1.2rem; }
+.notes { color: #555; font-size: 0.85rem; }
+ul.notes { padding-left: 1.2rem; }
 tr.solved td.verdict { background: #e3f1e3; }
 tr.infeasible td { background: #fbe9e7; }
 tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
 .verdicts td.verdict { white-space: normal; min-width: 13rem; }
+.verdicts td:last-child { white-space: normal; min-width: 9rem; }
 .verdicts th { white-space: normal; }
 @media screen and (max-width: 44rem) {
   .verdicts td.verdict { min-width: 7rem; }
@@ -49,10 +55,11 @@ tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
 @media print {
   @page { margin: 14mm; }
   body { font-size: 10pt; max-width: none; padding: 0; }
-  nav { display: none; }
   .scroll, pre { overflow: visible; }
-  figure img { min-width: 0; }
-  .verdicts td.verdict { min-width: 0; }
+  figure img, figure input:checked + .scroll img { width: 100%; min-width: 0; }
+  figcaption a { display: none; }
+  details::details-content { content-visibility: visible; block-size: auto; }
+  .verdicts td { min-width: 0 !important; }
   tr { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
   table { font-size: 6.5pt; width: 100%; }
   th, td { white-space: normal; padding-right: 0.3rem; }
@@ -70,10 +77,20 @@ class Section:
     Attributes:
         heading: its title.
         body: HTML, made by the functions below.
+        folded: whether only the heading shows until somebody opens it.
     """
 
     heading: str
     body: str
+    folded: bool = False
+
+    @property
+    def html(self) -> str:
+        """The part with its heading."""
+        heading = f"<h2>{escape(self.heading)}</h2>"
+        if self.folded:
+            return f"<details><summary>{heading}</summary>\n{self.body}\n</details>"
+        return f"<section>{heading}\n{self.body}\n</section>"
 
 
 def page(title: str, opening: str, sections: Sequence[Section], *, reload_seconds: int | None = None) -> str:
@@ -82,14 +99,9 @@ def page(title: str, opening: str, sections: Sequence[Section], *, reload_second
     Args:
         title: of the page.
         opening: HTML below it.
-        sections: its other parts, listed below the opening.
+        sections: its other parts.
         reload_seconds: an open page loads itself again so often; None if nothing will change.
     """
-    links = "".join(f'<a href="#s{index}">{escape(it.heading)}</a> ' for index, it in enumerate(sections))
-    parts = [
-        f'<section id="s{index}"><h2>{escape(it.heading)}</h2>\n{it.body}\n</section>'
-        for index, it in enumerate(sections)
-    ]
     reload = f'<meta http-equiv="refresh" content="{reload_seconds}">' if reload_seconds else ""
     return "\n".join(
         [
@@ -97,26 +109,34 @@ def page(title: str, opening: str, sections: Sequence[Section], *, reload_second
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<link rel="icon" href="data:,">{reload}',
             f"<title>{escape(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>",
-            f"<h1>{escape(title)}</h1>\n{opening}\n<nav>{links}</nav>",
-            *parts,
+            f"<h1>{escape(title)}</h1>\n{opening}",
+            *(it.html for it in sections),
             "</body>\n</html>",
         ]
     )
 
 
-def figure(png: Path, caption: str) -> str:
-    """An embedded PNG, as wide as the page but never too small to read."""
+def figure(png: Path, caption: str, file: str) -> str:
+    """An embedded PNG, as wide as the page but never too small to read; a click magnifies it.
+
+    Args:
+        png: the picture.
+        caption: below it.
+        file: the name of the file beside the page that the caption leads to.
+    """
     data = base64.b64encode(png.read_bytes()).decode()
-    text = escape(caption)
+    text, name = escape(caption), escape(file)
     return (
-        f'<figure><div class="scroll"><img src="data:image/png;base64,{data}" alt="{text}"></div>'
-        f"<figcaption>{text}</figcaption></figure>"
+        f'<figure><label><input type="checkbox" aria-label="magnify"><div class="scroll">'
+        f'<img src="data:image/png;base64,{data}" alt="{text}"></div></label>'
+        f'<figcaption>{text}. <a href="{name}">{name}</a></figcaption></figure>'
     )
 
 
-def table(frame: pd.DataFrame) -> str:
-    """A table of finished text."""
-    return _table(frame, [""] * len(frame), "")
+def table(frame: pd.DataFrame, note: str = "") -> str:
+    """A table of finished text, and a sentence below it."""
+    below = f'\n<p class="notes">{escape(note)}</p>' if note else ""
+    return _table(frame, [""] * len(frame), "") + below
 
 
 def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:

@@ -8,11 +8,21 @@ from collections.abc import Sequence
 import pandas as pd
 
 from recrl.analysis.report_tables import DASH, number, with_error, with_interval
-from recrl.analysis.statistics.feasibility import COST_TOLERANCE, OPTIMAL_GAP
+from recrl.analysis.statistics.feasibility import COST_TOLERANCE, OPTIMAL_GAP, is_cost
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
 SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
+WARNINGS = {
+    "no_curriculum": (
+        "curriculum without effect",
+        "Curriculum without effect: the measured d_t is not above d_d, so the limit was d_d from the start.",
+    ),
+    "hard_landing": (
+        "hard landing",
+        "Hard landing: more than 10% of the way from d_t to d_d was left when deployment began.",
+    ),
+}
 NO_VERDICT = "No trial is complete yet: no verdict."
 
 
@@ -26,14 +36,18 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     if not verdicts["exact"].all():
         sampled = int(verdicts.loc[~verdicts["exact"], "episodes"].min())
         how = f"means over {sampled} episodes, or exact where the task is finite"
-    interval = ", with its 95% interval (Student's t)" if (verdicts["seeds"] > 1).any() else ""
+    several = bool((verdicts["seeds"] > 1).any())
+    interval = ", with its 95% interval (Student's t)" if several else ""
+    errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
     return [
         f"The verdict, the return and the cost are those of the final policy, without learning: {how}.",
+        *errors,
         f"Solved: feasible, and within {OPTIMAL_GAP} of the constrained optimum, where that is known.",
         f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error.",
         "The return of an infeasible policy may be above the optimum: it is no success.",
         f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
+        *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
     ]
 
 
@@ -43,22 +57,26 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
     Args:
         verdicts: of ``verdicts.verdicts``.
     """
-    costs = [str(name) for name in verdicts if str(name).startswith("cost_")]
+    costs = [str(name) for name in verdicts if is_cost(str(name))]
+    warned = bool(verdicts[list(WARNINGS)].to_numpy().any())
     lines = []
     for _, row in verdicts.iterrows():
         line = {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
         line["verdict"] = verdict_text(row)
+        if warned:
+            line["warning"] = warning_text(row)
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         all_infeasible = row["infeasible"] == row["seeds"]  # more return is then no gain
         line["difference to none"] = DASH if all_infeasible else with_interval(row, "return_difference")
         line["optimum"] = number(row["optimal_return"])
         for name in costs:
             title = "cost" if len(costs) == 1 else f"cost {int(name[5:]) + 1}"
-            line[title] = with_error(row[name], math.nan, digits=3)
+            line[title] = with_error(row[name], row[f"{name}_se"], digits=3)
             line[f"limit of {title}" if len(costs) > 1 else "limit"] = number(row[f"deploy_limit_{name[5:]}"])
         line["n"] = str(row["seeds"])
-        deployed = [with_error(row[f"deployment_{name}"], math.nan, digits=3) for name in costs]
-        line[DEPLOYMENT] = f"return {number(row['deployment_return'])}, cost {', '.join(deployed)}"
+        earned = with_error(row["deployment_return"], row["deployment_return_se"])
+        paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"], digits=3) for it in costs]
+        line[DEPLOYMENT] = f"return {earned}, cost {', '.join(paid)}"
         lines.append(line)
     return pd.DataFrame(lines)
 
@@ -95,6 +113,17 @@ def verdict_text(row: pd.Series) -> str:
     names = {FEASIBLE: "feasible, not solved" if counts[SOLVED] else FEASIBLE}
     texts = [f"{names.get(kind, kind)} {count} of {seeds}" for kind, count in counts.items() if count]
     return "; ".join(texts) + (f", by up to {excess}" if counts[INFEASIBLE] else "")
+
+
+def warning_text(row: pd.Series) -> str:
+    """One row's warnings about its curriculum, with counts where not all seeds have them.
+
+    >>> warning_text(pd.Series({"seeds": 5, "no_curriculum": 1, "hard_landing": 5}))
+    'curriculum without effect 1 of 5; hard landing'
+    """
+    seeds = row["seeds"]
+    parts = [(name, row[flag]) for flag, (name, _) in WARNINGS.items() if row[flag]]
+    return "; ".join(name if count == seeds else f"{name} {count} of {seeds}" for name, count in parts)
 
 
 def answers(verdicts: pd.DataFrame) -> list[str]:

@@ -62,9 +62,9 @@ from recrl.teachers.windows import WindowStatistics, extend, last_two_windows
 
 
 def has_converged(new: float, old: float, *, tolerance: float, floor: float) -> bool:
-    """Whether a mean has converged: |new - old| <= eps max(|old|, floor).
+    """Whether a mean has converged: abs(new - old) <= eps max(abs(old), floor).
 
-    Algorithm 2, line 5, |new / old - 1| <= eps, corrected for means at or near zero.
+    Algorithm 2, line 5, abs(new / old - 1) <= eps, corrected for means at or near zero.
 
     Args:
         new: mean over the last window.

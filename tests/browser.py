@@ -50,6 +50,10 @@ STICKS_OUT = """
   return true;
 }).map(it => it.tagName + ' ' + (it.textContent || it.alt || '').slice(0, 60))
 """
+UNFOLD = """
+document.querySelectorAll('details').forEach(it => { it.open = true; });
+document.querySelectorAll('input').forEach(it => { it.checked = true; });
+"""
 
 
 class Browser:
@@ -131,11 +135,7 @@ def _at_size(
         mobile=scale > 2.0,
     )
     page.open(address)
-    wide = page.value("document.documentElement.scrollWidth")
-    if wide > width:
-        yield f"{shot.stem}: the page is {wide} wide, the window {width}"
-    for what in page.value(STICKS_OUT):
-        yield f"{shot.stem}: sticks out: {what}"
+    yield from _too_wide(page, shot.stem, width)
     for event in page.events:
         method, said = event["method"], event.get("params", {})
         if method in ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded"):
@@ -151,6 +151,16 @@ def _at_size(
         clip={"x": 0, "y": 0, "width": width, "height": tall, "scale": 1.0 / scale},
     )
     shot.write_bytes(base64.b64decode(picture["data"]))
+    page.ask("Runtime.evaluate", expression=UNFOLD)
+    yield from _too_wide(page, f"{shot.stem}, all unfolded and magnified", width)
+
+
+def _too_wide(page: Browser, what: str, width: int) -> Iterator[str]:
+    wide = page.value("document.documentElement.scrollWidth")
+    if wide > width:
+        yield f"{what}: the page is {wide} wide, the window {width}"
+    for element in page.value(STICKS_OUT):
+        yield f"{what}: sticks out: {element}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

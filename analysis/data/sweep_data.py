@@ -37,6 +37,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,7 @@ class TrialFacts:
     provenance: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sweep:
     """The frames of one sweep; the module's docstring lists their columns.
 
@@ -121,6 +122,7 @@ class Sweep:
         facts: the trials themselves, in the order of the grid.
         grid: the grid file of the last launch, or empty.
         notes: sentences on what a reader of the frames must know, for example an unknown optimum.
+        folder: of the sweep's files, or None where the frames come from an export or from MLflow.
     """
 
     name: str
@@ -133,6 +135,14 @@ class Sweep:
     facts: tuple[TrialFacts, ...] = ()
     grid: str = ""
     notes: tuple[str, ...] = ()
+    folder: Path | None = None
+
+    def __repr__(self) -> str:
+        statuses = ", ".join(
+            f"{count} {name}" for name, count in self.trials["status"].value_counts().items()
+        )
+        trials = f"{len(self.trials)} trials{f' ({statuses})' if statuses else ''}"
+        return f"<Sweep {self.name}: {trials}; data frames trials, {', '.join(ROWS)}>"
 
     @property
     def num_costs(self) -> int:
@@ -187,13 +197,14 @@ def load(store: SweepStore) -> Sweep:
     specs, trials = _trials(store)
     read = [_read(spec, trial) for spec, trial in zip(specs, trials, strict=True)]
     grid, problem = store.grid_text()
-    return assemble(
+    sweep = assemble(
         store.name,
         [facts for facts, _ in read],
         {name: joined([rows[name] for _, rows in read]) for name in ROWS},
         grid=grid,
         notes=[problem] if problem else [],
     )
+    return replace(sweep, folder=store.folder)
 
 
 def load_episodes(

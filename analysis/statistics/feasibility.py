@@ -54,6 +54,17 @@ def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
     return near & within_limits(rows)
 
 
+def tie(optimal_return: float) -> float:
+    """How far apart two equal returns may be: OPTIMAL_GAP where J*(d_d) is known, elsewhere ROUNDING.
+
+    Policies with softmax outputs that have all found one path differ by what other actions keep.
+
+    Args:
+        optimal_return: J*(d_d); NaN if it is not known, minus infinity if no policy is feasible.
+    """
+    return (OPTIMAL_GAP if math.isfinite(optimal_return) else 0.0) + ROUNDING
+
+
 def costs_of(rows: pd.DataFrame) -> list[str]:
     """Which i have a column deploy_limit_i."""
     names = [str(name) for name in rows]

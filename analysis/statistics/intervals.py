@@ -128,18 +128,20 @@ def performance_profile(scores: Floats, thresholds: Floats) -> Floats:
     return np.asarray(np.mean(scores[..., None] > thresholds, axis=(-3, -2)))
 
 
-def probability_of_improvement(scores: Floats, others: Floats) -> Floats:
+def probability_of_improvement(scores: Floats, others: Floats, *, tie: float = 0.0) -> Floats:
     """P(X > Y): mean over tasks and pairs of runs of 1[x > y] + 1[x = y] / 2 (Mann-Whitney's U / n n').
 
     Args:
         scores: x, [..., n, m].
         others: y, [..., n', m].
+        tie: values at most this far apart count as equal, at least 0.
 
     Returns:
         [...], in [0, 1]; 1/2 means that neither is better.
     """
     difference = scores[..., :, None, :] - others[..., None, :, :]
-    return np.asarray(np.mean((np.sign(difference) + 1.0) / 2.0, axis=(-3, -2, -1)))
+    higher = np.where(np.abs(difference) <= tie, 0.5, difference > 0.0)
+    return np.asarray(np.mean(higher, axis=(-3, -2, -1)))
 
 
 def stratified_bootstrap(
@@ -168,6 +170,7 @@ def improvement_interval(
     others: Floats,
     generator: np.random.Generator,
     *,
+    tie: float = 0.0,
     confidence: float = CONFIDENCE,
     replications: int = REPLICATIONS,
 ) -> Interval:
@@ -177,13 +180,14 @@ def improvement_interval(
         scores: x, [n, m].
         others: y, [n', m].
         generator: draws the resamples.
+        tie: values at most this far apart count as equal, at least 0.
         confidence: of the interval, in (0, 1).
         replications: r, number of resamples.
     """
     replicated = probability_of_improvement(
-        _resampled(scores, generator, replications), _resampled(others, generator, replications)
+        _resampled(scores, generator, replications), _resampled(others, generator, replications), tie=tie
     )
-    estimate = float(probability_of_improvement(scores, others))
+    estimate = float(probability_of_improvement(scores, others, tie=tie))
     return _percentile_interval(estimate, replicated, min(len(scores), len(others)), confidence)
 
 

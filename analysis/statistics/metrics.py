@@ -17,7 +17,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.statistics.feasibility import costs_of, is_cost, optimal, within_limits
+from recrl.analysis.statistics.feasibility import costs_of, is_cost, optimal, tie, within_limits
 from recrl.analysis.statistics.intervals import (
     Interval,
     improvement_interval,
@@ -171,8 +171,9 @@ def comparisons(
     Returns:
         GROUP, measure, pairs (seeds that both have), then mean paired differences to the baseline with
         Student's 95% interval: return_difference, _low, _high, and the same for cost_i_difference; then
-        improvement, the probability that a run returns more than one of the baseline's, with its
-        bootstrap interval _low, _high, and too_few_seeds (that interval is then too short).
+        improvement, the probability that a run returns more than one of the baseline's (ties count half:
+        ``feasibility.tie``), with its bootstrap interval _low, _high, and too_few_seeds (that interval is
+        then too short).
     """
     costs = [str(name) for name in rows if is_cost(str(name))]
     lines = []
@@ -195,6 +196,7 @@ def comparisons(
             chosen["episode_return"].to_numpy(np.float64)[:, None],
             others["episode_return"].to_numpy(np.float64)[:, None],
             generator,
+            tie=tie(float(chosen["optimal_return"].iloc[0])),
         )
         lines.append(line | _ends("improvement", improvement) | {"too_few_seeds": improvement.is_small})
     return pd.DataFrame(lines)

@@ -10,26 +10,28 @@ import math
 
 import pandas as pd
 
-from recrl.analysis.data.labels import GROUP
+from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.feasibility import is_cost
 from recrl.analysis.statistics.metrics import Measure
 
 FINAL = Measure.STOCHASTIC
 
 
-def verdicts(rows: pd.DataFrame, compared: pd.DataFrame) -> pd.DataFrame:
+def verdicts(rows: pd.DataFrame, compared: pd.DataFrame, flags: pd.DataFrame) -> pd.DataFrame:
     """Count the verdicts: a row a GROUP.
 
     Args:
         rows: of ``metrics.outcomes``.
         compared: of ``metrics.comparisons``, with the baseline ``none``.
+        flags: of ``validity.curriculum_flags``.
 
     Returns:
         GROUP, seeds, solved, feasible (the solved ones included), infeasible, worst_excess (the largest cost
         above its limit among the infeasible seeds, or NaN), worst_share (the same divided by that limit),
-        episode_return, episode_return_se and cost_i (means over seeds), deploy_limit_i, optimal_return,
-        exact (whether every seed is), episodes (of a seed), deployment_return, deployment_cost_i,
-        return_difference with _low and _high (NaN without a baseline).
+        episode_return and cost_i (means over seeds, with standard errors _se; NaN for one seed),
+        deploy_limit_i, optimal_return, exact (whether every seed is), episodes (of a seed),
+        deployment_return and deployment_cost_i (likewise, with _se), no_curriculum and hard_landing (seeds
+        that have the flag), return_difference with _low and _high (NaN without a baseline).
     """
     final = rows[rows["measure"] == FINAL.value]
     deployed = rows[rows["measure"] == Measure.DEPLOYMENT.value]
@@ -37,16 +39,20 @@ def verdicts(rows: pd.DataFrame, compared: pd.DataFrame) -> pd.DataFrame:
     lines = []
     for group, seeds in final.groupby(list(GROUP), observed=True, sort=False):
         line = dict(zip(GROUP, group, strict=True)) | _counts(seeds) | _worst(seeds, costs)
-        line |= {name: seeds[name].mean() for name in ("episode_return", *costs)}
-        line["episode_return_se"] = seeds["episode_return"].sem()
+        for name in ("episode_return", *costs):
+            line |= {name: seeds[name].mean(), f"{name}_se": seeds[name].sem()}
         constant = ["optimal_return", *(f"deploy_{name.replace('cost', 'limit')}" for name in costs)]
         line |= {name: seeds[name].iloc[0] for name in constant}
         line |= {"exact": bool(seeds["exact"].all()), "episodes": int(seeds["episodes"].min())}
         lines.append(line)
     table = pd.DataFrame(lines, columns=None if lines else [*GROUP])
     renamed = {"episode_return": "deployment_return"} | {name: f"deployment_{name}" for name in costs}
-    beside = deployed.groupby(list(GROUP), observed=True)[["episode_return", *costs]].mean()
-    table = table.merge(beside.rename(columns=renamed).reset_index(), on=list(GROUP), how="left")
+    beside = deployed.rename(columns=renamed).groupby(list(GROUP), observed=True)[list(renamed.values())]
+    for statistics in (beside.mean(), beside.sem().add_suffix("_se")):
+        table = table.merge(statistics.reset_index(), on=list(GROUP), how="left")
+    flagged = final[list(KEY)].merge(flags, on=list(KEY))
+    counts = flagged.groupby(list(GROUP), observed=True)[["no_curriculum", "hard_landing"]].sum()
+    table = table.merge(counts.reset_index(), on=list(GROUP), how="left")
     return table.merge(_differences(compared), on=list(GROUP), how="left")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+from pydantic import BaseModel
 from rich.console import Console
 
 from recrl.environments.plugins import UntrustedNameError
@@ -12,7 +13,7 @@ from recrl.orchestrator.cli.output import say
 from recrl.orchestrator.cli.requests import ListRequest, OptionsRequest, SchemaRequest
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.grid.catalogue import KINDS, Kind, kinds_of, listed, options_of
+from recrl.orchestrator.grid.catalogue import KINDS, SECTIONS, Kind, kinds_of, listed, options_of
 from recrl.orchestrator.grid.json_schema import grid_schema
 
 
@@ -25,17 +26,26 @@ def run_list(request: ListRequest, console: Console) -> ExitCode:
 
 
 def run_options(request: OptionsRequest, console: Console) -> ExitCode:
-    """List the options of a task, an agent or a curriculum."""
-    for kind in _kinds(request.name):
-        say(console, f"{request.name}, in a grid's {kind.section}: {kind.summary(request.name)}\n")
-        options = options_of(kind, request.name)
-        rows = [(it.name, it.type, it.default, it.description) for it in options]
-        if rows:
-            columns = ("option", "type", "default", "description")
-            console.print(display.folded_table(columns, rows, width=console.width))
-        else:
-            say(console, "It has no options that recrl knows of.")
+    """List the options of a task, an agent, a curriculum or a section of the grid."""
+    name = request.name
+    if name in SECTIONS:
+        where = "at a grid's top level, or at a task" if name == "limits" else "a section of a grid"
+        say(console, f"{name}, {where}: {SECTIONS[name].__doc__}\n")
+        _print_options(SECTIONS[name], console)
+        return ExitCode.OK
+    for kind in _kinds(name):
+        say(console, f"{name}, in a grid's {kind.section}: {kind.summary(name)}\n")
+        _print_options(kind.model(name), console)
     return ExitCode.OK
+
+
+def _print_options(model: type[BaseModel], console: Console) -> None:
+    rows = [(it.name, it.type, it.default, it.description) for it in options_of(model)]
+    if rows:
+        columns = ("option", "type", "default", "description")
+        console.print(display.folded_table(columns, rows, width=console.width))
+    else:
+        say(console, "It has no options that recrl knows of.")
 
 
 def _kinds(name: str) -> list[Kind]:

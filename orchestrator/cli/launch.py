@@ -151,13 +151,17 @@ def _say_starting(request: LaunchRequest, console: Console) -> None:
 
 def _say_results(sweep: Sweep, console: Console) -> None:
     """Print what the final policies earn and cost."""
+    from recrl.analysis.data.validity import curriculum_warnings  # noqa: PLC0415
     from recrl.orchestrator.cli.result_table import CAPTION, result_table  # noqa: PLC0415
 
     table = result_table(sweep)
     if len(table):
         say(console, "")
         show(table, console)
-        say(console, f"{CAPTION}\n")
+        say(console, CAPTION)
+        for sentence in curriculum_warnings(sweep):
+            say(console, f"warning: {sentence}")
+        say(console, "")
 
 
 def _draw_at_end(sweep: Sweep, store: SweepStore, console: Console) -> None:

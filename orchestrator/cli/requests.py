@@ -406,9 +406,12 @@ class ListRequest(Request):
 
 @dataclass(frozen=True)
 class OptionsRequest(Request):
-    """List the options of a task, an agent or a curriculum."""
+    """List the options of a task, an agent, a curriculum or a section of the grid."""
 
-    name: str = by_place(metavar="NAME", help="as 'list' shows it, or package.module:attribute")
+    name: str = by_place(
+        metavar="NAME",
+        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits",
+    )
     trust: bool = by_flag(**_TRUST)
 
 

@@ -8,6 +8,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.data.validity import curriculum_flags
 from recrl.analysis.report_tables import number, with_error
 from recrl.analysis.report_verdicts import verdict_text
 from recrl.analysis.statistics.metrics import outcomes
@@ -27,7 +28,7 @@ def result_table(sweep: Sweep) -> pd.DataFrame:
     """
     if sweep.evaluations.empty:
         return pd.DataFrame()
-    rows = verdicts(outcomes(sweep), pd.DataFrame())
+    rows = verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep))
     return pd.DataFrame([_line(row, sweep.num_costs) for _, row in rows.iterrows()])
 
 

@@ -15,7 +15,11 @@ from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusReq
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.code_changes import no_curriculum_sentence
+from recrl.orchestrator.files.curriculum_warnings import (
+    hard_landing_sentence,
+    landed_hard,
+    no_curriculum_sentence,
+)
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import make_plan
@@ -44,12 +48,26 @@ def run_status(request: StatusRequest, console: Console) -> ExitCode:
     for problem in store.damages():
         say(console, f"damaged: {problem}")
     say_other_code(make_plan(specs, store), console)
-    none = [
-        trial.spec.title for trial in now.trials if trial.spec.is_no_curriculum(trial.record.start_limits)
-    ]
-    if sentence := no_curriculum_sentence(none):
-        say(console, f"warning: {sentence}")
+    _warn_of_curricula(now, store, console)
     return ExitCode.OK
+
+
+def _warn_of_curricula(now: SweepProgress, store: SweepStore, console: Console) -> None:
+    """Print the warnings about curricula that had no effect or ended far above d_d."""
+    none = [it.spec.title for it in now.trials if it.spec.is_no_curriculum(it.record.start_limits)]
+    hard = [it.spec.title for it in now.trials if landed_hard(it.spec, _events(it, store))]
+    for sentence in filter(None, (no_curriculum_sentence(none), hard_landing_sentence(hard))):
+        say(console, f"warning: {sentence}")
+
+
+def _events(trial: TrialProgress, store: SweepStore) -> list[str]:
+    """The names of the events of a trial in its deployment phase; none of a damaged one."""
+    if trial.record.env_steps < trial.spec.train_steps:
+        return []
+    try:
+        return [str(event.get("event")) for event in store.trial(trial.spec).events()]
+    except StorageError:
+        return []
 
 
 def run_check(request: CheckRequest, console: Console) -> ExitCode:

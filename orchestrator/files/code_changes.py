@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import importlib.machinery
 import importlib.util
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
 
 OURS = "recrl"
-NAMED = 5  # trials in a sentence, at most
 FOLDERS = ("agents", "environments", "teachers")
 MODULES = ("trial/trial.py", "trial/runner.py", "spec.py")  # of the orchestrator
 SUFFIXES = (".py", ".xml", ".txt")  # of what results depend on
@@ -98,18 +97,6 @@ def other_code_sentence(complete: int, begun: int) -> str:
     return (
         f"{' and '.join(parts)} {comes} from other code than is installed now; launch --rerun-changed runs "
         f"{them} again"
-    )
-
-
-def no_curriculum_sentence(titles: Sequence[str]) -> str:
-    """What is said of trials whose measured d_t is not above d_d; empty for none."""
-    if not titles:
-        return ""
-    named = ", ".join(titles[:NAMED])
-    more = f" and {len(titles) - NAMED} more" if len(titles) > NAMED else ""
-    return (
-        f"the measured d_t is not above d_d, so that the curriculum is none: {named}{more}; give a finite "
-        "train_limits above d_d"
     )
 
 

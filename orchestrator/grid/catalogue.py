@@ -20,6 +20,7 @@ from recrl.agents.registry import AGENTS, find_agent
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import TASKS, find_task, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.grid.grid_file import Limits, Resources, Run
 from recrl.orchestrator.validation import model_in, nearest
 from recrl.teachers.registry import TEACHERS, find_teacher
 
@@ -105,6 +106,9 @@ KINDS: Mapping[str, Kind] = {
 }
 
 
+SECTIONS: Mapping[str, type[BaseModel]] = {"run": Run, "resources": Resources, "limits": Limits}
+
+
 def listed(kind: Kind) -> Iterator[tuple[str, str]]:
     """Every known name of a kind and its summary; of what cannot be loaded, why."""
     for name in kind.names:
@@ -124,10 +128,10 @@ def kinds_of(name: str) -> list[Kind]:
     if ":" not in name:
         found = [kind for kind in KINDS.values() if name in kind.names]
         if not found:
-            known = [known for kind in KINDS.values() for known in kind.names]
+            known = [*SECTIONS, *(known for kind in KINDS.values() for known in kind.names)]
             raise RecrlError(
                 f"no task, agent or curriculum is called {name!r}{nearest(name, known)}; "
-                "see recrl-sweep list tasks, list agents, list curricula"
+                f"see recrl-sweep list tasks, list agents, list curricula; or {', '.join(SECTIONS)}"
             )
         return found
     return [_kind_of_path(name)]
@@ -146,9 +150,8 @@ def _kind_of_path(path: str) -> Kind:
     raise RecrlError(f"{path!r} is no task, agent or curriculum: {reason}")
 
 
-def options_of(kind: Kind, name: str) -> list[Option]:
-    """Every option of a task, an agent or a curriculum, in the order of its model."""
-    model = kind.model(name)
+def options_of(model: type[BaseModel]) -> list[Option]:
+    """Every option of a task, an agent, a curriculum or a section, in the order of its model."""
     try:
         defaults: BaseModel | None = model.model_validate({})
     except ValidationError:  # something is required

@@ -21,13 +21,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from recrl.agents.registry import agent_config
+from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.plugins import UnknownNameError, UntrustedNameError, trusted_attribute
@@ -43,9 +45,10 @@ from recrl.orchestrator.grid.grid_file import (
 )
 from recrl.orchestrator.grid.grid_spec import GridSpec, TaskCell
 from recrl.orchestrator.located_yaml import Place, Problem, parse
-from recrl.orchestrator.spec import Choice
+from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.validation import nearest, sentences, shown
-from recrl.teachers.registry import teacher_config
+from recrl.teachers.registry import TEACHERS, make_teacher, teacher_config
+from recrl.teachers.teacher import checked_answer
 
 MAX_TRIALS = 100_000
 ROLLOUT_STEPS = 64  # by default: short rollouts of many environments make many updates
@@ -181,8 +184,33 @@ class _Check:
                 for value in (value for value in values if value not in known[key]):
                     hint = nearest(str(value), [str(name) for name in known[key]])
                     self._add(("exclude", index, key), f"this grid has no {key} {shown(value)}{hint}")
-        if not self.problems and not grid.trials():
+        trials = grid.trials() if not self.problems else []
+        if not self.problems and not trials:
             self._add(("exclude",), "leaves no trial at all")
+        self._build_own(grid, trials)
+
+    def _build_own(self, grid: GridSpec, trials: Sequence[TrialSpec]) -> None:
+        """Build the user's own agents, networks and curricula once on each task that they meet."""
+        cells = {cell.task.label: cell.task for cell in grid.tasks}
+        agents = {(it.task.label, it.agent.label): it for it in trials if _is_own_agent(it.agent)}
+        methods = {(it.task.label, it.method.label): it for it in trials if it.method.name not in TEACHERS}
+        for (task, label), spec in agents.items():
+            cmdp = make_vector(cells[task].name, 1, options=cells[task].options).cmdp
+            place = ("agents", [agent.label for agent in grid.agents].index(label))
+            with self._described(place, f"{label} cannot be built on {task}"):
+                make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
+        for (task, label), spec in methods.items():
+            place = ("methods", [method.label for method in grid.methods].index(label))
+            with self._described(place, f"{label} cannot be started on {task}"):
+                checked_answer(make_teacher(spec.teacher).start(), label, len(spec.deploy_limits))
+
+    @contextmanager
+    def _described(self, place: Place, what: str) -> Iterator[None]:
+        """Add what is raised meanwhile by the user's own code."""
+        try:
+            yield
+        except USERS_ERRORS as error:
+            self._add(place, f"{what}: {described(error)}")
 
     def _tasks(self) -> list[TaskCell]:
         """The tasks whose limits and rollouts are right."""
@@ -342,6 +370,10 @@ class _Check:
 
     def _add(self, place: Place, sentence: str) -> None:
         self.problems.append(Problem(self._document.line(place), place, sentence))
+
+
+def _is_own_agent(agent: Choice) -> bool:
+    return agent.name not in AGENTS or isinstance(agent.options.get("network"), str)
 
 
 def _valid(model: type[Model], value: Any) -> Model | None:

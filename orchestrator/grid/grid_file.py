@@ -165,9 +165,13 @@ class Limits(_Written):
     """The limits of a task's costs: one number for every cost, or a list with one number a cost."""
 
     train_limits: TrainLimits | None = Field(
-        default=None, description="d_t; 'auto', the default, lets the teacher measure its start."
+        default=None,
+        description="Training limits d_t: 'auto' (the default: the curriculum measures them), a number for "
+        "every cost, or a list.",
     )
-    deploy_limits: DeployLimits | None = Field(default=None, description="d_d.")
+    deploy_limits: DeployLimits | None = Field(
+        default=None, description="Deployment limits d_d: a number for every cost, or a list."
+    )
 
 
 class TaskEntry(Entry, Limits):

@@ -14,6 +14,7 @@ evaluated.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -217,10 +218,12 @@ class Trial:
         return checked_answer(answer, self.spec.method.label, self._cmdp.num_costs)
 
     def _warn_of_hard_landing(self) -> None:
-        """Record an event if deployment begins with limits that the agent was never near."""
+        """Record an event if much of the way from d_t to d_d is left when deployment begins."""
         before, after = self._step.limits, self.spec.deploy_limits
+        start = self._step.start_limits or self.spec.train_limits
         if any(
-            late > (1.0 + HARD_LANDING) * max(final, 1.0) for late, final in zip(before, after, strict=True)
+            late - final > HARD_LANDING * max(first - final if math.isfinite(first) else 0.0, final, 1.0)
+            for first, late, final in zip(start, before, after, strict=True)
         ):
             self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
 

@@ -7,9 +7,10 @@ import logging
 import re
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
 SOURCE = "grid"
+LINE_SECONDS = 60.0  # at most between two lines of progress
 
 
 def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
@@ -146,7 +148,8 @@ def train(
         train_limits: training limits d_t at the start, at least d_d, likewise; ``auto`` measures them.
         seed: of the trial, at least 0.
         folder: for the files, as a sweep of one trial; the same call continues from there. None for no files.
-        progress: whether to print a line that shows return and cost.
+        progress: whether to show return and cost: in place on a terminal, elsewhere in one line per tenth of
+            the updates.
         **run: other settings of a grid's section ``run``: ``deploy_fraction``, ``num_envs``,
             ``rollout_steps``, ``evaluation_episodes``.
 
@@ -190,10 +193,13 @@ def train(
             if trial.error_path.exists():
                 failed.add_note(trial.error_path.read_text())
             raise failed
-        return Training(sweep, policy_of(trial, seed=seed), folder=None if folder is None else trial.folder)
+        policy = policy_of(trial, seed=seed)
+        if folder is None:
+            return Training(replace(sweep, folder=None), policy, None)
+        return Training(sweep, policy, trial.folder)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Training:
     """Result of ``train``.
 
@@ -206,6 +212,10 @@ class Training:
     sweep: Sweep
     policy: Policy
     folder: Path | None
+
+    def __repr__(self) -> str:
+        place = f" in {self.folder}" if self.folder else ""
+        return f"<Training of {self.policy.spec.title}, {len(self.updates)} updates{place}>"
 
     @property
     def updates(self) -> pd.DataFrame:
@@ -257,25 +267,44 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class _Line(logging.Handler):
-    """Handler that shows the newest line of a trial's log in place."""
+class _LineInPlace(logging.Handler):
+    """Handler that shows the newest line of a trial's log in place, on a terminal."""
 
     def emit(self, record: logging.LogRecord) -> None:
         sys.stderr.write(f"\r{record.getMessage():<79.79}")
         sys.stderr.flush()
 
 
+class _PlainLines(logging.Handler):
+    """Handler that prints a line of a trial's log for each tenth of its updates, and after each minute."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._tenth, self._printed = -1, time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message, now = record.getMessage(), time.monotonic()
+        if not (update := re.match(r"update (\d+) of (\d+)", message)):
+            return
+        tenth = 10 * int(update[1]) // int(update[2])
+        if tenth > self._tenth or now > self._printed + LINE_SECONDS:
+            print(message, file=sys.stderr, flush=True)
+            self._tenth, self._printed = tenth, now
+
+
 @contextmanager
 def shown_progress(wanted: bool) -> Iterator[None]:
-    """Show the progress of a trial in this process, on one line of the standard error."""
+    """Show the progress of a trial in this process on the standard error: in place, or in plain lines."""
     if not wanted:
         yield
         return
-    trial, line = logging.getLogger("recrl.trial"), _Line()
+    in_place = sys.stderr.isatty()
+    trial, line = logging.getLogger("recrl.trial"), _LineInPlace() if in_place else _PlainLines()
     line.addFilter(lambda record: record.levelno == logging.INFO)
     trial.addHandler(line)
     try:
         yield
     finally:
         trial.removeHandler(line)
-        sys.stderr.write("\n")
+        if in_place:
+            sys.stderr.write("\n")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,11 +60,15 @@ def load_sweep(
         return sweep_data.load(sweep_store(Path(root), str(source)))
 
 
-def load_policy(trial: str | Path, *, seed: int | None = 0, trust: bool = False) -> Policy:
+def load_policy(
+    source: str | Path | Sweep, trial_id: str | None = None, *, seed: int | None = 0, trust: bool = False
+) -> Policy:
     """Load the policy of a trial's newest checkpoint.
 
     Args:
-        trial: the trial's folder, which ``recrl-sweep logs demo 3f2a --folder`` prints.
+        source: a sweep that ``load_sweep`` read from its folder; or the folder of a trial, which
+            ``recrl-sweep logs demo 3f2a --folder`` prints.
+        trial_id: of the sweep's trial, from the column ``trial_id`` of ``sweep.trials``.
         seed: of the policy's random numbers; None for a random one.
         trust: whether to follow the trial's import paths. This runs their code: do so only with files whose
             author you trust.
@@ -77,16 +81,32 @@ def load_policy(trial: str | Path, *, seed: int | None = 0, trust: bool = False)
 
     Example:
         >>> import recrl
-        >>> policy = recrl.load_policy("runs/demo/trials/...")          # doctest: +SKIP
+        >>> sweep = recrl.load_sweep("runs/demo")                      # doctest: +SKIP
+        >>> policy = recrl.load_policy(sweep, sweep.trials.trial_id[0])  # doctest: +SKIP
         >>> policy.act(observation, deterministic=True)                 # doctest: +SKIP
     """
     from recrl.orchestrator.files.trial_store import TrialStore  # noqa: PLC0415
 
-    folder = Path(trial)
+    folder = Path(source) if isinstance(source, str | Path) else _folder_of(source, trial_id)
     if not (folder / "spec.json").exists():
         raise RecrlError(f"{folder}: is not the folder of a trial; see recrl-sweep logs SWEEP TRIAL --folder")
     with following(trust):
         return policy_of(TrialStore(folder), seed=seed)
+
+
+def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
+    """The folder of a sweep's trial."""
+    if sweep.folder is None:
+        raise RecrlError(
+            f"{sweep.name}: an export and MLflow hold no policies; load the sweep from the folder it ran in"
+        )
+    spec = next((it.spec for it in sweep.facts if it.spec.trial_id == trial_id), None)
+    if spec is None:
+        raise RecrlError(f"{sweep.name}: has no trial {trial_id!r}; sweep.trials has the column trial_id")
+    folder = sweep.folder / "trials" / spec.folder_name
+    if not folder.exists():
+        raise RecrlError(f"{spec.title}: has not begun, so there is no policy yet")
+    return folder
 
 
 def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:
@@ -110,7 +130,7 @@ def following(trust: bool) -> Iterator[None]:
         raise RecrlError(str(error).replace("add --trust", "pass trust=True")) from error
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Policy:
     """A trained policy pi(a | s) that does not learn.
 
@@ -126,7 +146,10 @@ class Policy:
     cmdp: CMDPSpec
     spec: TrialSpec
     update: int
-    generator: np.random.Generator = field(repr=False)
+    generator: np.random.Generator
+
+    def __repr__(self) -> str:
+        return f"<Policy of {self.spec.title} after {self.update} of {self.spec.num_updates} updates>"
 
     def act(self, observation: npt.ArrayLike, deterministic: bool = False) -> Any:
         """Choose actions.

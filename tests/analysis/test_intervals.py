@@ -112,6 +112,16 @@ def test_probability_of_improvement_by_hand() -> None:
     assert probability_of_improvement(np.array([[1.0], [2.0]]), np.array([[0.0], [2.0]])) == 0.625
 
 
+def test_returns_within_the_tolerance_are_ties() -> None:
+    # 9.5 = 9.5 - 1e-9, 9.5 > 9: (1/2 + 1) / 2; without a tolerance the first counts as a gain
+    scores, others = np.array([[9.5]]), np.array([[9.5 - 1e-9], [9.0]])
+    assert probability_of_improvement(scores, others, tie=0.2) == 0.75
+    assert probability_of_improvement(others, scores, tie=0.2) == 0.25
+    assert probability_of_improvement(scores, others) == 1.0
+    interval = improvement_interval(scores, others[:1], generator(), tie=0.2)
+    assert interval.estimate == 0.5
+
+
 def test_improvement_over_oneself_is_a_half() -> None:
     assert probability_of_improvement(SCORES, SCORES) == 0.5
 

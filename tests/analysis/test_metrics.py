@@ -144,6 +144,15 @@ def test_comparisons_pair_equal_seeds(finished: Sweep) -> None:
     assert row["too_few_seeds"]
 
 
+def test_equally_good_policies_tie_where_the_optimum_is_known(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished).assign(episode_return=9.5)
+    rows.loc[rows["method"] == "linear", "episode_return"] += 1e-6
+    known = metrics.comparisons(rows, np.random.default_rng(0))
+    assert set(known["improvement"]) == {0.5}
+    unknown = metrics.comparisons(rows.assign(optimal_return=math.nan), np.random.default_rng(0))
+    assert set(unknown.loc[unknown["method"] == "linear", "improvement"]) == {1.0}
+
+
 def test_without_a_baseline_there_is_nothing_to_compare(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     assert not len(metrics.comparisons(rows, np.random.default_rng(0), baseline="absent"))

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from recrl.analysis import report_page, report_verdicts
+from recrl.analysis.data.labels import KEY
 from recrl.analysis.statistics.verdict_counts import verdicts
 
 NONE_COMPARED = pd.DataFrame()
@@ -46,7 +47,8 @@ ROWS = [
 
 
 def judged(rows: list[dict[str, object]]) -> pd.DataFrame:
-    return verdicts(pd.DataFrame(rows), NONE_COMPARED)
+    flags = pd.DataFrame(rows)[[*KEY, "measure"]].query("measure == 'stochastic'")[list(KEY)]
+    return verdicts(pd.DataFrame(rows), NONE_COMPARED, flags.assign(no_curriculum=False, hard_landing=False))
 
 
 def test_seeds_are_counted_by_the_final_policy_only() -> None:
@@ -74,12 +76,26 @@ def test_the_table_says_the_verdict_in_words() -> None:
     ]
     assert report_verdicts.verdict_kinds(judged(ROWS)) == ["feasible", "infeasible", "solved"]
     assert table["n"].tolist() == ["2", "2", "2"]
-    assert table[report_verdicts.DEPLOYMENT].iloc[0] == "return 2.00, cost 50.000"
+    assert table[report_verdicts.DEPLOYMENT].iloc[0] == "return 2.00 ± 1.00, cost 50.000 ± 0.000"
+    assert table["cost"].tolist() == ["2.500 ± 2.500", "6.500 ± 0.500", "5.000 ± 0.000"]
+
+
+def test_warnings_stand_beside_the_verdict_they_concern() -> None:
+    table = judged(ROWS)
+    assert "warning" not in report_verdicts.verdict_table(table)
+    table.loc[table["method"] == "dynamic", ["no_curriculum", "hard_landing"]] = [1, 2]
+    shown = report_verdicts.verdict_table(table)
+    assert shown["warning"].tolist() == ["", "", "curriculum without effect 1 of 2; hard landing"]
+    assert list(shown).index("warning") == list(shown).index("verdict") + 1
+    assert "Hard landing: more than 10% of the way" in report_verdicts.explanation(table)[-1]
 
 
 def test_one_seed_has_no_interval() -> None:
     table = report_verdicts.verdict_table(judged(ROWS[:1]))
     assert table["return"].tolist() == ["-20.00"]
+    assert table["cost"].tolist() == ["0.000"]
+    deployed = report_verdicts.verdict_table(judged([ROWS[0], ROWS[6]]))[report_verdicts.DEPLOYMENT]
+    assert deployed.tolist() == ["return 1.00, cost 50.000"]
     assert table["verdict"].tolist() == ["feasible"]
 
 

@@ -86,7 +86,7 @@ def test_every_option_is_described(capsys: pytest.CaptureFixture[str], name: str
     from recrl.orchestrator.grid.catalogue import kinds_of, options_of  # noqa: PLC0415
 
     (kind,) = kinds_of(name)
-    for option in options_of(kind, name):
+    for option in options_of(kind.model(name)):
         assert option.description, f"{name}: {option.name}"
         assert not re.search(r"[<\[]|typing|None", option.type), f"{name}: {option.name}: {option.type}"
 
@@ -96,6 +96,14 @@ def test_options_show_type_default_and_description(capsys: pytest.CaptureFixture
     assert re.search(r"^discount +number +0.99 +gamma of the critics", out, re.MULTILINE)
     out = output(capsys, "options", "rivergrid")
     assert re.search(r"^generate.seed +whole number +required +Seed of the map", out, re.MULTILINE)
+
+
+def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    out = output(capsys, "options", "run")
+    assert out.startswith("run, a section of a grid: How long and how wide every trial runs.\n")
+    assert re.search(r"^total_steps +whole number +required +Environment steps", out, re.MULTILINE)
+    assert "silence_seconds" in output(capsys, "options", "resources")
+    assert "train_limits" in output(capsys, "options", "limits")
 
 
 @pytest.mark.parametrize(

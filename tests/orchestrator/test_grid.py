@@ -390,3 +390,55 @@ def test_a_grid_damaged_anywhere_is_right_or_gives_located_sentences(cut: int, a
         except GridError as error:
             assert error.problems
             assert all(problem.startswith("grid.yaml:") for problem in error.problems)
+
+
+OWN_PARTS = """\
+import torch
+from pydantic import BaseModel
+from recrl.agents.registry import AgentEntry
+from recrl.teachers.registry import TeacherKind
+
+class Options(BaseModel):
+    network: str | None = None
+
+class Curriculum:
+    def __init__(self, spec):
+        pass
+    def start(self):
+        return None
+
+def make_agent(cmdp, options, seed):
+    raise KeyError("momentum")
+
+def network(inputs, outputs):
+    return torch.nn.Linear(inputs, outputs + 1)
+
+AGENT = AgentEntry("Fails.", Options, make_agent)
+CURRICULUM = TeacherKind("Answers nothing.", Options, Curriculum)
+"""
+
+
+def test_what_a_user_brings_is_built_once_on_each_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_parts.py").write_text(OWN_PARTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    data = b"""\
+name: own
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [{name: ppo-lag, label: mine, options: {network: "own_parts:network"}}, "own_parts:AGENT"]
+methods: [none, "own_parts:CURRICULUM"]
+seeds: 1
+run: {total_steps: 10_000}
+"""
+    with pytest.raises(GridError) as caught:
+        parse_grid(data, source="grid.yaml")
+    network, agent, curriculum = caught.value.problems
+    assert network.startswith("grid.yaml:3: agents.0: mine cannot be built on two-state: NetworkError: ")
+    assert agent == (
+        "grid.yaml:3: agents.1: own_parts:AGENT cannot be built on two-state: KeyError: 'momentum'"
+    )
+    assert curriculum == (
+        "grid.yaml:4: methods.1: own_parts:CURRICULUM cannot be started on two-state: TypeError: curriculum "
+        "own_parts:CURRICULUM: must return a CurriculumStep and its state, a mapping, got NoneType"
+    )

@@ -11,15 +11,16 @@ import pytest
 
 from recrl.analysis import report
 from recrl.analysis.data import sweep_data
+from recrl.analysis.data.validity import curriculum_flags
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import (
     code_of,
     has_other_code,
-    no_curriculum_sentence,
     other_code_sentence,
 )
+from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.places import SweepPlace
@@ -189,3 +190,28 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert sentence in report.missing(sweep_data.load(store))
     assert json.loads(store.trials()[0].provenance_path.read_text())["attempts"][0]["attempt"] == 1
+
+
+def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A window longer than training leaves the limit of dynamic where it was; step keeps it on purpose."""
+    (folder / "grid.yaml").write_text(
+        GRID.replace("SEEDS", "0")
+        .replace('"my_scaled_task:TASK", label: scaled', "two-state")
+        .replace("methods: [none]", "methods: [none, step, {name: dynamic, options: {window: 50}}]")
+    )
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    launched = capsys.readouterr().out.splitlines()
+    assert main(["status", "--brief"]) == ExitCode.OK
+    sentence = (
+        "hard landing, the limit was still far above d_d when deployment began: two-state ppo-lag dynamic "
+        "seed 0; give the curriculum more steps, a smaller window or a smaller d_t"
+    )
+    assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
+    assert f"warning: {sentence}" in launched
+    sweep = sweep_data.load(SweepStore(folder / "runs", "small"))
+    assert sentence in report.missing(sweep)
+    flags = curriculum_flags(sweep)
+    assert flags["hard_landing"].tolist() == [method == "dynamic" for method in flags["method"]]
+    assert not flags["no_curriculum"].any()

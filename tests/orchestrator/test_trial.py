@@ -168,6 +168,12 @@ def test_a_limit_that_falls_at_once_when_training_ends_is_an_event(tmp_path: Pat
     assert event["event"] == "hard landing"
     assert (event["limits"], event["deploy_limits"]) == ([50.0], SPEC.deploy_limits.to_json())
     assert run(tmp_path / "soft", replace(SPEC, method=Choice("none"))).events() == []
+    # a limit that falls steadily is a little above d_d in the last update
+    linear = run(
+        tmp_path / "linear", replace(SPEC, method=Choice("linear"), train_limits=CostLimits((50.0,)))
+    )
+    assert linear.updates()["limit_0"].iloc[-2] > 1.1 * SPEC.deploy_limits[0]
+    assert linear.events() == []
 
 
 def test_every_episode_is_recorded_once_with_its_place(undisturbed: TrialStore) -> None:

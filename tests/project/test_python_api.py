@@ -1,8 +1,10 @@
 """The Python API: quick to import, the same checks and results as the command line."""
 
+import dataclasses
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +109,18 @@ def test_training_equals_the_sweeps_trial(folder: Path) -> None:
     assert again.updates.equals(one.updates)
 
 
-def test_progress_is_one_line_with_return_and_cost(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_is_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    train(progress=True, total_steps=1200)
+    lines = capsys.readouterr().err.splitlines()
+    assert "\r" not in "".join(lines)
+    assert [line.split()[1] for line in lines] == ["1", *(str(3 * i) for i in range(1, 11))]
+    assert lines[-1].startswith("update 30 of 30, deployment: return ")
+
+
+def test_progress_is_one_line_with_return_and_cost(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     train(progress=True)
     err = capsys.readouterr().err
     assert err.endswith("\n")
@@ -150,6 +163,35 @@ def test_sweeps_are_loaded_from_a_folder_and_an_export(finished_sweep: SweepStor
     assert len(sweep.trials) == 36
     path = export.save(sweep, tmp_path / "made-up.zip")
     assert recrl.load_sweep(path).trials.equals(sweep.trials)
+    assert repr(sweep) == (
+        "<Sweep made-up: 36 trials (36 complete); data frames trials, phases, updates, evaluations, events, "
+        "policies>"
+    )
+    with pytest.raises(recrl.RecrlError) as error:
+        recrl.load_policy(recrl.load_sweep(path), sweep.trials["trial_id"].iloc[0])
+    assert str(error.value) == (
+        "made-up: an export and MLflow hold no policies; load the sweep from the folder it ran in"
+    )
+
+
+def test_a_policy_is_loaded_by_its_row_in_trials(
+    folder: Path, made_up_sweep: Callable[..., SweepStore]
+) -> None:
+    training = train(folder="one")
+    policy = recrl.load_policy(training.sweep, training.sweep.trials["trial_id"].iloc[0])
+    assert repr(policy) == "<Policy of two-state ppo-lag none seed 0 after 4 of 4 updates>"
+    assert repr(training) == f"<Training of two-state ppo-lag none seed 0, 4 updates in {training.folder}>"
+    with pytest.raises(recrl.RecrlError, match="one: has no trial '3f2a'; "):
+        recrl.load_policy(training.sweep, "3f2a")
+    assert train().sweep.folder is None
+    store = made_up_sweep(
+        seeds=2, methods=["none"], tasks=["a"], agents=["cpo"], missing=["a cpo none seed 1"]
+    )
+    other = store.trials()[0].spec
+    store.write_specs([other, dataclasses.replace(other, seed=1)], b"")
+    sweep = recrl.load_sweep(store.folder)
+    with pytest.raises(recrl.RecrlError, match="a cpo none seed 1: has not begun, so there is no policy yet"):
+        recrl.load_policy(sweep, sweep.trials["trial_id"].iloc[1])
 
 
 def test_a_policy_acts_on_one_and_on_many_alike(folder: Path) -> None:
@@ -232,6 +274,7 @@ def test_a_launch_prints_what_the_command_prints(folder: Path, capsys: pytest.Ca
     out = capsys.readouterr().out
     assert "small: 2 trials: 2 new" in out
     assert "task       agent    method  n  return" in out
+    assert "\nwarning: hard landing, " in out
     assert main(["status", "--brief", "runs/small"]) == ExitCode.OK
     assert len(recrl.load_sweep("small").trials) == len(recrl.load_sweep("runs/small").trials) == 2
     with pytest.raises(recrl.RecrlError, match="holds no sweep 'smal'; did you mean 'small'"):

@@ -1,0 +1,46 @@
+"""Trials whose curriculum had no effect, or ended far above the deployment limit d_d."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from recrl.orchestrator.spec import TrialSpec
+
+HARD_LANDING = "hard landing"  # the event
+CONTROLS = ("step", "unconstrained")  # curricula that keep d_t until deployment, as they should
+NAMED = 5  # trials in a sentence, at most
+
+
+def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
+    """Return whether deployment began far above d_d, although the curriculum is no control.
+
+    Args:
+        spec: the trial.
+        events: the names of its events.
+    """
+    return spec.method.name not in CONTROLS and HARD_LANDING in events
+
+
+def no_curriculum_sentence(titles: Sequence[str]) -> str:
+    """Return the warning about trials whose measured d_t is not above d_d; empty for none."""
+    if not titles:
+        return ""
+    return (
+        f"the measured d_t is not above d_d, so that the curriculum is none: {_named(titles)}; give a finite "
+        "train_limits above d_d"
+    )
+
+
+def hard_landing_sentence(titles: Sequence[str]) -> str:
+    """Return the warning about trials that ``landed_hard``; empty for none."""
+    if not titles:
+        return ""
+    return (
+        f"hard landing, the limit was still far above d_d when deployment began: {_named(titles)}; give the "
+        "curriculum more steps, a smaller window or a smaller d_t"
+    )
+
+
+def _named(titles: Sequence[str]) -> str:
+    more = f" and {len(titles) - NAMED} more" if len(titles) > NAMED else ""
+    return ", ".join(titles[:NAMED]) + more
