@@ -31,7 +31,7 @@ def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
 
 
 def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
-    """The page of the sweep's charts, grouped by task, agent and method."""
+    """The page of the sweep's charts; seeds are averaged where there are several."""
     address = uri.rstrip("/") if is_server(uri) else f"http://127.0.0.1:{port}"
     report = last_report(store, uri)
     if report is None or not report.experiment_id:
