@@ -36,6 +36,7 @@ from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
 from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.agents.policy_module import PolicyModule
 from recrl.agents.shared_options import ActorCriticConfig
 from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
@@ -101,6 +102,10 @@ class ActorCritic:
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         return self._policy.mode(self._encoder(observations))
+
+    def to_torch_module(self) -> PolicyModule:
+        """Return a copy of the policy, with the encoding of observations, as a module."""
+        return PolicyModule(self._encoder, self._policy)
 
     def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
         """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
