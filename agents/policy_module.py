@@ -24,6 +24,10 @@ class PolicyModule(nn.Module):
     """
 
     log_std: Tensor
+    _lidar: Tensor
+    _rates: Tensor
+    _mean: Tensor
+    _spread: Tensor
 
     def __init__(self, encoder: Encoder, policy: StochasticPolicy) -> None:
         super().__init__()
