@@ -62,11 +62,18 @@ class RunningMoments:
 
     def standardised(self, observations: Rows) -> Rows:
         """Return (observations [N, n] - mean) / standard deviation, clipped to +-10."""
-        if self._count == 0:
+        mean, spread = self.mean_and_spread
+        if not len(mean):
             return observations
-        spread = np.sqrt(self._scatter / self._count + SMALLEST_VARIANCE)
-        clipped = np.clip((observations - self._mean) / spread, -CLIP, CLIP)
+        clipped = np.clip((observations - mean) / spread, -CLIP, CLIP)
         return clipped.astype(np.float32)
+
+    @property
+    def mean_and_spread(self) -> tuple[Floats, Floats]:
+        """The mean and the standard deviation of each number, [n]; [0] before the first observation."""
+        if self._count == 0:
+            return np.empty(0), np.empty(0)
+        return self._mean, np.sqrt(self._scatter / self._count + SMALLEST_VARIANCE)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the count, the means and the sums of squared deviations."""
@@ -119,6 +126,23 @@ class Encoder:
         values = observations[:, self._lidar]
         seen, beyond = values > 0.0, values - np.float32(1.0)
         return np.concatenate([kept, *(np.exp(beyond * rate) * seen for rate in self._rates)], axis=1)
+
+    def constants(self) -> dict[str, npt.NDArray[Any]]:
+        """Return what an encoding is computed from at present.
+
+        Returns:
+            lidar (indices of the lidar numbers, [L]), rates (ranges over length scales, [S, L]), normalise
+            (which numbers are standardised, [n]), and mean and spread of all numbers, [n], or [0] if none is.
+        """
+        mean, spread = self._moments.mean_and_spread if self._moments else (np.empty(0), np.empty(0))
+        rates = np.array(self._rates, np.float32).reshape(len(self._rates), len(self._lidar))
+        return {
+            "lidar": self._lidar,
+            "rates": rates,
+            "normalise": self._normalise,
+            "mean": mean,
+            "spread": spread,
+        }
 
     def learn(self, observations: Rows) -> None:
         """Include the observations of a rollout, [N, n], in the running statistics, if there are any."""

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from recrl.agents.encoding import Encoder
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.policy_module import PolicyModule
 from recrl.environments.cmdp import Floats
 
 
@@ -47,6 +48,10 @@ class NetworkPolicy:
     def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
         """Return pi(a | s) at B observations [B, n], float64 [B, A]; Discrete actions only."""
         return self._network.probabilities(self._encoder(observations))
+
+    def to_torch_module(self) -> PolicyModule:
+        """Return a copy of the policy, with the encoding of observations, as a module."""
+        return PolicyModule(self._encoder, self._network)
 
 
 class PolicyAverage:

@@ -9,6 +9,7 @@ Notation: C networks, U rows, n inputs, P parameters.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -93,6 +94,14 @@ class ModuleStack:
                 values[name].copy_(value.detach())
         self._factors.fill_(last_scale)
 
+    def to_module(self) -> nn.Module:
+        """Return a copy of the first network, with its factor."""
+        module = copy.deepcopy(self._modules[0])
+        with torch.no_grad():
+            for name, value in module.named_parameters():
+                value.copy_(self._values[0][name])
+        return _Scaled(module, self._factors[0].detach().cpu().clone())
+
     def scale(self, factors: Tensor) -> None:
         """Multiply each network's outputs by a factor, [C] or a scalar."""
         self._factors.mul_(factors)
@@ -168,6 +177,21 @@ class ModuleStack:
         """The first tensors of a block by module and name."""
         rest = iter(tensors)
         return [{name: next(rest) for name in names} for names in self._names]
+
+
+class _Scaled(nn.Module):
+    """A module whose outputs are multiplied by a factor."""
+
+    factor: Tensor
+
+    def __init__(self, module: nn.Module, factor: Tensor) -> None:
+        super().__init__()
+        self.module = module
+        self.register_buffer("factor", factor)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        outputs: Tensor = self.module(rows) * self.factor
+        return outputs
 
 
 def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int) -> nn.Module:

@@ -259,6 +259,16 @@ class TanhStack:
             bias.zero_()
         self.weights[-1].mul_(last_scale)
 
+    def to_module(self) -> torch.nn.Module:
+        """Return a copy of the first network."""
+        layers: list[torch.nn.Module] = []
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            layer = torch.nn.Linear(weight.shape[1], weight.shape[2])
+            layer.weight.data = weight[0].T.cpu().clone().contiguous()
+            layer.bias.data = bias[0, 0].cpu().clone()
+            layers += [layer, torch.nn.Tanh()]
+        return torch.nn.Sequential(*layers[:-1])
+
     def scale(self, factors: Tensor) -> None:
         """Multiply each network's outputs by a factor, [C] or a scalar."""
         self.layers[-1].mul_(factors.reshape(-1, 1, 1))

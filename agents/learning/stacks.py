@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from recrl.agents.learning.module_stack import ModuleStack, checked_module, perceptron
 from recrl.agents.learning.networks import FlatParameters, NetworkForm, Scratch, TanhStack
@@ -17,6 +17,10 @@ class Stack(Protocol):
 
     def scale(self, factors: Tensor) -> None:
         """Multiply each network's outputs by a factor, [C] or a scalar."""
+        ...
+
+    def to_module(self) -> nn.Module:
+        """Return a copy of the first network."""
         ...
 
     def outputs(self, rows: Tensor) -> Tensor:

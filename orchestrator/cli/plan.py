@@ -24,7 +24,7 @@ from recrl.orchestrator.spec import TrialState
 def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
     """Check a grid file; nothing is started or written."""
     try:
-        grid = read_grid(request.grid)
+        grid = read_grid(request.grid, build=True)
     except UncalledError as error:
         say(console, f"{error}; all else is right")
         return ExitCode.OK

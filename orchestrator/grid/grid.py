@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -45,7 +45,7 @@ from recrl.orchestrator.grid.grid_file import (
 )
 from recrl.orchestrator.grid.grid_spec import GridSpec, TaskCell
 from recrl.orchestrator.located_yaml import Place, Problem, parse
-from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.spec import Choice
 from recrl.orchestrator.validation import nearest, sentences, shown
 from recrl.teachers.registry import TEACHERS, make_teacher, teacher_config
 from recrl.teachers.teacher import checked_answer
@@ -60,23 +60,28 @@ Model = TypeVar("Model", bound=BaseModel)
 OptionsOf = Callable[[str, Mapping[str, Any]], BaseModel]
 
 
-def read_grid(path: Path) -> GridSpec:
+def read_grid(path: Path, *, build: bool = False) -> GridSpec:
     """The grid in a file, checked whole.
+
+    Args:
+        path: of the file.
+        build: whether to build the user's own agents, networks and curricula once on each task.
 
     Raises:
         GridError: the file is missing or wrong; one located sentence for every mistake in it.
         UncalledError: no mistake was found, but something was not checked, as this process follows no
             import paths.
     """
-    return parse_grid(_read(path), source=str(path))
+    return parse_grid(_read(path), source=str(path), build=build)
 
 
-def parse_grid(data: bytes, *, source: str) -> GridSpec:
+def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
     """The grid in ``data``.
 
     Args:
         data: a YAML document.
         source: the file's name, for the sentences.
+        build: see ``read_grid``.
 
     Raises:
         GridError: one located sentence for every mistake.
@@ -84,6 +89,8 @@ def parse_grid(data: bytes, *, source: str) -> GridSpec:
     """
     check = _Check(data)
     grid = check.grid()
+    if grid is not None and build:
+        check.build_own(grid)
     if check.problems:
         ordered = sorted(set(check.problems), key=lambda problem: (problem.line, str(problem.place)))
         raise GridError([f"{source}:{problem}" for problem in ordered])
@@ -184,13 +191,12 @@ class _Check:
                 for value in (value for value in values if value not in known[key]):
                     hint = nearest(str(value), [str(name) for name in known[key]])
                     self._add(("exclude", index, key), f"this grid has no {key} {shown(value)}{hint}")
-        trials = grid.trials() if not self.problems else []
-        if not self.problems and not trials:
+        if not self.problems and not grid.trials():
             self._add(("exclude",), "leaves no trial at all")
-        self._build_own(grid, trials)
 
-    def _build_own(self, grid: GridSpec, trials: Sequence[TrialSpec]) -> None:
+    def build_own(self, grid: GridSpec) -> None:
         """Build the user's own agents, networks and curricula once on each task that they meet."""
+        trials = grid.trials()
         cells = {cell.task.label: cell.task for cell in grid.tasks}
         agents = {(it.task.label, it.agent.label): it for it in trials if _is_own_agent(it.agent)}
         methods = {(it.task.label, it.method.label): it for it in trials if it.method.name not in TEACHERS}

@@ -39,8 +39,8 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
 
     Args:
         grid: the path of a grid file, or its content as a dictionary.
-        trust: whether to import and call what the grid names by an import path. Do so only with grids whose
-            author you trust.
+        trust: whether to import and call what the grid names by an import path, and to build it once on each
+            task. Do so only with grids whose author you trust.
 
     Returns:
         The checked grid with all defaults; ``trials()`` has its trials.
@@ -57,7 +57,7 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
         3
     """
     with following(trust):
-        return _checked(grid)
+        return _checked(grid, build=True)
 
 
 def launch(
@@ -232,16 +232,16 @@ def _scratch(stack: ExitStack) -> Path:
     return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="recrl-"))) / "trial"
 
 
-def _checked(grid: Grid) -> GridSpec:
+def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     """Read the grid of a file or of a dictionary; mistakes in a dictionary have no line numbers."""
     if isinstance(grid, str | Path):
-        return read_grid(Path(grid))
+        return read_grid(Path(grid), build=build)
     try:
         data = json.dumps(dict(grid)).replace("Infinity", ".inf").replace("NaN", ".nan").encode()
     except (TypeError, ValueError) as error:
         raise GridError([f"{SOURCE}: must hold plain values only: {error}"]) from error
     try:
-        return parse_grid(data, source=SOURCE)
+        return parse_grid(data, source=SOURCE, build=build)
     except GridError as error:
         problems = [re.sub(rf"^{SOURCE}:\d+: ", "", problem) for problem in error.problems]
         raise GridError(problems) from error

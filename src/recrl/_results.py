@@ -15,6 +15,8 @@ from recrl.environments.plugins import refuse_import_paths
 from recrl.orchestrator.errors import RecrlError
 
 if TYPE_CHECKING:
+    import torch
+
     from recrl.agents.agent import FinalPolicy
     from recrl.analysis.data.sweep_data import Sweep
     from recrl.environments.cmdp import CMDPSpec
@@ -181,6 +183,22 @@ class Policy:
         if rows.ndim == 2:
             return actions
         return int(actions[0]) if actions.ndim == 1 else actions[0]
+
+    def to_torch_module(self) -> torch.nn.Module:
+        """Return a copy of the policy as a module, for ``torch.export`` and ONNX.
+
+        Returns:
+            A module that maps observations, float32 [B, n], to logits [B, A] or, for continuous actions,
+            means [B, m]; its buffer ``log_std`` holds their log standard deviations.
+
+        Raises:
+            RecrlError: the agent is your own and is not built on ``ActorCritic``.
+        """
+        from recrl.agents.learning.final_policy import NetworkPolicy  # noqa: PLC0415
+
+        if not isinstance(self.final, NetworkPolicy):
+            raise RecrlError(f"{self.spec.agent.label}: has no module; only agents built on ActorCritic do")
+        return self.final.to_torch_module()
 
     def seed(self, seed: int) -> None:
         """Restart the policy's random numbers."""

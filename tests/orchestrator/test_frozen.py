@@ -175,7 +175,9 @@ def test_a_video_has_a_picture_a_step(crossing: TrialStore) -> None:
 
 
 def test_a_task_without_pictures_is_a_sentence(complete: TrialStore) -> None:
-    with pytest.raises(RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state cannot be rendered"):
+    with pytest.raises(
+        RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state cannot be rendered"
+    ):
         SavedTrial.load(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 

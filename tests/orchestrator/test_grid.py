@@ -432,7 +432,7 @@ seeds: 1
 run: {total_steps: 10_000}
 """
     with pytest.raises(GridError) as caught:
-        parse_grid(data, source="grid.yaml")
+        parse_grid(data, source="grid.yaml", build=True)
     network, agent, curriculum = caught.value.problems
     assert network.startswith("grid.yaml:3: agents.0: mine cannot be built on two-state: NetworkError: ")
     assert agent == (
@@ -442,3 +442,4 @@ run: {total_steps: 10_000}
         "grid.yaml:4: methods.1: own_parts:CURRICULUM cannot be started on two-state: TypeError: curriculum "
         "own_parts:CURRICULUM: must return a CurriculumStep and its state, a mapping, got NoneType"
     )
+    assert len(parse_grid(data, source="grid.yaml").trials()) == 4  # a launch leaves that to the trials
