@@ -1,7 +1,7 @@
-"""Where a sweep is kept: in its folder, or in an object store that the folder copies.
+"""Storage of a sweep: its folder, or an object store of which the folder is a copy.
 
-A launch, its executors and the commands use a ``SweepPlace`` and do not ask which of the two it is. The
-object store's is ``remote.remote_sweep.RemoteSweep``; ``remote.opening`` chooses.
+A launch, its executors and the commands use a ``SweepPlace`` for both. That of an object store is
+``remote.remote_sweep.RemoteSweep``; ``remote.opening`` chooses.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from recrl.orchestrator.spec import TrialSpec
 
 
 class StopSign(Protocol):
-    """How one run of a sweep tells its workers, on any node, to save and stop."""
+    """Stop signal of one run of a sweep for its workers on all nodes."""
 
     @property
     def place(self) -> str:
-        """By which workers find it: see ``SweepPlace.stop_sign_at``."""
+        """Name of the signal for workers: see ``SweepPlace.stop_sign_at``."""
         ...
 
     @property
@@ -33,16 +33,16 @@ class StopSign(Protocol):
         ...
 
     def set(self) -> None:
-        """Tell the workers to stop."""
+        """Signal the workers to stop."""
         ...
 
     def is_set(self) -> bool:
-        """Return whether to stop; may be asked often."""
+        """Return whether to stop; may be called often."""
         ...
 
 
 class SweepPlace(Protocol):
-    """Where the trials of a sweep are kept, as seen from one machine."""
+    """Storage of the trials of a sweep, as seen from one machine."""
 
     @property
     def store(self) -> SweepStore:
@@ -60,7 +60,7 @@ class SweepPlace(Protocol):
         ...
 
     def prepare(self) -> None:
-        """Find out whether the place can be used, before any work.
+        """Check that the place can be used, before any work.
 
         Raises:
             RecrlError: it cannot.
@@ -68,7 +68,7 @@ class SweepPlace(Protocol):
         ...
 
     def require_reruns(self) -> None:
-        """Find out whether trials that have ended can be run again here.
+        """Check that finished trials can be run again here.
 
         Raises:
             RecrlError: they cannot.
@@ -76,10 +76,10 @@ class SweepPlace(Protocol):
         ...
 
     def held(self, stop: threading.Event) -> AbstractContextManager[None]:
-        """Be the one launch, on all machines, that runs the sweep; its folder is locked already.
+        """Hold the sweep as the only launch on all machines; its folder is locked already.
 
         Args:
-            stop: set when somebody asks for it on another machine, or has taken the sweep over.
+            stop: set on a request from another machine, or when another launch has taken over.
 
         Raises:
             SweepBusyError: another launch runs the sweep.
@@ -90,16 +90,16 @@ class SweepPlace(Protocol):
         """Bring the folder up to date.
 
         Args:
-            checkpoints: whether to bring those of trials that still run.
+            checkpoints: whether to include those of running trials.
         """
         ...
 
     def refresh(self, *, checkpoints: bool = False) -> None:
-        """Bring the folder up to date for somebody who looks; log a warning if that is impossible."""
+        """Bring the folder up to date for a reader; log a warning if that is impossible."""
         ...
 
     def publish(self) -> None:
-        """Send what the folder says of the sweep itself."""
+        """Send the sweep's own files."""
         ...
 
     def kept_up_to_date(self, stop: threading.Event) -> AbstractContextManager[None]:
@@ -107,14 +107,14 @@ class SweepPlace(Protocol):
         ...
 
     def settle(self, specs: Sequence[TrialSpec]) -> None:
-        """Send what only this machine knows of trials that nobody runs: that their process died."""
+        """Send the status of trials whose processes died, which only this machine knows."""
         ...
 
     def request_stop(self) -> Callable[[], bool]:
-        """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
+        """Ask the launch that runs the sweep, on any machine, to save its trials and end.
 
         Returns:
-            A function that says whether it still runs.
+            A function that returns whether it still runs.
         """
         ...
 
@@ -123,7 +123,7 @@ class SweepPlace(Protocol):
         ...
 
     def is_out_of_touch(self, silence_seconds: float) -> bool:
-        """Return whether the folder is so old that a silence of so many seconds in it says nothing."""
+        """Return whether the folder is too old to conclude from a silence of this many seconds."""
         ...
 
     def working_copy(
@@ -133,17 +133,17 @@ class SweepPlace(Protocol):
         ...
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:
-        """Return the stop sign of a new run; workers of earlier runs are told to stop."""
+        """Return the stop signal of a new run; workers of earlier runs are stopped."""
         ...
 
     def stop_sign_at(self, place: str) -> StopSign:
-        """Return the stop sign that a run has made: its ``StopSign.place``."""
+        """Return the stop signal of a run by its ``StopSign.place``."""
         ...
 
 
 @dataclass(frozen=True)
 class LocalSweep:
-    """A sweep that is kept in its folder; every node sees the folder under the same path.
+    """A sweep in its folder; every node sees the folder under the same path.
 
     Attributes:
         store: the folder.
@@ -154,7 +154,7 @@ class LocalSweep:
     address = ""
 
     def prepare(self) -> None:
-        """See ``SweepPlace``; nothing to do, as the other methods without a body."""
+        """See ``SweepPlace``; does nothing, like the other methods without a body."""
 
     def require_reruns(self) -> None:
         """See ``SweepPlace``."""

@@ -28,7 +28,7 @@ from recrl.orchestrator.cli.shared_arguments import (
 
 VIDEOS = ("gif", "mp4")
 TEMPLATES = ("demo", "safety-gym", "velocity", "own-task")
-KINDS = ("tasks", "agents", "curricula", "methods")  # methods: as in a grid
+KINDS = ("tasks", "agents", "curricula", "methods")  # methods: the key in a grid
 
 
 def _add_init(commands: Commands) -> None:
@@ -47,7 +47,7 @@ def _add_init(commands: Commands) -> None:
         choices=TEMPLATES,
         default=TEMPLATES[0],
         help="demo: RiverGrid in a few minutes (default); safety-gym and velocity: MuJoCo tasks; "
-        "own-task: an environment of your own, with a small Python file that holds one",
+        "own-task: your own environment, with a small example in Python",
     )
 
 
@@ -81,25 +81,25 @@ def _add_plan(commands: Commands) -> None:
     add_trust(plan)
     add_selection(plan)
     plan.add_argument(
-        "--check", action="store_true", help="end with 5 if a launch would have something to do"
+        "--check", action="store_true", help="exit with code 5 if a launch would have something to do"
     )
     plan.add_argument(
         "--measure",
         action="store_true",
-        help="run about a second of each task and agent that has not run yet, to estimate the time",
+        help="run about a second of each task and agent without a known speed, to estimate the time",
     )
     room = plan.add_mutually_exclusive_group()
     room.add_argument(
         "--address",
         metavar="HOST:PORT",
-        help="estimate for this Ray cluster, which is asked; by default for this machine",
+        help="estimate for this Ray cluster, which must run; by default for this machine",
     )
-    room.add_argument("--cores", type=at_least_one, metavar="N", help="estimate for so many cores")
+    room.add_argument("--cores", type=at_least_one, metavar="N", help="estimate for this number of cores")
 
 
 def _add_progress(commands: Commands) -> None:
     status = add_command(
-        commands, "status", requests.StatusRequest, "say how far a sweep is, from its files alone"
+        commands, "status", requests.StatusRequest, "show the progress of a sweep, from its files"
     )
     add_sweep(status)
     status.add_argument("--brief", action="store_true", help="one line, without the table of trials")
@@ -135,8 +135,8 @@ def _add_launch(commands: Commands) -> None:
         "--executor",
         choices=("ray", "inline"),
         default="ray",
-        help="ray: side by side on all cores or a cluster (default); inline: one after the other in this "
-        "process, for debuggers",
+        help="ray: in parallel on all cores or a cluster (default); inline: one after the other "
+        "in this process, for debuggers",
     )
     launch.add_argument(
         "--address",
@@ -153,7 +153,7 @@ def _add_launch(commands: Commands) -> None:
         "--no-mlflow",
         dest="mlflow",
         action="store_false",
-        help="send nothing to MLflow; 'sync' can do it later",
+        help="do not log to MLflow; 'sync' can do it later",
     )
     launch.add_argument(
         "--no-figures", dest="figures", action="store_false", help="draw no figures at the end"
@@ -167,12 +167,12 @@ def _add_logs(commands: Commands) -> None:
         "trial",
         nargs="*",
         metavar="TRIAL",
-        help="the beginning of its id, title or folder, as status shows them; default: the one that runs",
+        help="the beginning of its id, title or folder, as status shows them; default: the running trial",
     )
     logs.add_argument(
         "--follow",
         action="store_true",
-        help="wait until the trial starts, and for more lines as long as it runs",
+        help="wait until the trial starts, and show new lines as long as it runs",
     )
     logs.add_argument("--folder", action="store_true", help="print the trial's folder instead")
 
@@ -182,7 +182,7 @@ def _add_evaluate(commands: Commands) -> None:
         commands,
         "evaluate",
         requests.EvaluateRequest,
-        "evaluate the policies of trials without learning; film them on demand",
+        "evaluate the policies of trials without learning; optionally film them",
     )
     add_sweep(evaluate)
     evaluate.add_argument(
@@ -197,24 +197,25 @@ def _add_evaluate(commands: Commands) -> None:
         "--episodes",
         type=at_least_one,
         metavar="N",
-        help="of each policy; by default as many as the trial itself evaluates at its end",
+        help="for each policy; by default the number of the trial's own evaluation",
     )
     evaluate.add_argument(
         "--seed",
         type=at_least_zero,
         metavar="S",
-        help="of the episodes; by default that of the trial's own evaluation, which then comes out again",
+        help="for the episodes; by default that of the trial's own evaluation, whose results are then equal",
     )
     evaluate.add_argument(
         "--policy",
         choices=("stochastic", "deterministic", "both"),
         default="both",
-        help="act as in training, by the most likely action, or one after the other (default)",
+        help="stochastic as in training, deterministic, or both one after the other (default)",
     )
     evaluate.add_argument(
         "--video",
         choices=VIDEOS,
-        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; MLflow gets it",
+        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; it "
+        "is also logged to MLflow",
     )
     add_tracking(evaluate)
 
@@ -224,12 +225,12 @@ def _add_figures(commands: Commands) -> None:
         commands,
         "figures",
         requests.FiguresRequest,
-        "draw the figures, tables and report of what is there so far",
+        "draw the figures, tables and report of the present results",
     )
     add_source(figures)
     add_trust(figures)
     figures.add_argument(
-        "--to", type=folder, metavar="FOLDER", help="where to; by default the sweep's figures folder"
+        "--to", type=folder, metavar="FOLDER", help="the output folder; by default the sweep's figures folder"
     )
     figures.add_argument(
         "--band",
@@ -241,7 +242,7 @@ def _add_figures(commands: Commands) -> None:
     figures.add_argument(
         "--sketch",
         action="store_true",
-        help="only learning curves, limits and tables, no PDF: quick, as launch does while it runs",
+        help="only learning curves, limits and tables, no PDF: fast, as during a launch",
     )
 
 
@@ -270,9 +271,9 @@ def _add_merge(commands: Commands) -> None:
         type=path_of,
         nargs="+",
         metavar="FILE.zip",
-        help="the first gives the name; of a trial that several have, the one that got furthest is taken",
+        help="the first gives the name; if several have a trial, the furthest is used",
     )
-    merge.add_argument("--to", type=zip_file, metavar="FILE.zip", required=True, help="what to write")
+    merge.add_argument("--to", type=zip_file, metavar="FILE.zip", required=True, help="the output file")
 
 
 def _add_bound(commands: Commands) -> None:
@@ -288,11 +289,11 @@ def _add_bound(commands: Commands) -> None:
         "--budget",
         type=cost,
         metavar="COST",
-        help="cost above the deployment limit that all training episodes may have together: find the largest "
-        "training limit d_t",
+        help="allowed cost above the deployment limit of all training episodes together: find the "
+        "largest training limit d_t",
     )
     bound.add_argument(
-        "--cost", type=at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
+        "--cost", type=at_least_one, default=1, metavar="I", help="index of the cost (default: 1)"
     )
 
 
@@ -316,7 +317,7 @@ def _add_replay(commands: Commands) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="its options where they differ from the sweep's, window=8",
+        help="its options that differ from the sweep's, window=8",
     )
     add_only(replay)
 
@@ -337,7 +338,7 @@ def _add_sync(commands: Commands) -> None:
         commands,
         "sync",
         requests.SyncRequest,
-        "bring MLflow up to the files, for example after it was unreachable",
+        "bring MLflow up to date with the files, for example after it was unreachable",
     )
     add_sweep(sync)
     add_tracking(sync)

@@ -1,4 +1,4 @@
-"""Which function does what a request asks for."""
+"""The function for each command."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What each command of ``recrl-sweep`` is asked for: one frozen, typed value a command.
+"""Requests of ``recrl-sweep``: one frozen, typed value per command.
 
-``arguments`` fills them in. Imports nothing but the standard library, so that ``--help`` is quick.
+``arguments`` makes them. Imports only the standard library, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import ClassVar, Self
 
 @dataclass(frozen=True)
 class Request:
-    """What every command has.
+    """Common part of all requests.
 
     Attributes:
         given: the arguments as they were typed.
     """
 
-    trusted: ClassVar[bool] = False  # whether the command itself is the order to run what a file names
+    trusted: ClassVar[bool] = False  # whether the command itself is the permission to follow import paths
     given: tuple[str, ...]
 
     @classmethod
     def of(cls, parsed: argparse.Namespace) -> Self:
-        """The request that parsed arguments make; lists become tuples."""
+        """Make a request of parsed arguments; lists become tuples."""
         values = {field.name: getattr(parsed, field.name) for field in fields(cls)}
         return cls(**{key: tuple(it) if isinstance(it, list) else it for key, it in values.items()})
 
@@ -35,13 +35,13 @@ class Request:
 
     @property
     def follows_import_paths(self) -> bool:
-        """Whether code that a file names by an import path may run."""
+        """Whether import paths in files are followed."""
         return self.trusted or bool(getattr(self, "trust", False))
 
 
 @dataclass(frozen=True)
 class PlaceRequest(Request):
-    """Where sweeps are.
+    """Location of sweeps.
 
     Attributes:
         root: the folder of all sweeps.
@@ -54,7 +54,7 @@ class PlaceRequest(Request):
 
 @dataclass(frozen=True)
 class GridRequest(PlaceRequest):
-    """A grid, and which of its trials.
+    """A grid, and a selection of its trials.
 
     Attributes:
         grid: its file.
@@ -62,7 +62,7 @@ class GridRequest(PlaceRequest):
         retry_failed: whether to try failed trials again.
         rerun_damaged: whether to run damaged trials again that were complete or failed.
         rerun_changed: whether to run trials again that ran other code than is installed now.
-        max_concurrent: trials at once, at most.
+        max_concurrent: largest number of parallel trials.
         address: of an existing Ray cluster.
     """
 
@@ -88,7 +88,7 @@ class LaunchRequest(GridRequest):
         tracking_uri: of MLflow; None for a database in the sweep's folder.
         executor: ``ray`` or ``inline``.
         ship_package: whether to send recrl itself to the cluster.
-        mlflow: whether MLflow is told.
+        mlflow: whether to log to MLflow.
         figures: whether to draw figures at the end.
     """
 
@@ -106,9 +106,9 @@ class PlanRequest(GridRequest):
 
     Attributes:
         trust: whether to follow import paths.
-        check: whether to end with 5 if there is something to do.
-        cores: to estimate for.
-        measure: whether to run a second of each cell to learn its speed.
+        check: whether to exit with code 5 if there is something to do.
+        cores: number of cores of the estimate.
+        measure: whether to run a second of each cell to measure its speed.
     """
 
     trust: bool
@@ -140,7 +140,7 @@ class SweepRequest(PlaceRequest):
     """A sweep.
 
     Attributes:
-        sweep: its name, folder or grid file; None for the only one there.
+        sweep: its name, folder or grid file; None for the only sweep there.
     """
 
     sweep: str | None
@@ -176,7 +176,7 @@ class LogsRequest(SweepRequest):
 
     Attributes:
         trial: words of its id, title or folder.
-        follow: whether to wait for more.
+        follow: whether to wait for new lines.
         folder: whether to print the trial's folder instead.
     """
 
@@ -193,7 +193,7 @@ class EvaluateRequest(SweepRequest):
         trial: words of the beginning of the trials' ids, titles or folders.
         only: the trials, each ``KEY=VALUE``.
         trust: whether to follow import paths.
-        episodes: of each policy; None for as many as the trial itself evaluates.
+        episodes: of each policy; None for the number of the trial's own evaluation.
         seed: of the episodes; None for the trial's own.
         policy: ``stochastic``, ``deterministic`` or ``both``.
         video: ``gif``, ``mp4`` or None.
@@ -215,7 +215,7 @@ class SourceRequest(SweepRequest):
     """A sweep in its folder, in an exported file, or in MLflow.
 
     Attributes:
-        tracking_uri: read MLflow alone.
+        tracking_uri: of MLflow, to be read instead of files.
     """
 
     tracking_uri: str | None
@@ -229,7 +229,7 @@ class FiguresRequest(SourceRequest):
         trust: whether to follow import paths.
         to: the folder to draw into; None for the sweep's own.
         band: ``mean`` or ``iqm``.
-        sketch: whether to draw only what is quick.
+        sketch: whether to draw only the fast figures.
     """
 
     trust: bool
@@ -273,8 +273,8 @@ class BoundRequest(SourceRequest):
 
     Attributes:
         trust: whether to follow import paths.
-        budget: cost above the deployment limit that may be spent in training; None for no answer.
-        cost: which of the costs, from 1.
+        budget: allowed cost above the deployment limit in training; None to compute no limit.
+        cost: index of the cost, from 1.
     """
 
     trust: bool
@@ -288,7 +288,7 @@ class ReplayRequest(SweepRequest):
 
     Attributes:
         trust: whether to follow import paths.
-        teacher: a method of the sweep, or any teacher by its name.
+        teacher: a method of the sweep, or any curriculum by its name.
         option: its options, each ``KEY=VALUE``.
         only: the trials, each ``KEY=VALUE``.
     """
@@ -330,8 +330,8 @@ class InitRequest(Request):
     """``init``.
 
     Attributes:
-        template: which grid to write.
-        file: where to; None for the template's name.
+        template: name of the grid to write.
+        file: output file; None for the template's name.
     """
 
     template: str

@@ -1,4 +1,4 @@
-"""What several commands take in common: the parser's class, and groups of arguments."""
+"""Arguments common to several commands: the parser's class, and groups of arguments."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from recrl.orchestrator.cli.requests import PlaceRequest, Request
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 LONGEST_LINE = 1000  # characters of an error
-SWEEP_HELP = "a sweep's name, folder or grid file; may be left out where there is only one"
+SWEEP_HELP = "a sweep's name, folder or grid file; optional if there is only one"
 
 
 def readable(sentence: str) -> str:
-    """What may be shown of a sentence, its lines cut where they quote something endless."""
+    """Return a sentence for display; lines with very long quotations are cut."""
     from recrl.orchestrator.redaction import shown  # noqa: PLC0415  (--help is to be quick)
 
     lines = shown(sentence).split("\n")
@@ -24,7 +24,7 @@ def readable(sentence: str) -> str:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong with the arguments, which may hold a password, and exit."""
+        """Print what is wrong with the arguments, without secrets, and exit."""
         super().error(readable(message))
 
 
@@ -41,7 +41,7 @@ def new_parser(name: str, description: str, epilog: str) -> argparse.ArgumentPar
 def add_command(
     commands: Commands, name: str, request: type[Request], summary: str
 ) -> argparse.ArgumentParser:
-    """Add a command that makes a ``request``; one about sweeps takes the place where they are."""
+    """Add a command that makes a ``request``; with the location of sweeps if the request has one."""
     command = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
     command.set_defaults(request=request)
     if issubclass(request, PlaceRequest):
@@ -78,14 +78,14 @@ def add_sweep(command: argparse.ArgumentParser) -> None:
 
 
 def add_source(command: argparse.ArgumentParser) -> None:
-    """Add a sweep that may also be an exported file or in MLflow."""
+    """Add a sweep that may also be an export or in MLflow."""
     command.add_argument(
         "sweep", nargs="?", metavar="SWEEP", help=f"{SWEEP_HELP}; or a file that export wrote (.zip)"
     )
     command.add_argument(
         "--tracking-uri",
         metavar="URI",
-        help="read MLflow alone, no files: a server (http://host:port) or database (sqlite:///file.db)",
+        help="read MLflow instead of files: a server (http://host:port) or database (sqlite:///file.db)",
     )
 
 
@@ -102,7 +102,7 @@ def add_only(command: argparse.ArgumentParser) -> None:
 
 
 def add_selection(command: argparse.ArgumentParser) -> None:
-    """Add what chooses a launch's trials."""
+    """Add the selection of a launch's trials."""
     add_only(command)
     command.add_argument(
         "--retry-failed", action="store_true", help="try failed trials again, from their last checkpoint"
@@ -110,18 +110,19 @@ def add_selection(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--rerun-damaged",
         action="store_true",
-        help="run damaged trials again that were complete or had failed; others are by themselves",
+        help="run damaged trials again that were complete or had failed; other damaged trials are "
+        "repaired anyway",
     )
     command.add_argument(
         "--rerun-changed",
         action="store_true",
-        help="run trials again that ran other code than is installed now; what they left is kept aside",
+        help="run trials again that ran other code than is installed now; their old files are kept aside",
     )
     command.add_argument(
         "--max-concurrent",
         type=at_least_one,
         metavar="N",
-        help="trials at once, at most; by default as many as fit (or as the grid says)",
+        help="largest number of parallel trials; by default as fit (or the grid's)",
     )
 
 

@@ -1,4 +1,4 @@
-"""A file by which one run of a sweep tells its workers to save and stop."""
+"""A file by which one run of a sweep signals its workers to save and stop."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ STOP_QUESTION_SECONDS = 0.5
 
 
 class StopFile:
-    """How one run of a sweep tells its workers, on any node, to checkpoint and stop.
+    """Stop signal of one run of a sweep for its workers on all nodes, as a file.
 
-    The file is empty as long as they are to go on; they stop when it says anything, or is gone. It is there
-    from the beginning because a network file system may remember for a minute that a file is absent,
-    whereas opening one asks the server.
+    Workers continue as long as the file is empty; they stop when it has content or is missing. It exists from
+    the beginning, because a network file system may cache the absence of a file for a minute. Opening a file
+    asks the server.
 
     Attributes:
         path: the file, in the sweep's folder.
@@ -27,17 +27,17 @@ class StopFile:
         self._answer = False
         self._asked_at = float("-inf")
 
-    uri = ""  # it is in no object store
+    uri = ""  # not in an object store
 
     @property
     def place(self) -> str:
-        """By which workers find it."""
+        """Return the name for the workers."""
         return str(self.path)
 
     @classmethod
     @contextmanager
     def open(cls, folder: Path) -> Iterator[StopFile]:
-        """The stop file of a new run; whatever may be left of earlier runs is told to stop."""
+        """Make the stop file of a new run; workers of earlier runs are stopped."""
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.glob("stop-*"):
             old.unlink(missing_ok=True)
@@ -49,11 +49,11 @@ class StopFile:
             stop_file.path.unlink(missing_ok=True)
 
     def set(self) -> None:
-        """Tell the workers to stop."""
+        """Signal the workers to stop."""
         self.path.write_text("stop\n")
 
     def is_set(self) -> bool:
-        """Whether to stop; looks at the file every ``STOP_QUESTION_SECONDS`` at most."""
+        """Whether to stop; reads the file every ``STOP_QUESTION_SECONDS`` at most."""
         if not self._answer and time.monotonic() >= self._asked_at + STOP_QUESTION_SECONDS:
             self._asked_at = time.monotonic()
             try:

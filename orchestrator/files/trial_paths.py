@@ -1,4 +1,4 @@
-"""The paths in a trial's folder; ``sweep_store`` says what each file holds."""
+"""The paths in a trial's folder; ``sweep_store`` describes the files."""
 
 from __future__ import annotations
 
@@ -29,32 +29,32 @@ class TrialPaths:
 
     @property
     def episodes_path(self) -> Path:
-        """A row an episode."""
+        """One row per episode."""
         return self.folder / "episodes.csv"
 
     @property
     def updates_path(self) -> Path:
-        """A row a policy update."""
+        """One row per policy update."""
         return self.folder / "updates.csv"
 
     @property
     def events_path(self) -> Path:
-        """A line an event."""
+        """One line per event."""
         return self.folder / "events.jsonl"
 
     @property
     def evaluation_path(self) -> Path:
-        """A row an episode of the frozen-policy evaluations."""
+        """One row per episode of the final evaluations."""
         return self.folder / "evaluation.csv"
 
     @property
     def policy_path(self) -> Path:
-        """The final policy's table, where the task is finite."""
+        """The final policy's table, if the task is finite."""
         return self.folder / "policy.csv"
 
     @property
     def evaluations_folder(self) -> Path:
-        """What ``recrl-sweep evaluate`` measured afterwards."""
+        """Results of ``recrl-sweep evaluate``."""
         return self.folder / "evaluations"
 
     @property
@@ -84,12 +84,12 @@ class TrialPaths:
 
     @property
     def reserve_path(self) -> Path:
-        """Room that is given up to say, on a full disk, how a trial ended."""
+        """Disk space that is released to record the end of a trial on a full disk."""
         return self.folder / ".reserve"
 
     @property
     def aside_folder(self) -> Path:
-        """What was damaged or replaced, as it was when an attempt began."""
+        """Damaged or replaced files, moved there when an attempt began."""
         return self.folder / "aside"
 
     @property
@@ -99,7 +99,7 @@ class TrialPaths:
 
     @property
     def is_local_copy(self) -> bool:
-        """Whether the folder only mirrors a trial that is kept in an object store."""
+        """Whether the folder is only a local copy of a trial in an object store."""
         return (self.folder / ".pulled.json").exists()
 
     def checkpoints(self) -> list[Path]:

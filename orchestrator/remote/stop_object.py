@@ -1,4 +1,4 @@
-"""An object by which one run of a sweep tells its workers to save and stop."""
+"""An object by which one run of a sweep signals its workers to save and stop."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from contextlib import contextmanager
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.remote.object_store import ObjectStore
 
-STOP_QUESTION_SECONDS = 5.0  # between two questions of a worker whether to stop
+STOP_QUESTION_SECONDS = 5.0  # between two reads by a worker
 
 logger = logging.getLogger("recrl.sweep")
 
 
 class StopObject:
-    """How one run of a sweep tells its workers, on any node, to save and stop: see ``stop_file``.
+    """Stop signal of one run of a sweep for its workers on all nodes, as an object: see ``stop_file``.
 
     Attributes:
         key: of the object, below the sweep.
@@ -31,7 +31,7 @@ class StopObject:
 
     @property
     def place(self) -> str:
-        """By which workers find it, beside the sweep's address."""
+        """Return the name for the workers, relative to the sweep's address."""
         return self.key
 
     @property
@@ -42,7 +42,7 @@ class StopObject:
     @classmethod
     @contextmanager
     def open(cls, objects: ObjectStore) -> Iterator[StopObject]:
-        """That of a new run; whatever may be left of earlier runs is told to stop.
+        """Make the stop object of a new run; workers of earlier runs are stopped.
 
         Raises:
             StorageError: the store cannot be written.
@@ -59,7 +59,7 @@ class StopObject:
                 logger.warning("%s", error)
 
     def set(self) -> None:
-        """Tell the workers to stop; tried again by whoever calls again."""
+        """Signal the workers to stop; after an error the caller calls again."""
         if self._answer:
             return
         try:
@@ -69,7 +69,7 @@ class StopObject:
             logger.debug("%s", error)
 
     def is_set(self) -> bool:
-        """Whether to stop; asks every ``STOP_QUESTION_SECONDS`` at most. No answer is none."""
+        """Whether to stop; reads the object every ``STOP_QUESTION_SECONDS`` at most. No answer means no."""
         if not self._answer and time.monotonic() >= self._asked_at + STOP_QUESTION_SECONDS:
             self._asked_at = time.monotonic()
             try:
