@@ -1,6 +1,6 @@
-"""All figures and tables of a sweep in one call, from a finished or a running one.
+"""All figures and tables of a finished or running sweep in one call.
 
-    report.html                 the answer, the verdicts, and all of what follows on one self-contained page
+    report.html                 the answer, the verdicts, and everything below on one self-contained page
     report.md                   the same as text, with links to the figures
     return-against-cost         final policies, the infeasible region, and the frontier J*(d) (PDF and PNG)
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
@@ -9,18 +9,18 @@
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
     bounds_<agent>              cumulative cost of training against Proposition 1 (PDF and PNG)
     performance-profiles        fraction of final policies that are feasible and return more (PDF and PNG)
-    verdicts.csv                a row a task, agent and curriculum: what the report begins with
-    outcomes.csv                a row a trial and measure
+    verdicts.csv                one row per task, agent and curriculum: the report's first table
+    outcomes.csv                one row per trial and measure
     summary.csv                 averaged over seeds, with interquartile means
     comparisons.csv             paired differences to the agent without a curriculum
-    training.csv                what relaxed training cost, a row a trial
-    claims.csv                  the paper's claims about RiverGrid's maps, counted, where a grid has these
-    bounds.csv                  the cumulative cost against Proposition 1, a row a trial and cost
+    training.csv                cost of relaxed training, one row per trial
+    claims.csv                  the paper's claims about RiverGrid's maps, counted, if the grid has them
+    bounds.csv                  the cumulative cost against Proposition 1, one row per trial and cost
     outcomes.tex                the first tables for LaTeX (booktabs)
     outcomes.parquet            outcomes.csv with its types, for programs
 
-Of a sweep that runs, ``sketch`` draws SKETCHED, as PNGs, and all tables and pages: that takes a fraction of
-the time of the whole, and trials want the rest.
+For a running sweep, ``sketch`` draws only SKETCHED, as PNGs, and all tables and pages. This takes a
+fraction of the time, and leaves the cores to the trials.
 
 Equal sweeps give equal bytes: no time is written, and the bootstrap's generator is seeded here.
 """

@@ -1,7 +1,8 @@
-"""Verdicts on the final policies (solved, feasible, infeasible), for each task, agent and curriculum.
+"""Counts of verdicts on the final policies (solved, feasible, infeasible), by task, agent and curriculum.
 
-Every verdict is on the stochastic final policy, evaluated without learning. What the words mean is defined in
-``recrl.analysis.statistics.metrics``. The deployment phase stands beside it for comparison only.
+Every verdict is on the stochastic final policy, evaluated without learning.
+``recrl.analysis.statistics.feasibility`` defines the verdicts. The deployment phase is given for comparison
+only.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ FINAL = Measure.STOCHASTIC
 
 
 def verdicts(rows: pd.DataFrame, compared: pd.DataFrame) -> pd.DataFrame:
-    """Count the verdicts: a row a GROUP.
+    """Count the verdicts: one row per GROUP.
 
     Args:
         rows: of ``metrics.outcomes``.
         compared: of ``metrics.comparisons``, with the baseline ``none``.
 
     Returns:
-        GROUP, seeds, solved, feasible (the solved ones included), infeasible, worst_excess (the largest cost
-        above its limit among the infeasible seeds, or NaN), worst_share (the same divided by that limit),
-        episode_return, episode_return_se and cost_i (means over seeds), deploy_limit_i, optimal_return,
-        exact (whether every seed is), episodes (of a seed), deployment_return, deployment_cost_i,
-        return_difference with _low and _high (NaN without a baseline).
+        GROUP, seeds, solved, feasible (the solved ones included), infeasible; worst_excess (the largest cost
+        above its limit among the infeasible seeds, or NaN); worst_share (the same divided by that limit);
+        episode_return, episode_return_se and cost_i (means over seeds); deploy_limit_i, optimal_return, exact
+        (whether every seed is), episodes (of a seed); deployment_return, deployment_cost_i; return_difference
+        with _low and _high (NaN without a baseline).
     """
     final = rows[rows["measure"] == FINAL.value]
     deployed = rows[rows["measure"] == Measure.DEPLOYMENT.value]
@@ -57,7 +58,7 @@ def _counts(seeds: pd.DataFrame) -> dict[str, int]:
 
 
 def _worst(seeds: pd.DataFrame, costs: list[str]) -> dict[str, float]:
-    """The largest excess among the infeasible seeds, and its share of the limit."""
+    """Return the largest excess among the infeasible seeds, and its fraction of the limit."""
     broken = seeds[~seeds["feasible"]]
     limits = {name: seeds[f"deploy_{name.replace('cost', 'limit')}"].iloc[0] for name in costs}
     excess = [(float((broken[name] - limits[name]).max()), float(limits[name])) for name in costs]
