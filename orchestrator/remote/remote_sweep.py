@@ -3,9 +3,9 @@
     <address>/<sweep>/
         sweep.json, grid.yaml, trials.jsonl     as in a sweep's folder
         trials/                                 see ``remote_trial``
-        launch.json the launch that runs the sweep, see ``launch_lease``
-        stop.request exists while that launch is asked to stop
-        stop-<run> stop signal for the workers of one run
+        launch.json                             the launch that runs the sweep, see ``launch_lease``
+        stop.request                            exists while that launch is asked to stop
+        stop-<run>                              stop signal for the workers of one run
 
 The sweep's folder on this machine is a copy, which plan, status, figures and MLflow read like any sweep's
 folder. It may be deleted at any time, but MLflow's default database, figures, evaluations and videos are only

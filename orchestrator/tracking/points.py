@@ -3,13 +3,13 @@
 Metrics are over environment steps; the part before the slash is the UI's chart section:
 
     train/return, train/cost_0            means over the episodes of an update, training phase
-    train/episodes their number
+    train/episodes                        their number
     deploy/return, deploy/cost_0, ...     the same, deployment phase
-    curriculum/limit_0, curriculum/noise output of the curriculum; also curriculum/temperature, if any
-    agent/<name> metrics of the agent: kl, entropy, multiplier_0, ...
+    curriculum/limit_0, curriculum/noise  output of the curriculum; also curriculum/temperature, if any
+    agent/<name>                          metrics of the agent: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
     summary/deploy_return, ..._cost_0     mean over the episodes of the deployment phase; once, at the end
-    evaluation/<policy>_return, ..._cost_0 mean over the final evaluation's episodes; once, at the end
+    evaluation/<policy>_return, ..._cost_0    mean over the final evaluation's episodes; once, at the end
 
 MLflow stores an infinite value as 1.8e308 and draws it. So values that are not finite (an infinite limit, the
 mean of no episodes) are left out, and the chart has no point there.

@@ -2,7 +2,7 @@
 
 The trial may be complete or running, and its own files do not change. Results are in two separate folders:
 
-    evaluations/update-<update>__seed-<seed>.csv one row per episode, as in evaluation.csv
+    evaluations/update-<update>__seed-<seed>.csv                one row per episode, as in evaluation.csv
     videos/update-<update>__seed-<seed>__<policy>.gif           one episode
 
 ``seed-own`` is the seed of the trial's own evaluation. With it and the trial's number of episodes, the result
