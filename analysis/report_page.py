@@ -1,7 +1,7 @@
-"""A sweep's report as one self-contained HTML page: nothing is fetched, no script runs, it prints.
+"""A sweep's report as one self-contained HTML page, without scripts and external files.
 
-Figures are embedded PNGs. What is too wide for a phone scrolls by itself, so that the page never does; in
-print it shrinks instead. All text is escaped.
+Figures are embedded PNGs. Parts that are too wide for a phone scroll separately from the page; in print they
+shrink instead. All text is escaped.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Section:
 
     Attributes:
         heading: its title.
-        body: HTML, made by the functions below.
+        body: HTML from the functions below.
     """
 
     heading: str
@@ -77,13 +77,13 @@ class Section:
 
 
 def page(title: str, opening: str, sections: Sequence[Section], *, reload_seconds: int | None = None) -> str:
-    """The whole page.
+    """Return the whole page.
 
     Args:
         title: of the page.
         opening: HTML below it.
         sections: its other parts, listed below the opening.
-        reload_seconds: an open page loads itself again so often; None if nothing will change.
+        reload_seconds: interval at which an open page reloads; None if nothing will change.
     """
     links = "".join(f'<a href="#s{index}">{escape(it.heading)}</a> ' for index, it in enumerate(sections))
     parts = [
@@ -105,7 +105,7 @@ def page(title: str, opening: str, sections: Sequence[Section], *, reload_second
 
 
 def figure(png: Path, caption: str) -> str:
-    """An embedded PNG, as wide as the page but never too small to read."""
+    """Return an embedded PNG, as wide as the page but never too small to read."""
     data = base64.b64encode(png.read_bytes()).decode()
     text = escape(caption)
     return (
@@ -115,12 +115,12 @@ def figure(png: Path, caption: str) -> str:
 
 
 def table(frame: pd.DataFrame) -> str:
-    """A table of finished text."""
+    """Return a table of finished text."""
     return _table(frame, [""] * len(frame), "")
 
 
 def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:
-    """A table whose rows are coloured by their verdict.
+    """Return a table with rows coloured by their verdict.
 
     Args:
         frame: finished text, with a column ``verdict``.
@@ -146,7 +146,7 @@ def _table(frame: pd.DataFrame, of_rows: Sequence[str], of_table: str) -> str:
 
 
 def items(sentences: Sequence[str], *, kind: str = "plain") -> str:
-    """A list of sentences.
+    """Return a list of sentences.
 
     Args:
         sentences: its items.
@@ -158,5 +158,5 @@ def items(sentences: Sequence[str], *, kind: str = "plain") -> str:
 
 
 def verbatim(text: str) -> str:
-    """Text as it is."""
+    """Return text verbatim."""
     return f"<pre>{escape(text)}</pre>"
