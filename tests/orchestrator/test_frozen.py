@@ -121,7 +121,7 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(complete: TrialStore) -> N
     changed = TrialStore(complete.folder.parent / other.folder_name)
     changed.begin(other).commit(tree["trial"], update=5, env_steps=200)
     with pytest.raises(
-        RecrlError, match=r"^two-state ppo-lag none seed 5: its checkpoint cannot be used with the task and "
+        RecrlError, match=r"^two-state ppo-lag none seed 5: its checkpoint cannot be used with the installed "
     ):
         SavedTrial.load(changed)
 
@@ -174,8 +174,8 @@ def test_a_video_has_a_picture_a_step(crossing: TrialStore) -> None:
     assert contents(crossing) == before
 
 
-def test_a_task_without_pictures_is_a_sentence(complete: TrialStore) -> None:
-    with pytest.raises(RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state has no pic"):
+def test_a_task_without_rendering_is_a_sentence(complete: TrialStore) -> None:
+    with pytest.raises(RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state cannot be r"):
         SavedTrial.load(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
