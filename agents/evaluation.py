@@ -95,13 +95,13 @@ class Shot:
     """One frame of a filmed episode.
 
     Attributes:
-        picture: RGB, uint8 [height, width, 3].
+        frame: RGB, uint8 [height, width, 3].
         step: steps taken, from 0.
         episode_return: undiscounted sum of the rewards so far.
         costs: undiscounted sums of the costs so far, [k]; all 0 before the first step.
     """
 
-    picture: npt.NDArray[np.uint8]
+    frame: npt.NDArray[np.uint8]
     step: int
     episode_return: float
     costs: Floats
@@ -157,8 +157,8 @@ def _picture(environment: gymnasium.Env[Any, Any]) -> npt.NDArray[np.uint8]:
     if not (isinstance(drawn, np.ndarray) and drawn.dtype == np.uint8 and drawn.shape[2:] == (3,)):
         kind = f"{drawn.dtype} {drawn.shape}" if isinstance(drawn, np.ndarray) else type(drawn).__name__
         raise ValueError(f"a frame must be uint8 of shape [height, width, 3], got {kind}")
-    picture: npt.NDArray[np.uint8] = drawn
-    return picture
+    frame: npt.NDArray[np.uint8] = drawn
+    return frame
 
 
 def _spawned(seed: np.random.SeedSequence) -> list[np.random.SeedSequence]:

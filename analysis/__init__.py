@@ -1,4 +1,4 @@
-"""From a sweep's files to frames, statistics, figures and tables. Never imports torch or ray.
+"""From a sweep's files to data frames, statistics, figures and tables. Independent of torch and ray.
 
 Import the modules by name; this file imports nothing.
 """

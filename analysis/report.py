@@ -1,4 +1,4 @@
-"""All figures and tables of a sweep in one call, from a finished or a running one.
+"""All figures and tables of a finished or running sweep in one call.
 
     report.html                 answer, verdicts, figures and, folded, the rest on one self-contained page
     report.md                   the same as text, with links to the figures
@@ -9,18 +9,18 @@
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
     bounds_<agent>              cumulative cost of training against Proposition 1 (PDF and PNG)
     performance-profiles        fraction of final policies that are feasible and return more (PDF and PNG)
-    verdicts.csv                a row a task, agent and curriculum: what the report begins with
-    outcomes.csv                a row a trial and measure
+    verdicts.csv                one row per task, agent and curriculum: the report's first table
+    outcomes.csv                one row per trial and measure
     summary.csv                 averaged over seeds, with interquartile means
     comparisons.csv             paired differences to the agent without a curriculum
-    training.csv                what relaxed training cost, a row a trial
-    claims.csv                  the paper's claims about RiverGrid's maps, counted, where a grid has these
-    bounds.csv                  the cumulative cost against Proposition 1, a row a trial and cost
+    training.csv                cost of relaxed training, one row per trial
+    claims.csv                  the paper's claims about RiverGrid's maps, counted, if the grid has them
+    bounds.csv                  the cumulative cost against Proposition 1, one row per trial and cost
     outcomes.tex                the first tables for LaTeX (booktabs)
     outcomes.parquet            outcomes.csv with its types, for programs
 
-Of a sweep that runs, ``sketch`` draws SKETCHED, as PNGs, and all tables and pages: that takes a fraction of
-the time of the whole, and trials want the rest.
+For a running sweep, ``sketch`` draws only SKETCHED, as PNGs, and all tables and pages. This takes a
+fraction of the time, and leaves the cores to the trials.
 
 Equal sweeps give equal bytes: no time is written, and the bootstrap's generator is seeded here.
 """
@@ -82,20 +82,20 @@ class NothingToDrawError(RecrlError):
 
 
 def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
-    """Draw every figure and write every table of a sweep, as far as it has come.
+    """Draw every figure and write every table of a finished or running sweep.
 
     Args:
-        sweep: its frames, from whatever source.
-        folder: where the files go, for example ``SweepStore.figures_folder``.
-        averaging: what lines and bands of the learning curves are.
+        sweep: its data frames, of any source.
+        folder: of the files, for example ``SweepStore.figures_folder``.
+        averaging: kind of lines and bands of the learning curves.
 
     Returns:
-        The files written, ``report.html`` and ``report.md`` first.
+        The written files, ``report.html`` and ``report.md`` first.
 
     Raises:
         NothingToDrawError: no trial has committed a policy update yet.
-        Exception: what went wrong in the first figure that could not be drawn; all others and the report,
-            which names it, are there.
+        Exception: raised by the first figure that failed; all others and the report, which names it, are
+            written.
     """
     drawn, mistakes = [], _Mistakes()
     for stem, make in drawings(sweep, averaging=averaging).items():
@@ -108,7 +108,7 @@ def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Pat
 
 
 def sketch(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
-    """Draw what is cheap to draw, for a look at a sweep that runs; otherwise like ``draw``.
+    """Draw only the fast figures, for a running sweep; otherwise like ``draw``.
 
     Args:
         sweep: its frames.
@@ -126,7 +126,7 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[P
 
 
 class _Mistakes:
-    """What went wrong in single figures: the others are drawn all the same, and the report says it."""
+    """Collector of errors in single figures: the others are drawn, and the report lists the errors."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
@@ -134,7 +134,7 @@ class _Mistakes:
 
     @contextmanager
     def kept(self, stem: str) -> Iterator[None]:
-        """Keep what is raised while one figure is drawn."""
+        """Record the error of one figure."""
         try:
             yield
         except OSError:
@@ -144,7 +144,7 @@ class _Mistakes:
             self._first = self._first or error
 
     def raise_first(self) -> None:
-        """Raise the first of them, now that all else is done."""
+        """Raise the first error, after all else is done."""
         if self._first is not None:
             raise self._first
 
@@ -154,7 +154,7 @@ def _noted(sweep: Sweep, notes: list[str]) -> Sweep:
 
 
 def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
-    """Write the tables and the two reports that show the figures drawn; all files, the reports first."""
+    """Write the tables and the two reports with the figures; return all files, the reports first."""
     written, tables = write_tables(sweep, folder)
     reports = [
         report_tables.write_text(_html(sweep, drawn, tables), folder / "report.html"),
@@ -164,7 +164,7 @@ def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
 
 
 def _full_sizes(drawn: list[Path]) -> dict[Path, str]:
-    """Every PNG, and the name of the file with its full size: the PDF where one was drawn."""
+    """Return each PNG with the name of its full-size file: the PDF if there is one."""
     files = set(drawn)
     return {
         path: next(it.name for it in (path.with_suffix(".pdf"), path) if it in files)
@@ -174,7 +174,7 @@ def _full_sizes(drawn: list[Path]) -> dict[Path, str]:
 
 
 def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
-    """The report as text: answers, verdicts, warnings, figures, tables, provenance."""
+    """Return the report as text: answers, verdicts, warnings, figures, tables, provenance."""
     judged = tables.verdicts
     lines = [f"# {report_tables.markdown_text(sweep.name)}", ""]
     if len(judged):
@@ -198,13 +198,13 @@ def _list(sentences: Sequence[str]) -> list[str]:
 
 
 def _marked(table: pd.DataFrame) -> pd.DataFrame:
-    """The verdict table with violators in bold."""
+    """Return the verdict table with violations in bold."""
     texts = [f"**{text}**" if report_verdicts.INFEASIBLE in text else text for text in table["verdict"]]
     return table.assign(verdict=texts)
 
 
 def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable[[], Figure | None]]:
-    """The figures of a sweep by the stems of their files, made when called; None where there is nothing.
+    """Return the figures of a sweep by file stem, as functions; a function returns None without data.
 
     Args:
         sweep: its frames.
@@ -243,17 +243,17 @@ def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable
 
 
 def averagings() -> dict[str, Averaging]:
-    """What lines and bands can be, by the name that the command line has for it."""
+    """Return the kinds of lines and bands, by their names on the command line."""
     return {"mean": MEAN, "iqm": interquartile(np.random.default_rng(BOOTSTRAP_SEED))}
 
 
 def _safe(label: str) -> str:
-    """A label as part of a file's name."""
+    """Return a label as part of a file's name."""
     return re.sub(r"[^A-Za-z0-9.+-]+", "-", label)
 
 
 def missing(sweep: Sweep) -> list[str]:
-    """Sentences on what a reader might take for complete but is not; empty for a whole sweep."""
+    """Return sentences on incomplete results; empty for a complete sweep."""
     sentences = [*sweep.notes, *doubts(sweep)]
     for status, what in (
         (TrialState.DAMAGED, "damaged"),
@@ -283,14 +283,14 @@ def missing(sweep: Sweep) -> list[str]:
 
 
 def _count(sweep: Sweep) -> str:
-    """How many trials stand how: ``20 trials: 1 running, 19 complete.``."""
+    """Count trials by status: ``20 trials: 1 running, 19 complete.``."""
     counts = sweep.trials["status"].value_counts()
     states = [f"{counts[state.value]} {state.value}" for state in TrialState if counts.get(state.value)]
     return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
 def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
-    """The page: answers, verdicts, warnings and the first figures; all else is folded."""
+    """Return the page: answers, verdicts, warnings and the first figures; the rest is folded."""
     failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
     sentences = [_count(sweep), *missing(sweep)]
     figures = _full_sizes(drawn)
@@ -317,7 +317,7 @@ def _figures(figures: Mapping[Path, str]) -> str:
 
 
 def _opening(judged: pd.DataFrame) -> str:
-    """The answers and the verdict table."""
+    """Return the answers and the verdict table."""
     if not len(judged):
         return report_page.items([report_verdicts.NO_VERDICT], kind="answers")
     return "\n".join(
@@ -332,7 +332,7 @@ def _opening(judged: pd.DataFrame) -> str:
 
 
 def _settings(sweep: Sweep) -> str:
-    """Every task, agent and curriculum with its options, a line each."""
+    """Return every task, agent and curriculum with its options, one line each."""
     settings = {
         f"{kind} {choice['label']}": choice
         for trial in sweep.facts
@@ -348,6 +348,6 @@ def _caption(path: Path) -> str:
 
 
 def _provenance(sweep: Sweep) -> list[str]:
-    """Every different origin of the trials, and how many have it."""
+    """Return every distinct provenance of the trials, with the number of trials."""
     origins = Counter(trial.provenance for trial in sweep.facts if trial.provenance)
     return [f"{count} trials:\n{text}" for text, count in sorted(origins.items())]

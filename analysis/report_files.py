@@ -1,4 +1,4 @@
-"""The tables of a sweep: written as files, and as text for the report."""
+"""The tables of a sweep: files, and text for the report."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ShownTable:
 
 @dataclass(frozen=True)
 class Tables:
-    """What the report shows beside the figures.
+    """Content of the report besides the figures.
 
     Attributes:
         verdicts: of ``verdicts.verdicts``; empty before a trial is complete.
@@ -57,14 +57,14 @@ class Tables:
 
 
 def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
-    """Write the tables of a sweep, as far as it has come.
+    """Write the tables of a finished or running sweep.
 
     Args:
         sweep: its frames.
         folder: where the files go.
 
     Returns:
-        The files, and what the report shows of them.
+        The files, and the report's content.
     """
     rows = metrics.outcomes(sweep)
     bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
@@ -104,13 +104,13 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
 
 
 def _outcome_tables(averaged: pd.DataFrame) -> list[ShownTable]:
-    """The outcomes, those of the final policy first."""
+    """Return the outcomes, those of the final policy first."""
     tables = [(measure, report_tables.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
     return [ShownTable(_heading(measure), table) for measure, table in tables if len(table)]
 
 
 def _comparison_tables(compared: pd.DataFrame) -> list[ShownTable]:
-    """Differences to the agent without a curriculum, those of the final policy first."""
+    """Return differences to the agent without a curriculum, those of the final policy first."""
     if not len(compared):
         return []
     return [

@@ -1,7 +1,7 @@
-"""A sweep's report as one self-contained HTML page: nothing is fetched, no script runs, it prints.
+"""A sweep's report as one self-contained HTML page, without scripts and external files.
 
-Figures are embedded PNGs; a click magnifies one. What is too wide for a phone scrolls by itself, so that the
-page never does; in print it shrinks instead, and what is folded is printed as well. All text is escaped.
+Figures are embedded PNGs; a click magnifies one. Parts that are too wide for a phone scroll separately from
+the page; in print they shrink instead. Folded sections are printed as well. All text is escaped.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ class Section:
 
     Attributes:
         heading: its title.
-        body: HTML, made by the functions below.
-        folded: whether only the heading shows until somebody opens it.
+        body: HTML from the functions below.
+        folded: whether only the heading shows until it is opened.
     """
 
     heading: str
@@ -94,13 +94,13 @@ class Section:
 
 
 def page(title: str, opening: str, sections: Sequence[Section], *, reload_seconds: int | None = None) -> str:
-    """The whole page.
+    """Return the whole page.
 
     Args:
         title: of the page.
         opening: HTML below it.
         sections: its other parts.
-        reload_seconds: an open page loads itself again so often; None if nothing will change.
+        reload_seconds: interval at which an open page reloads; None if nothing will change.
     """
     reload = f'<meta http-equiv="refresh" content="{reload_seconds}">' if reload_seconds else ""
     return "\n".join(
@@ -117,12 +117,12 @@ def page(title: str, opening: str, sections: Sequence[Section], *, reload_second
 
 
 def figure(png: Path, caption: str, file: str) -> str:
-    """An embedded PNG, as wide as the page but never too small to read; a click magnifies it.
+    """Return an embedded PNG, as wide as the page but never too small to read; a click magnifies it.
 
     Args:
-        png: the picture.
-        caption: below it.
-        file: the name of the file beside the page that the caption leads to.
+        png: the image.
+        caption: text below it.
+        file: name of the file for the link in the caption.
     """
     data = base64.b64encode(png.read_bytes()).decode()
     text, name = escape(caption), escape(file)
@@ -134,13 +134,13 @@ def figure(png: Path, caption: str, file: str) -> str:
 
 
 def table(frame: pd.DataFrame, note: str = "") -> str:
-    """A table of finished text, and a sentence below it."""
+    """Return a table of finished text with a note below it."""
     below = f'\n<p class="notes">{escape(note)}</p>' if note else ""
     return _table(frame, [""] * len(frame), "") + below
 
 
 def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:
-    """A table whose rows are coloured by their verdict.
+    """Return a table with rows coloured by their verdict.
 
     Args:
         frame: finished text, with a column ``verdict``.
@@ -166,7 +166,7 @@ def _table(frame: pd.DataFrame, of_rows: Sequence[str], of_table: str) -> str:
 
 
 def items(sentences: Sequence[str], *, kind: str = "plain") -> str:
-    """A list of sentences.
+    """Return a list of sentences.
 
     Args:
         sentences: its items.
@@ -178,5 +178,5 @@ def items(sentences: Sequence[str], *, kind: str = "plain") -> str:
 
 
 def verbatim(text: str) -> str:
-    """Text as it is."""
+    """Return text verbatim."""
     return f"<pre>{escape(text)}</pre>"

@@ -1,4 +1,4 @@
-"""What the trials achieved, as tables: CSV with every digit for programs, Markdown and LaTeX for people.
+"""Tables of the trials' outcomes: CSV with every digit for programs, Markdown and LaTeX for people.
 
 In the tables for people a value is "mean ± standard error" over seeds, or one seed's value. A share of seeds
 is "3 of 5", from five seeds on with Wilson's 95% interval in percent.
@@ -37,9 +37,10 @@ LATEX = {
 
 
 def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
-    """Return, costs, regret and shares of feasible and solved seeds, as text.
+    """Format return, costs, regret and fractions of feasible and solved seeds.
 
-    The regret, J*(d_d) minus the return, is left out where a seed is infeasible: it may be above J*(d_d).
+    The regret, J*(d_d) minus the return, is left out if a seed is infeasible, because its return may be above
+    J*(d_d).
 
     Args:
         summary: of ``metrics.summary``.
@@ -66,7 +67,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
 
 
 def comparison_table(comparisons: pd.DataFrame, measure: Measure) -> pd.DataFrame:
-    """Paired differences to the agent without a curriculum, as text.
+    """Format paired differences to the agent without a curriculum.
 
     Args:
         comparisons: of ``metrics.comparisons``.
@@ -88,7 +89,7 @@ def comparison_table(comparisons: pd.DataFrame, measure: Measure) -> pd.DataFram
 
 
 def number(value: float) -> str:
-    """A value with as many digits as it deserves; a dash for NaN.
+    """Format a value with suitable digits; a dash for NaN.
 
     >>> [number(value) for value in (9.5, 128.44, 0.0312, 0.0, float("nan"))]
     ['9.50', '128.4', '0.031', '0.00', '–']
@@ -101,7 +102,7 @@ def number(value: float) -> str:
 
 
 def with_error(mean: float, error: float, *, digits: int = 2) -> str:
-    """Mean ± standard error, the error left out where one seed has none.
+    """Format mean ± standard error, without the error for a single seed.
 
     Args:
         mean: NaN becomes a dash.
@@ -121,7 +122,7 @@ def with_error(mean: float, error: float, *, digits: int = 2) -> str:
 
 
 def with_interval(row: pd.Series, name: str) -> str:
-    """Estimate [low, high] from the three columns of an interval; without ends where there are none."""
+    """Format estimate [low, high] from the three columns of an interval; without ends if they are NaN."""
     estimate, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
     shown, low, high = (round(value, 2) + 0.0 for value in (estimate, low, high))  # no -0.00
     ends = "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
@@ -129,7 +130,7 @@ def with_interval(row: pd.Series, name: str) -> str:
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """A Markdown table; repeated labels in the first columns stay, so that it can be sorted and searched.
+    """Format a Markdown table; repeated labels in the first columns stay, for sorting and searching.
 
     >>> print(markdown(pd.DataFrame({"task": ["1a"], "return": ["9.50"]})))
     | task | return |
@@ -141,7 +142,7 @@ def markdown(table: pd.DataFrame) -> str:
 
 
 def markdown_text(text: str) -> str:
-    r"""A text that Markdown shows as it is where it would be HTML, a link or the end of a cell.
+    r"""Escape HTML, links and cell separators in a text for Markdown.
 
     >>> markdown_text("<img src=x> [a](b) | c")
     '&lt;img src=x&gt; [a]\\(b) \\| c'
@@ -153,7 +154,7 @@ def markdown_text(text: str) -> str:
 
 
 def latex(table: pd.DataFrame) -> str:
-    """A LaTeX tabular for the package booktabs, with a rule between tasks."""
+    """Format a LaTeX tabular for the package booktabs, with a rule between tasks."""
     lines = [r"\begin{tabular}{" + "l" * len(table.columns) + "}", r"\toprule"]
     lines += [_latex_line(list(map(str, table))), r"\midrule"]
     before = None
@@ -166,21 +167,21 @@ def latex(table: pd.DataFrame) -> str:
 
 
 def write_csv(frame: pd.DataFrame, path: Path) -> Path:
-    """A frame with every digit; floats as the shortest text that reads back equal."""
+    """Write a data frame as CSV; floats as the shortest exact text."""
     path.parent.mkdir(parents=True, exist_ok=True)
     frame.to_csv(path, index=False, lineterminator="\n")
     return path
 
 
 def write_parquet(frame: pd.DataFrame, path: Path) -> Path:
-    """A frame with its types, for programs."""
+    """Write a data frame as Parquet, with its types."""
     path.parent.mkdir(parents=True, exist_ok=True)
     frame.to_parquet(path, index=False)
     return path
 
 
 def write_text(text: str, path: Path) -> Path:
-    """A text file that ends with a line feed."""
+    """Write a text file that ends with a line feed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
     return path

@@ -1,4 +1,4 @@
-"""The verdicts in words: the sentences and the table that a report begins with."""
+"""The verdicts in words: the first sentences and the first table of a report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_VERDICT = "No trial is complete yet: no verdict."
 
 
 def explanation(verdicts: pd.DataFrame) -> list[str]:
-    """Sentences that define the words of the verdict table.
+    """Return sentences that define the words of the verdict table.
 
     Args:
         verdicts: of ``verdicts.verdicts``.
@@ -52,7 +52,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
 
 
 def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """A row a task, agent and curriculum, as text.
+    """Return one row per task, agent and curriculum, as text.
 
     Args:
         verdicts: of ``verdicts.verdicts``.
@@ -82,7 +82,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 
 def verdict_kinds(verdicts: pd.DataFrame) -> list[str]:
-    """The worst verdict of each row: SOLVED, FEASIBLE or INFEASIBLE."""
+    """Return the worst verdict of each row: SOLVED, FEASIBLE or INFEASIBLE."""
     return [
         INFEASIBLE if row["infeasible"] else SOLVED if row["solved"] == row["seeds"] else FEASIBLE
         for _, row in verdicts.iterrows()
@@ -90,7 +90,7 @@ def verdict_kinds(verdicts: pd.DataFrame) -> list[str]:
 
 
 def verdict_text(row: pd.Series) -> str:
-    """One row's verdict: counts of seeds, and by how much the worst one is infeasible.
+    """Format one row's verdict: counts of seeds, and the largest violation.
 
     >>> counts = {"solved": 3, "feasible": 4, "seeds": 5, "worst_excess": 0.4, "worst_share": 0.08}
     >>> verdict_text(pd.Series(counts | {"infeasible": 1}))
@@ -127,7 +127,7 @@ def warning_text(row: pd.Series) -> str:
 
 
 def answers(verdicts: pd.DataFrame) -> list[str]:
-    """One sentence a task: how many final policies solve it, with which curricula, and which violate.
+    """Return one sentence per task: how many final policies solve it, by which curricula, and which violate.
 
     Args:
         verdicts: of ``verdicts.verdicts``.
@@ -152,7 +152,7 @@ def _answer(task: str, rows: pd.DataFrame) -> str:
 
 
 def _best(rows: pd.DataFrame, column: str) -> str:
-    """Which curricula do best, and what ``none`` does."""
+    """Describe the best curricula, and ``none``."""
     counts = rows.groupby("method", sort=False)[[column, "seeds"]].sum()
     shares = counts[column] / counts["seeds"]
     best = [str(method) for method in counts.index[shares == shares.max()]]
@@ -180,7 +180,7 @@ def _violations(rows: pd.DataFrame) -> list[str]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Names in a sentence.
+    """Join names in a sentence.
 
     >>> _listed(["a"]), _listed(["a", "b", "c"])
     ('a', 'a, b and c')

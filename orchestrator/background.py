@@ -1,4 +1,4 @@
-"""Work in a thread beside a block of code, for as long as the block takes."""
+"""Run a function in a background thread during a block of code."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from contextlib import contextmanager
 
 @contextmanager
 def beside(work: Callable[[threading.Event], object], *, name: str) -> Iterator[None]:
-    """Do something in a thread of its own until the end of the ``with`` block, which waits for it.
+    """Run a function in a thread until the end of the ``with`` block, which waits for it.
 
     Args:
-        work: told by the event that the block is over, however that ended; to return soon after. It may
-            return before.
-        name: the thread's.
+        work: the function. Its event is set when the block ends, also by an error; then it must return soon.
+            It may return earlier.
+        name: of the thread.
     """
     over = threading.Event()
     thread = threading.Thread(target=work, args=(over,), name=name, daemon=True)

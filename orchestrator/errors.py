@@ -1,4 +1,4 @@
-"""The questions a user may have, each an exception; only ``cli`` turns them into text and exit codes."""
+"""Errors that a user can understand, one class per question; only ``cli`` turns them into exit codes."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 
 
 class RecrlError(Exception):
-    """Anything that a user can understand and mend; its text is one clear sentence."""
+    """An error that a user can correct; its text is one clear sentence."""
 
 
 class GridError(RecrlError):
-    """A grid file is wrong; ``problems`` holds one located sentence for every mistake in it."""
+    """A grid file is wrong; ``problems`` holds one located sentence for each mistake."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
@@ -19,11 +19,11 @@ class GridError(RecrlError):
 
 
 class UncalledError(RecrlError):
-    """A grid has no mistake that could be found without code that it names, which was not run.
+    """A grid was checked without its import paths, which were not followed; no mistake was found.
 
     Attributes:
         source: the grid file's name.
-        uncalled: where the import paths are, and what they are.
+        uncalled: places and texts of the import paths.
     """
 
     def __init__(self, source: str, uncalled: list[str]) -> None:
@@ -37,11 +37,11 @@ class UncalledError(RecrlError):
 
 
 class CheckpointError(RecrlError):
-    """A checkpoint is truncated, damaged or of another version; an older one may serve."""
+    """A checkpoint is truncated, damaged or of another version; an older one may be used."""
 
 
 class StorageError(RecrlError):
-    """A trial's files cannot be written, or read where they are kept; its last commit stands."""
+    """A trial's files cannot be written or read; the last commit is intact."""
 
 
 class DamagedError(StorageError):
@@ -53,11 +53,11 @@ class OtherFormatError(DamagedError):
 
 
 class RowError(RecrlError):
-    """A row does not have the columns of its file, or holds what is no cell."""
+    """A row does not have the columns of its file, or contains an invalid value."""
 
 
 class LostLeaseError(RecrlError):
-    """Another attempt has taken this trial over; this one must write nothing more."""
+    """Another attempt has taken over this trial; this one must not write any more."""
 
 
 class SweepBusyError(RecrlError):
@@ -69,31 +69,33 @@ class TeacherUnavailableError(RecrlError):
 
 
 class ClusterError(RecrlError):
-    """Ray cannot be started or reached, or lacks what a trial asks for."""
+    """Ray cannot be started or reached, or lacks the resources of a trial."""
 
 
 class TrackingError(RecrlError):
-    """MLflow cannot be used in the way that was asked for; training does not depend on it."""
+    """MLflow cannot be used as requested; training does not depend on it."""
 
 
-# What a user's own task, agent or teacher may raise, and what must not end more than its own work.
+# Exceptions of a user's task, agent or curriculum, which must end only their own trial.
 USERS_ERRORS = (Exception, SystemExit)
 
 
 def described(error: BaseException) -> str:
-    """An error as one line: ``KeyError: 'window'``; of one that ends the process, its exit code."""
+    """Return an error as one line: ``KeyError: 'window'``; for SystemExit, its exit code."""
     if isinstance(error, SystemExit):
         return f"it ended the process (exit code {error.code})"
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def missing(path: Path) -> str:
-    """What is said of a file that is not there: where it was looked for, and what there may be meant."""
+    """Describe a missing file: the folder that was searched, and similar names in it."""
     folder = path.absolute().parent
     if not folder.is_dir():
         return f"there is no folder {folder}"
     files = sorted(each for each in folder.iterdir() if each.is_file())
-    files.sort(key=lambda each: each.suffix == path.suffix)  # of two with one stem, that of the same kind
+    files.sort(
+        key=lambda each: each.suffix == path.suffix
+    )  # if two have the same stem, the one with this suffix
     names = {each.stem: each.name for each in files}
     near = difflib.get_close_matches(path.stem, names, n=1)
     hint = f"; did you mean {names[near[0]]!r}?" if near else ""

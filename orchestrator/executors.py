@@ -1,9 +1,8 @@
-"""Who runs the trials of a sweep.
+"""Executors run the trials of a sweep.
 
-An executor works through specs and leaves everything it achieved in the sweep's files; it returns nothing.
-What happened is read back from there, so an executor may die at any time. Ray is one executor
-(``ray.executor``); ``InlineExecutor`` runs the trials one after the other in this process: for tests,
-debuggers, and machines without Ray.
+An executor runs specs and writes all results to the sweep's files; it returns nothing. Results are read from
+the files, so an executor may die at any time. Ray is one executor (``ray.executor``); ``InlineExecutor`` runs
+the trials one after the other in this process: for tests, debuggers and machines without Ray.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from recrl.orchestrator.spec import TrialSpec
 
 
 class Executor(Protocol):
-    """Something that runs trials."""
+    """Interface of executors."""
 
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
-        """Work on the specs, in order of priority, until each is finished or ``stop`` is set.
+        """Run the specs, in order of priority, until each is finished or ``stop`` is set.
 
         A trial that raises is recorded as failed in its own files; the others go on. When ``stop`` is
         set, running trials checkpoint at their next update and the call returns soon after.
@@ -29,7 +28,7 @@ class Executor(Protocol):
 
 
 class InlineExecutor:
-    """Runs the trials one after the other in this process."""
+    """Executor that runs the trials one after the other in this process."""
 
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """See ``Executor.run``."""

@@ -1,7 +1,7 @@
-"""YAML in which every value knows its line, so that a mistake can be pointed at.
+"""YAML with the line of every value, for error messages.
 
-Only plain data is read: mappings with text keys, lists, text, numbers, booleans and null; any other tag is
-a mistake, never code. Scalars follow YAML 1.2's core schema, not 1.1's: ``no`` and ``on`` are text, ``010``
+Only plain data is read: mappings with text keys, lists, text, numbers, booleans and null; any other tag is an
+error and runs no code. Scalars follow YAML 1.2's core schema, not 1.1's: ``no`` and ``on`` are text, ``010``
 is ten, and ``1e6`` is a number.
 """
 
@@ -14,11 +14,11 @@ from typing import Any
 
 import yaml
 
-# Where a value is: keys and list indices from the root, for example ("methods", 1, "options").
+# Place of a value: keys and list indices from the root, for example ("methods", 1, "options").
 Place = tuple[str | int, ...]
 
 MAX_BYTES = 1 << 20
-MAX_VALUES = 20_000  # aliases may repeat a part of the file; this is how much it may grow to
+MAX_VALUES = 20_000  # aliases may repeat a part of the file; this bounds the growth
 MAX_DEPTH = 40
 
 
@@ -29,7 +29,7 @@ class Problem:
     Attributes:
         line: counted from 1.
         place: the place's keys and indices; () for the whole document.
-        sentence: what is wrong and what is allowed, without the place.
+        sentence: the mistake and the allowed values, without the place.
     """
 
     line: int
@@ -46,9 +46,9 @@ class Document:
     """A parsed file.
 
     Attributes:
-        value: dicts, lists and scalars; None where the file could not be parsed at all.
+        value: dicts, lists and scalars; None if the file could not be parsed.
         lines: the line of each value, by its place; a mapping's value has the line of its key.
-        problems: what is wrong with the file as YAML.
+        problems: mistakes of YAML syntax.
     """
 
     value: Any
@@ -56,14 +56,14 @@ class Document:
     problems: tuple[Problem, ...] = ()
 
     def line(self, place: Place) -> int:
-        """The line of the value at ``place``, or of the nearest value around it."""
+        """Return the line of the value at ``place``, or of the nearest value around it."""
         while place and place not in self.lines:
             place = place[:-1]
         return self.lines.get(place, 1)
 
 
 def parse(data: bytes) -> Document:
-    """Read one YAML document; mistakes are in ``problems``, nothing is raised."""
+    """Read one YAML document; mistakes are in ``problems``, not raised."""
     reader = _Reader()
     try:
         value = reader.value(_root(data), ())
@@ -73,7 +73,7 @@ def parse(data: bytes) -> Document:
 
 
 class _UnreadableError(Exception):
-    """The file as a whole is no document that could be checked further."""
+    """The file is no document that could be checked further."""
 
     def __init__(self, line: int, sentence: str) -> None:
         super().__init__(sentence)
@@ -81,7 +81,7 @@ class _UnreadableError(Exception):
 
 
 def _root(data: bytes) -> yaml.Node:
-    """The root node of the one document in ``data``."""
+    """Return the root node of the one document in ``data``."""
     if len(data) > MAX_BYTES:
         raise _UnreadableError(1, f"the file must have at most {MAX_BYTES} bytes, got {len(data)}")
     try:
@@ -103,7 +103,7 @@ def _root(data: bytes) -> yaml.Node:
 
 
 class _Loader(yaml.SafeLoader):
-    """Parses only; its scalar rules are those of YAML 1.2's core schema."""
+    """Parser with the scalar rules of YAML 1.2's core schema."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  (PyYAML's name for its table)
 
@@ -132,14 +132,14 @@ _SCALARS: Mapping[str, Callable[[str], Any]] = {
 
 
 class _Reader:
-    """Turns nodes into values and remembers where they were."""
+    """Converter of nodes to values that records their lines."""
 
     def __init__(self) -> None:
         self.lines: dict[Place, int] = {}
         self.problems: list[Problem] = []
 
     def value(self, node: yaml.Node, place: Place) -> Any:
-        """The value of a node, of which ``place`` says where it is."""
+        """Return the value of a node at ``place``."""
         line = self.lines.setdefault(place, _line(node))
         if len(place) > MAX_DEPTH:
             raise _UnreadableError(line, f"nested deeper than {MAX_DEPTH} levels")

@@ -1,7 +1,7 @@
-"""Where a sweep is kept: in its folder, or in an object store that the folder copies.
+"""Storage of a sweep: its folder, or an object store of which the folder is a copy.
 
-A launch, its executors and the commands use a ``SweepPlace`` and do not ask which of the two it is. The
-object store's is ``remote.remote_sweep.RemoteSweep``; ``remote.opening`` chooses.
+A launch, its executors and the commands use a ``SweepPlace`` for both. That of an object store is
+``remote.remote_sweep.RemoteSweep``; ``remote.opening`` chooses.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from recrl.orchestrator.spec import TrialSpec
 
 
 class SweepPlace:
-    """Where the trials of a sweep are kept, as seen from one machine; here the sweep's folder.
+    """Storage of the trials of a sweep, as seen from one machine; here the sweep's folder.
 
     Every node sees the folder under the same path, so most methods have nothing to do.
 
@@ -38,24 +38,24 @@ class SweepPlace:
         return ""
 
     def prepare(self) -> None:
-        """Find out whether the place can be used, before any work.
+        """Check that the place can be used, before any work.
 
         Raises:
             RecrlError: it cannot.
         """
 
     def require_reruns(self) -> None:
-        """Find out whether trials that have ended can be run again here.
+        """Check that finished trials can be run again here.
 
         Raises:
             RecrlError: they cannot.
         """
 
     def held(self, stop: threading.Event) -> AbstractContextManager[None]:
-        """Be the one launch, on all machines, that runs the sweep; its folder is locked already.
+        """Hold the sweep as the only launch on all machines; its folder is locked already.
 
         Args:
-            stop: set when somebody asks for it on another machine, or has taken the sweep over.
+            stop: set on a request from another machine, or when another launch has taken over.
 
         Raises:
             SweepBusyError: another launch runs the sweep.
@@ -66,27 +66,27 @@ class SweepPlace:
         """Bring the folder up to date.
 
         Args:
-            checkpoints: whether to bring those of trials that still run.
+            checkpoints: whether to include those of running trials.
         """
 
     def refresh(self, *, checkpoints: bool = False) -> None:
-        """Bring the folder up to date for somebody who looks; log a warning if that is impossible."""
+        """Bring the folder up to date for a reader; log a warning if that is impossible."""
 
     def publish(self) -> None:
-        """Send what the folder says of the sweep itself."""
+        """Send the sweep's own files."""
 
     def kept_up_to_date(self, stop: threading.Event) -> AbstractContextManager[None]:
         """Keep the folder up to date while the body runs, and once more after it."""
         return nullcontext()
 
     def settle(self, specs: Sequence[TrialSpec]) -> None:
-        """Send what only this machine knows of trials that nobody runs: that their process died."""
+        """Send the status of trials whose processes died, which only this machine knows."""
 
     def request_stop(self) -> Callable[[], bool]:
-        """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
+        """Ask the launch that runs the sweep, on any machine, to save its trials and end.
 
         Returns:
-            A function that says whether it still runs.
+            A function that returns whether it still runs.
         """
         if self.store.is_locked():
             self.store.stop_request_path.touch()

@@ -1,8 +1,9 @@
-"""What may be shown or kept of a text: no password, no token, and nothing that a terminal would obey.
+"""Remove passwords, tokens and control characters from texts.
 
-Addresses carry secrets in three places: the user info (``scheme://user:password@host``, ``scheme://TOKEN@host``),
-the query (``?password=...``) and the fragment. People write a password as it is, so it may hold an ``@``, a
-``:`` or a ``/`` that should have been encoded. Where it is unclear, more is hidden rather than less.
+Addresses carry secrets in three places: the user info (``scheme://user:password@host``,
+``scheme://TOKEN@host``),
+the query (``?password=...``) and the fragment. A password may contain an ``@``, a ``:`` or a ``/`` that
+should have been encoded. If it is unclear, more is hidden rather than less.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _SETTING = re.compile(
     r"(\"[^\"]*\"|'[^']*'|[^\s&;,#'\")]+)"
 )
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^:@]*)(:[0-9]{1,5})?")  # an authority without a secret
-# In these, what precedes the @ is the name of a container.
+# In these schemes the part before the @ is the name of a container.
 _CONTAINERS = frozenset(("abfs", "abfss", "wasb", "wasbs"))
 _UNSEEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
@@ -28,7 +29,7 @@ _UNSEEN = re.compile(
 
 
 def redacted(text: str) -> str:
-    """Return the text with the secrets of all addresses in it hidden.
+    """Return the text with the secrets in all addresses hidden.
 
     >>> redacted("postgresql://me:p@ss/word@host/mlflow?sslmode=require&password=secret")
     'postgresql://***@host/mlflow?sslmode=require&password=***'
@@ -44,13 +45,13 @@ def _without_user(address: re.Match[str]) -> str:
     scheme, rest = address.groups()
     authority = re.split(r"[/?#]", rest, maxsplit=1)[0]
     container = scheme.lower() in _CONTAINERS and ":" not in authority.partition("@")[0]
-    if container or "@" not in rest or _HOST.fullmatch(authority):  # else a password may hold slashes
+    if container or "@" not in rest or _HOST.fullmatch(authority):  # otherwise a password may contain slashes
         return address[0]
     return f"{scheme}://{HIDDEN}{rest[rest.rindex('@') :]}"
 
 
 def printable(text: str) -> str:
-    r"""Return the text with everything escaped that a terminal would obey instead of showing it.
+    r"""Return the text with control characters escaped.
 
     Line feeds and tabs stay.
 
@@ -61,22 +62,22 @@ def printable(text: str) -> str:
 
 
 def shown(text: str) -> str:
-    """Return the text as it may be shown to people: without secrets, and without control characters."""
+    """Return the text for display: without secrets and control characters."""
     return printable(redacted(text))
 
 
 class RedactedStream(io.TextIOBase):
-    """A stream of a process's output on which secrets are hidden, whoever writes: other packages, tracebacks.
+    """An output stream that hides secrets, also in tracebacks and output of other packages.
 
     Args:
-        stream: where the text goes.
+        stream: the underlying stream.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write the text as it may be shown; a line at a time, as logs and tracebacks do."""
+        """Write the text without secrets, a line at a time, as logs and tracebacks do."""
         self._stream.write(redacted(text))
         return len(text)
 
@@ -85,5 +86,5 @@ class RedactedStream(io.TextIOBase):
         self._stream.flush()
 
     def fileno(self) -> int:
-        """The file that the stream writes to."""
+        """File descriptor of the underlying stream."""
         return self._stream.fileno()

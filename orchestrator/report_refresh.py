@@ -1,9 +1,9 @@
-"""The report of a sweep, drawn again now and then while the sweep runs.
+"""Redraw the report of a running sweep at intervals.
 
-Drawing takes seconds of a core that trials want. So it is a sketch (``recrl-sweep figures --sketch``), made
-in a process of its own, of the lowest priority, and seldom enough to take at most about a thirtieth of a
-core. What it draws lies in the sweep's figures folder, from which the mirror sends it to MLflow. A report
-that cannot be drawn is no failure: the launch draws the last and whole one itself.
+Drawing takes seconds of a core. So it is a sketch (``recrl-sweep figures --sketch``), made in a separate
+process of the lowest priority. On average it takes at most about a thirtieth of a core. The output is in the
+sweep's figures folder, from which the MLflow sync uploads it. A failure is not fatal: the launch draws the
+final, complete report itself.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 
 FIRST_SECONDS = 120.0
 INTERVAL_SECONDS = 300.0
-REST = 30.0  # times as long as the last drawing took
+REST = 30.0  # multiple of the time of the last drawing
 LOWEST_PRIORITY = 19
 
 
@@ -30,12 +30,12 @@ LOWEST_PRIORITY = 19
 def refreshing(
     store: SweepStore, *, first_seconds: float = FIRST_SECONDS, interval_seconds: float = INTERVAL_SECONDS
 ) -> Iterator[None]:
-    """Draw the report again and again until the end of the ``with`` block.
+    """Redraw the report at intervals until the end of the ``with`` block.
 
     Args:
         store: the sweep.
-        first_seconds: until the first time.
-        interval_seconds: between two times, at least.
+        first_seconds: until the first drawing.
+        interval_seconds: least time between two drawings.
     """
     work = partial(_refresh, store, first_seconds, interval_seconds)
     with beside(work, name="report"):
@@ -43,7 +43,7 @@ def refreshing(
 
 
 def sketch_command(store: SweepStore) -> list[str]:
-    """The command that sketches the sweep's report."""
+    """Return the command that sketches the sweep's report."""
     root = ["--root", str(store.folder.parent)]
     return [
         sys.executable,
@@ -66,7 +66,7 @@ def _refresh(store: SweepStore, wait: float, interval: float, over: threading.Ev
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for the launch
+            start_new_session=True,  # Ctrl-C is handled by the launch
         )
         os.setpriority(os.PRIO_PROCESS, process.pid, LOWEST_PRIORITY)
         while process.poll() is None and not over.wait(0.2):

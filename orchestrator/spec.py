@@ -1,8 +1,8 @@
-"""What one trial is: a frozen, JSON-able value that fixes everything a result depends on.
+"""Specification of a trial: a frozen value, convertible to JSON, that determines the result.
 
-Two trials with equal specs give equal bytes. Paths, cluster addresses, logging and the number of workers
-are therefore not in it. ``trial_id`` is a hash of the spec's canonical JSON; ``group`` is the same hash
-without the seed, so that runs to be averaged share it.
+Two trials with equal specs give equal bytes. So it does not contain paths, cluster addresses, logging or the
+number of workers. ``trial_id`` is a hash of the spec's canonical JSON; ``group`` is the same hash without the
+seed, so that runs to be averaged share it.
 
 Notation: d_t training limits, d_d deployment limits, B the training budget, T rollout steps.
 """
@@ -24,28 +24,28 @@ from recrl.teachers.teacher import TeacherSpec
 
 
 class TrialState(StrEnum):
-    """Where a trial stands, as its files say."""
+    """Status of a trial in its files."""
 
     WAITING = "waiting"
     RUNNING = "running"
     COMPLETE = "complete"
     FAILED = "failed"
-    DAMAGED = "damaged"  # as a reader finds it; no file says so of itself
+    DAMAGED = "damaged"  # found by a reader; not stored in a file
 
     @property
     def is_finished(self) -> bool:
-        """Whether no further launch of the same grid would work on it by itself."""
+        """Whether another launch of the same grid would leave the trial alone."""
         return self in (TrialState.COMPLETE, TrialState.FAILED)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A task, agent or teacher chosen in a grid.
+    """A task, agent or curriculum chosen in a grid.
 
     Attributes:
         name: registry name, entry point or import path.
-        options: its settings, as JSON values; validated by its own config class.
-        label: what tables, figures and folders call it; the name unless the grid says otherwise.
+        options: its settings, as JSON values, validated by its own config class.
+        label: its label in tables, figures and folders; the name unless the grid has another.
     """
 
     name: str
@@ -63,19 +63,19 @@ class Choice:
 
 @dataclass(frozen=True)
 class TrialSpec:
-    """One cell of a sweep.
+    """One trial of a sweep.
 
     Attributes:
         task: the CMDP.
         agent: the agent.
-        method: the teacher; its label is the method's name in tables and figures.
-        train_limits: d_t, [k]; infinite where the teacher is to measure its start or needs none.
+        method: the curriculum; its label is the method's name in tables and figures.
+        train_limits: d_t, [k]; infinite if the curriculum measures its start or needs none.
         deploy_limits: d_d, [k], finite, at most d_t.
         train_steps: B, environment steps of the training phase, at least 1.
         deploy_steps: environment steps of the deployment phase, at least 0.
-        num_envs: environments stepped together, at least 1.
+        num_envs: number of environments, at least 1.
         rollout_steps: T, steps of each environment between two policy updates, at least 1.
-        evaluation_episodes: episodes of each frozen-policy evaluation at the end, at least 0.
+        evaluation_episodes: episodes of each final evaluation, at least 0.
         seed: at least 0; the same seed gives the same initial policy and the same environment stream
             under every method.
     """
@@ -109,7 +109,7 @@ class TrialSpec:
 
     @property
     def teacher(self) -> TeacherSpec:
-        """The teacher's part of the spec."""
+        """Return the curriculum's part of the spec."""
         return TeacherSpec(
             name=self.method.name,
             options=self.method.options,
@@ -122,7 +122,7 @@ class TrialSpec:
         """Whether the measured d_t is not above d_d anywhere: then the limits are d_d from the start.
 
         Args:
-            start_limits: the d_t that the curriculum measured, [k]; None if it has not, or need not.
+            start_limits: the measured d_t, [k]; None if it was not measured.
         """
         is_measured = not all(map(math.isfinite, self.train_limits)) and self.method.name != "none"
         if start_limits is None or not is_measured:
@@ -132,12 +132,12 @@ class TrialSpec:
 
     @property
     def trial_id(self) -> str:
-        """Ten hex digits that differ whenever anything a result depends on differs."""
+        """Ten hex digits that change with anything that affects the result."""
         return _digest(self.to_json())
 
     @property
     def group(self) -> str:
-        """The trial's identity without its seed: what seeds are averaged over."""
+        """The trial's identity without its seed, for averaging over seeds."""
         return _digest({key: value for key, value in self.to_json().items() if key != "seed"})
 
     @property
@@ -149,20 +149,20 @@ class TrialSpec:
 
     @property
     def title(self) -> str:
-        """What people call the trial: ``rivergrid-1a ppo-lag dynamic seed 3``."""
+        """The trial's name for people: ``rivergrid-1a ppo-lag dynamic seed 3``."""
         return f"{self.task.label} {self.agent.label} {self.method.label} seed {self.seed}"
 
     def to_json(self) -> dict[str, Any]:
-        """The spec as strict JSON values; ``from_json`` is its inverse."""
+        """Return the spec as strict JSON values; ``from_json`` is its inverse."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value if isinstance(value, int) else value.to_json() for name, value in values.items()}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrialSpec:
-        """The spec that ``to_json`` wrote.
+        """Return the spec of ``to_json``.
 
         Raises:
-            ValueError: it did not: what the mistake is, in one line.
+            ValueError: the values are invalid; the message is one line.
         """
         value = checked_spec(value)
         return cls(

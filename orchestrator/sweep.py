@@ -1,8 +1,8 @@
-"""A launch: the one place that makes what is on disk match a grid.
+"""A launch runs the trials of a grid that are not complete on disk.
 
-First run, resume after a crash, retry of what failed and more seeds are the same call. The lock sees to it
-that there is one at a time; the plan says what is to do; the executor does it; what came of it is read back
-from the files.
+First run, resume after a crash, retry of failed trials and more seeds are the same call. A lock permits one
+launch at a time. The plan selects the trials, the executor runs them, and the results are read from the
+files.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
 
-# How long the mirror may take for its last pass: after the whole sweep, and when someone wants to stop.
+# Timeout of the MLflow sync for its last pass: after the whole sweep, and after a stop request.
 SYNC_SECONDS = 120.0
 HASTY_SYNC_SECONDS = 10.0
-REQUEST_SECONDS = 0.5  # between two looks whether somebody asks to stop, or has been heard
+REQUEST_SECONDS = 0.5  # between two checks for a stop request
 
 logger = logging.getLogger("recrl.sweep")
 
 
 class BackgroundSync(Protocol):
-    """Something that shows the sweep elsewhere while it runs."""
+    """A process that copies the sweep to MLflow while it runs."""
 
     def stop(self, timeout: float) -> bool:
-        """Show what is left, and end; says whether everything is shown.
+        """Copy the remaining results and end; return whether all are copied.
 
         Args:
-            timeout: seconds it may take, at least 0.
+            timeout: seconds, at least 0.
         """
         ...
 
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What came of a launch.
+    """Result of a launch.
 
     Attributes:
-        plan: what there was to do.
-        progress: where the chosen trials stand now.
-        stopped: whether it was asked to stop before its end.
-        synced: whether the sync shows everything; None if there was none.
+        plan: the plan of the launch.
+        progress: of the selected trials.
+        stopped: whether it was stopped before its end.
+        synced: whether MLflow is up to date; None without MLflow.
     """
 
     plan: Plan
@@ -66,24 +66,24 @@ class SweepResult:
 
     @property
     def failed(self) -> tuple[TrialProgress, ...]:
-        """The trials that stand as failed, also from earlier launches."""
+        """The trials with the status failed, also from earlier launches."""
         return self.progress.with_status(DisplayStatus.FAILED)
 
 
 @dataclass(frozen=True)
 class LaunchSettings:
-    """What to launch.
+    """Settings of a launch.
 
     Attributes:
         grid: the checked grid.
-        place: where the sweep is kept.
-        executor: who runs the trials.
-        only: the trials to work on, as ``plan.select`` reads it; all by default.
+        place: of the sweep's files.
+        executor: runs the trials.
+        only: the selected trials, see ``plan.select``; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again.
         rerun_changed: whether trials that ran other code than is installed now are run again.
-        start_sync: begins to show the sweep elsewhere, before the first trial.
-        watch: told the plan before the first trial.
+        start_sync: starts the MLflow sync, before the first trial.
+        watch: called with the plan before the first trial.
         finish: called after the last trial, before the sync stops: draws figures, for example.
     """
 
@@ -100,28 +100,28 @@ class LaunchSettings:
 
 
 def launch(settings: LaunchSettings, *, stop: threading.Event) -> SweepResult:
-    """Work on everything in the grid that is not finished.
+    """Run all trials of a grid that are not finished.
 
     Args:
-        settings: what to launch.
-        stop: once set, running trials save where they are, and the call returns.
+        settings: of the launch.
+        stop: once set, running trials save their state, and the call returns.
 
     Raises:
         SweepBusyError: another process is running this sweep.
         StorageError: the object store cannot be used.
-        RecrlError: ``only`` names what is not in the grid, the trials cannot be run again where they are
-            kept, or the executor cannot run at all.
+        RecrlError: ``only`` matches no trial, the trials cannot be run again in their storage, or the
+            executor cannot run.
     """
     place, store = settings.place, settings.place.store
     if settings.rerun_damaged or settings.rerun_changed:
         place.require_reruns()
     specs = settings.grid.trials()
-    select(specs, settings.only or {})  # a mistake in ``only`` leaves no trace
+    select(specs, settings.only or {})  # a mistake in ``only`` must leave no files
     with store.lock(), _stopping_on_request(store, stop), place.held(stop):
         place.pull()
         _write_files(settings.grid, specs, store)
         place.publish()
-        _leave_none_running(specs, store)  # of a launch that died
+        _leave_none_running(specs, store)  # trials of a launch that died
         plan = _plan(settings, specs)
         settings.watch(plan)
         for trial in plan.with_action(PlannedAction.RERUN):
@@ -141,7 +141,7 @@ def _plan(settings: LaunchSettings, specs: Sequence[TrialSpec]) -> Plan:
 
 
 def _run(settings: LaunchSettings, plan: Plan, stop: threading.Event) -> SweepResult:
-    """Run the trials of a plan, and show them elsewhere meanwhile."""
+    """Run the trials of a plan, with the MLflow sync in the background."""
     store = settings.place.store
     sync = settings.start_sync(store) if settings.start_sync is not None else None
     patience = HASTY_SYNC_SECONDS
@@ -159,7 +159,7 @@ def _run(settings: LaunchSettings, plan: Plan, stop: threading.Event) -> SweepRe
 
 
 def _run_trials(settings: LaunchSettings, specs: Sequence[TrialSpec], stop: threading.Event) -> None:
-    """Run trials; afterwards none of them stands as running, whatever happened."""
+    """Run trials; afterwards none of them has the status running, also after an error."""
     place = settings.place
     try:
         with place.kept_up_to_date(stop):
@@ -168,8 +168,8 @@ def _run_trials(settings: LaunchSettings, specs: Sequence[TrialSpec], stop: thre
         _leave_none_running(specs, place.store)
         try:
             place.settle(specs)
-        except StorageError as error:  # it must not hide what came before
-            logger.warning("%s; how its trials ended is known on this machine only", error)
+        except StorageError as error:  # must not hide an earlier error
+            logger.warning("%s; the end of its trials is recorded on this machine only", error)
 
 
 @contextmanager
@@ -192,10 +192,10 @@ def _stopping_on_request(store: SweepStore, stop: threading.Event) -> Iterator[N
 
 @contextmanager
 def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Iterator[None]:
-    """Set ``stop`` on the first SIGINT or SIGTERM, raise KeyboardInterrupt on the second, die of the third.
+    """Set ``stop`` on the first SIGINT or SIGTERM; the second raises KeyboardInterrupt, the third kills.
 
     Args:
-        stop: what a launch looks at.
+        stop: the event of the launch.
         say: called on the first signal.
     """
 
@@ -217,22 +217,22 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
 
 
 def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) -> None:
-    """Say in the sweep's folder what it is."""
+    """Write the sweep's own files."""
     try:
         created = store.info().get("created", time.time())
     except DamagedError as error:
-        logger.warning("%s; to MLflow the sweep is a new one", error)
+        logger.warning("%s; MLflow shows it as a new sweep", error)
         created = time.time()
     store.write_info({"name": grid.name, "created": created, "launched": time.time(), **collect()})
     store.write_specs(specs, grid.text)
 
 
 def _leave_none_running(specs: Sequence[TrialSpec], store: SweepStore) -> None:
-    """Nobody works on these trials: one whose files still say so waits to be resumed."""
+    """Set trials with the status running to waiting: no process runs them."""
     for spec in specs:
         files = store.trial(spec)
         if files.record().status is TrialState.RUNNING:
             try:
                 files.set_status(TrialState.WAITING)
-            except StorageError as error:  # the next launch says it; nothing that came before is hidden
+            except StorageError as error:  # the next launch reports it; an earlier error is not hidden
                 logger.warning("%s", error)

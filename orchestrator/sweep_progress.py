@@ -1,4 +1,4 @@
-"""How far a sweep is, from its files alone: from any terminal, also when whoever ran it is dead."""
+"""Progress of a sweep, from its files alone: from any terminal, also after the launch has died."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
-# A trial says after its updates that it lives, and an update of big networks takes a minute or two; one that
-# has been silent for so long has died.
+# A trial writes a sign of life after its updates, and an update of large networks takes a minute or two.
+# After this silence it counts as dead.
 SILENCE_SECONDS = 300.0
 
 
 class DisplayStatus(StrEnum):
-    """Where a trial stands for a person: its status, and whether it is still alive."""
+    """Status of a trial for display: the recorded status, and whether its process is alive."""
 
     COMPLETE = "complete"
     RUNNING = "running"
@@ -33,12 +33,12 @@ class DisplayStatus(StrEnum):
 
 @dataclass(frozen=True)
 class TrialProgress:
-    """How far one trial is.
+    """Progress of one trial.
 
     Attributes:
         spec: the trial.
-        status: where it stands.
-        record: what its files say.
+        status: for display.
+        record: from its files.
     """
 
     spec: TrialSpec
@@ -47,7 +47,7 @@ class TrialProgress:
 
     @property
     def fraction(self) -> float:
-        """The share of its environment steps that is done, in [0, 1]; 0 of a damaged one."""
+        """Fraction of its environment steps that is done, in [0, 1]; 0 for a damaged trial."""
         if self.status is DisplayStatus.COMPLETE:
             return 1.0
         if self.status is DisplayStatus.DAMAGED:
@@ -57,7 +57,7 @@ class TrialProgress:
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """How far a sweep is.
+    """Progress of a sweep.
 
     Attributes:
         trials: each trial, in the grid's order.
@@ -67,19 +67,19 @@ class SweepProgress:
 
     @property
     def counts(self) -> Mapping[DisplayStatus, int]:
-        """How many trials stand where."""
+        """Number of trials by status."""
         found = Counter(trial.status for trial in self.trials)
         return {status: found[status] for status in DisplayStatus}
 
     @property
     def fraction(self) -> float:
-        """The share of all environment steps that is done, in [0, 1]; 1 for no trials."""
+        """Fraction of all environment steps that is done, in [0, 1]; 1 for no trials."""
         total = sum(trial.spec.total_steps for trial in self.trials)
         return sum(trial.fraction * trial.spec.total_steps for trial in self.trials) / total if total else 1.0
 
     @property
     def steps_left(self) -> float:
-        """Environment steps of all trials that are neither complete nor failed."""
+        """Remaining environment steps of all trials that have not failed."""
         return sum(
             (1.0 - trial.fraction) * trial.spec.total_steps
             for trial in self.trials
@@ -93,7 +93,7 @@ class SweepProgress:
 
     @property
     def seconds_left(self) -> float | None:
-        """Time left at the present speed, or None while nothing runs."""
+        """Remaining time at the present speed, or None while no trial runs."""
         return self.steps_left / self.steps_per_second if self.steps_per_second > 0.0 else None
 
     @property
@@ -102,12 +102,12 @@ class SweepProgress:
         return all(trial.status is DisplayStatus.COMPLETE for trial in self.trials)
 
     def with_status(self, *statuses: DisplayStatus) -> tuple[TrialProgress, ...]:
-        """The trials that stand there."""
+        """Return the trials with one of these statuses."""
         return tuple(trial for trial in self.trials if trial.status in statuses)
 
 
 def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None = None) -> SweepProgress:
-    """How far the trials are.
+    """Read the progress of trials.
 
     Args:
         specs: the trials of the grid.
@@ -123,7 +123,7 @@ def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None
 
 
 def display_status(record: TrialRecord, *, now: float) -> DisplayStatus:
-    """Where a trial stands at a time: its status, unless it died without a word."""
+    """Return the status of a trial for display: the recorded one, unless its process has died."""
     match record.status:
         case TrialState.COMPLETE:
             return DisplayStatus.COMPLETE
@@ -139,13 +139,13 @@ def display_status(record: TrialRecord, *, now: float) -> DisplayStatus:
 
 
 def _has_no_process(record: TrialRecord) -> bool:
-    """Whether the trial's process was on this machine and is gone."""
+    """Whether the trial's process was on this machine and has ended."""
     if record.host != socket.gethostname():
         return False
     try:
-        os.kill(record.pid, 0)  # signal 0 only asks
+        os.kill(record.pid, 0)  # signal 0 only checks
     except ProcessLookupError:
         return True
     except PermissionError:
-        pass  # somebody else's process, so it is there
+        pass  # a process of another user, so it exists
     return False

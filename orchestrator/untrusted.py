@@ -1,7 +1,7 @@
-"""What a file that somebody else may have made has to be before anything is done with it.
+"""Checks of files from untrusted sources, before any use.
 
-A name becomes a folder's or a file's name, a label a title: both are held to what a grid may say. Everything
-is checked whole and at once, so that nobody later meets a list where a number should be.
+Names become names of folders or files, and labels become titles, so both must follow the rules of grids.
+Everything is checked at once, so that later code can rely on the types.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _NAME = re.compile(r"[^\W_.-][^/\\\x00-\x1f]{0,127}")
 
 
 def checked_name(value: Any) -> str:
-    """Return a sweep's name if it can name a folder: one part of a path that cannot lead elsewhere.
+    """Return a sweep's name if it can name a folder: one part of a path, without separators.
 
     Raises:
         ValueError: it cannot.
@@ -35,7 +35,7 @@ def checked_name(value: Any) -> str:
 
 
 def plain_text(text: str) -> str:
-    """Return a name or a label if it holds nothing that a terminal would obey.
+    """Return a name or a label if it has no control characters.
 
     Raises:
         ValueError: it holds control characters.
@@ -88,10 +88,10 @@ _SPEC = TypeAdapter(SpecFile)
 
 
 def checked_spec(value: Any) -> Mapping[str, Any]:
-    """Return the JSON value of a TrialSpec as it was given, if it is one.
+    """Return the unchanged JSON value of a TrialSpec, if it is valid.
 
     Raises:
-        ValueError: it is none; the message is one line that names the first mistake.
+        ValueError: it is invalid; the message is one line with the first mistake.
     """
     try:
         _SPEC.validate_python(value)

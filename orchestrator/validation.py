@@ -1,6 +1,6 @@
-"""Pydantic's errors as sentences for people, each at its place in a file.
+"""Pydantic's errors as sentences, each with its place in a file.
 
-A sentence says what is allowed and what was given: ``must be at least 1, got 0``. An unknown key names the
+A sentence has the allowed and the given value: ``must be at least 1, got 0``. An unknown key names the
 nearest known one.
 """
 
@@ -50,11 +50,11 @@ _SENTENCES: Mapping[str, str] = {
 
 
 def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator[tuple[Place, str]]:
-    """Every mistake as (place relative to the validated value, sentence).
+    """Return all mistakes as (place relative to the validated value, sentence).
 
     Args:
-        error: what pydantic found.
-        model: the class that was validated, to name the nearest known key; None where it is not known.
+        error: pydantic's error.
+        model: the class that was validated, to name the nearest known key; None if unknown.
     """
     for item in error.errors(include_url=False):
         place, kind = item["loc"], item["type"]
@@ -69,7 +69,7 @@ def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator
 
 
 def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
-    """The keys that are allowed at ``place`` inside a value of ``model``; [] where that is not known."""
+    """Return the allowed keys at ``place`` inside a value of ``model``; [] if unknown."""
     for part in place:
         if model is None:
             return []
@@ -79,7 +79,7 @@ def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
 
 
 def shown(value: Any) -> str:
-    """A value as a person wrote it, cut to a readable length."""
+    """Return a value as the user wrote it, cut to a readable length."""
     try:
         text = json.dumps(value, ensure_ascii=False)
     except (TypeError, ValueError):
@@ -90,7 +90,7 @@ def shown(value: Any) -> str:
 
 
 def nearest(name: str, known: list[str]) -> str:
-    """``; did you mean 'window'?``, or nothing where no known name is near."""
+    """Return ``; did you mean 'window'?``, or nothing if no known name is near."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
@@ -101,7 +101,7 @@ def _unknown_key(key: str, known: list[str]) -> str:
 
 
 def model_in(annotation: Any) -> type[BaseModel] | None:
-    """The pydantic model that an annotation is about: itself, in a list, optional or annotated."""
+    """Return the pydantic model in an annotation: itself, in a list, optional or annotated."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in typing.get_args(annotation):

@@ -1,1 +1,1 @@
-"""A sweep's data: reading it from files, exports and MLflow, merging parts, and checking validity."""
+"""Data of a sweep: reading from files, exports and MLflow, merging parts, and validity checks."""

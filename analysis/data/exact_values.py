@@ -1,4 +1,4 @@
-"""What the final policies of finite tasks are worth, computed from their tables instead of sampled.
+"""Exact values of the final policies of finite tasks, computed from their tables instead of sampled.
 
 The recorded table pi(a | s) is the stochastic policy. The deterministic one takes its most probable action.
 """
@@ -24,11 +24,11 @@ STOCHASTIC, DETERMINISTIC = "stochastic", "deterministic"
 
 
 def exact_values(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]) -> pd.DataFrame:
-    """Evaluate every final policy that has a table and a model: a row a trial and policy.
+    """Evaluate every final policy that has a table and a model: one row per trial and policy.
 
     Args:
         policies: of a ``Sweep``.
-        models: of each task, by its label; None where the task is not finite or not installed.
+        models: of each task, by its label; None if the task is not finite or not installed.
 
     Returns:
         KEY, policy (STOCHASTIC or DETERMINISTIC), episode_return, cost_i. Tables that do not fit their
@@ -49,7 +49,7 @@ def exact_values(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]
 
 
 def finite_model(name: str, options: Mapping[str, Any]) -> FiniteCMDP | None:
-    """Return the tables of a task of known optimum, or None.
+    """Return the tables of a task with a known optimum, or None.
 
     Other tasks are not built: they can be slow to build, and few of them are finite.
 
@@ -72,7 +72,7 @@ def _model(name: str, canonical: str) -> FiniteCMDP | None:
 
 
 def _table(run: pd.DataFrame, model: FiniteCMDP) -> Floats | None:
-    """Return pi, [S, A], its rows summing to 1 again after rounding; None if it does not fit the model."""
+    """Return pi, [S, A], with rows normalised after rounding; None if it does not fit the model."""
     columns = [f"action_{j}" for j in range(model.num_actions)]
     if len(run) != model.num_states or not set(columns) <= set(run):
         return None

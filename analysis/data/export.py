@@ -3,13 +3,12 @@
 A zip archive of plain text, so that any tool can open it:
 
     sweep.json         name, notes, grid file, the trials (spec, status, provenance), digests of the tables
-    phases.csv, ...    the other frames of ``recrl.analysis.data.sweep_data`` but KEY: ``trial`` is the
-    position of the
-                       trial in sweep.json
+    phases.csv, ...    the other data frames of ``recrl.analysis.data.sweep_data``;
+                       instead of KEY, ``trial`` is the position of the trial in sweep.json
 
-Left out are single episodes (``phases`` has their sums), timing, and the agents' metrics that no figure
-reads. What was measured at single updates, and the policies' tables, are rounded to DIGITS significant
-digits; outcomes (phases, evaluations) are exact. Equal sweeps give equal bytes.
+Left out are single episodes (``phases`` has their sums), timing, and metrics of agents without a figure.
+Measurements at single updates and the policies' tables are rounded to DIGITS significant digits. Outcomes
+(phases, evaluations) are exact. Equal sweeps give equal bytes.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ FORMAT = 2
 DIGITS = 6
 ROUNDED = ("updates", "policies")
 MAX_BYTES = 512 * 2**20  # unpacked; about 50 times the largest sweep so far
-# Columns that every frame must have if it has rows, those that it has for each cost, and those of text.
+# Columns that every data frame must have if it has rows, columns per cost, and columns of text.
 REQUIRED = {
     "phases": PHASE_COLUMNS,
     "updates": drawn_columns(UPDATE_COLUMNS),
@@ -68,7 +67,7 @@ COSTLY = {
     "policies": (),
 }
 TEXTS = ("phase", "policy", "event")
-LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: zip knows none before
+LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: the earliest possible in zip
 
 
 def save(sweep: Sweep, path: Path) -> Path:
@@ -76,10 +75,10 @@ def save(sweep: Sweep, path: Path) -> Path:
 
     Args:
         sweep: finished or not.
-        path: of the file; its folder is made if it is not there.
+        path: of the file; its folder is created if necessary.
 
     Raises:
-        RecrlError: nobody would read it back, as it is too large, or its folder cannot be made.
+        RecrlError: the file is too large to be read back, or its folder cannot be created.
     """
     tables = {}
     for name in ROWS:
@@ -111,7 +110,7 @@ def load(path: Path) -> Sweep:
     """Read a compact file back.
 
     Raises:
-        RecrlError: the file is not there, is none, or unpacks to more than MAX_BYTES.
+        RecrlError: the file is missing or invalid, or unpacks to more than MAX_BYTES.
     """
     names = ("sweep.json", *(f"{name}.csv" for name in ROWS))
     try:
@@ -149,7 +148,7 @@ def load(path: Path) -> Sweep:
 
 
 class _TrialFile(BaseModel):
-    """What sweep.json says of a trial, but for its spec, which ``TrialSpec`` checks itself."""
+    """Entry of a trial in sweep.json, without its spec, which ``TrialSpec`` checks itself."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     spec: dict[str, Any]
@@ -162,7 +161,7 @@ class _TrialFile(BaseModel):
 
 
 class _SweepFile(BaseModel):
-    """The content of sweep.json."""
+    """Content of sweep.json."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
     format: int
@@ -175,7 +174,7 @@ class _SweepFile(BaseModel):
 
 
 def _check_task(name: str, options: dict[str, Any]) -> None:
-    """Check the options of a task of ours: its optimum and its maps are computed from them.
+    """Check the options of a built-in task: its optimum and its maps are computed from them.
 
     Raises:
         ValueError: they are wrong.
@@ -189,10 +188,10 @@ def _check_task(name: str, options: dict[str, Any]) -> None:
 
 
 def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> None:
-    """Check that a frame has the columns that the others rely on, and numbers where these are numbers.
+    """Check that a data frame has the required columns, and numbers in numeric ones.
 
     Raises:
-        ValueError: it has not.
+        ValueError: a column is missing or not numeric.
     """
     columns = list(map(str, rows))
     if TRIAL not in columns:
@@ -212,7 +211,7 @@ def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> N
 
 
 def _told(sweep: Sweep) -> dict[str, Any]:
-    """Everything but the frames; equal provenances are there once."""
+    """Return everything except the data frames; equal provenances are stored once."""
     origins = list(Counter(it.provenance for it in sweep.facts))
     return {
         "format": FORMAT,
@@ -243,13 +242,13 @@ def _facts(value: dict[str, Any], origins: list[str]) -> TrialFacts:
 
 
 def _rounded(rows: pd.DataFrame) -> pd.DataFrame:
-    """Floats with DIGITS significant digits, as the shortest text."""
+    """Format floats with DIGITS significant digits, as the shortest text."""
     floats = rows.select_dtypes("float").columns
     return rows.assign(**{name: _significant(rows[name].to_numpy(np.float64)) for name in floats})
 
 
 def _significant(values: np.ndarray) -> np.ndarray:
-    """Each value at DIGITS significant digits.
+    """Round each value to DIGITS significant digits.
 
     >>> _significant(np.array([0.0012345678, -98765.4321, np.inf])).tolist()
     [0.00123457, -98765.4, inf]

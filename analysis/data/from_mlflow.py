@@ -1,6 +1,6 @@
-"""A sweep from MLflow alone, for whoever has a tracking address and no files.
+"""Read a sweep from MLflow, without its files.
 
-MLflow's parent run of a sweep has its export file among its artifacts; the sweep is read from that.
+The parent run of a sweep has the export file among its artifacts; the sweep is read from it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.tracking.read import downloaded_export
 
-TRIES = 3  # a file that is being uploaded is not whole yet
+TRIES = 3  # a file that is being uploaded is incomplete
 PAUSE_SECONDS = 1.0
 
 pause = partial(time.sleep, PAUSE_SECONDS)
@@ -26,10 +26,10 @@ def load(uri: str, name: str | None = None) -> Sweep:
 
     Args:
         uri: http(s)://host:port, sqlite:///file.db or another database's address.
-        name: of the sweep; may be left out where MLflow shows only one.
+        name: of the sweep; optional if MLflow has only one.
 
     Raises:
-        TrackingError: MLflow cannot be reached, shows no such sweep, or its export file is damaged.
+        TrackingError: MLflow cannot be reached, has no such sweep, or its export file is damaged.
     """
     for tries_left in range(TRIES - 1, -1, -1):
         with downloaded_export(uri, name) as download:

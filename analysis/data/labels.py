@@ -1,4 +1,4 @@
-"""The labels of a sweep's trials, KEY, and the one order that every table and legend has."""
+"""The labels of a sweep's trials, KEY, and their order in all tables and legends."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ METHOD_ORDER = (
     "step",
     "unconstrained",
 )
-TRIAL = "trial"  # in rows given to ``assemble``: the position of the trial they are of
+TRIAL = "trial"  # in rows for ``assemble``: the position of their trial
 DOUBLES = "groups of trials have these labels but different settings"
 
 
 def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
-    """Labels without duplicates: those of ``first`` in its order, then the others by name, numbers by size.
+    """Sort labels without duplicates: first the labels in ``first``, then others by name, numbers by size.
 
     >>> ordered(["dynamic", "mine", "none", "dynamic"], METHOD_ORDER)
     ['none', 'dynamic', 'mine']
@@ -43,13 +43,13 @@ def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
 
 
 def _numbers_by_size(label: str) -> tuple[list[str | int], str]:
-    """A key to sort by: texts and whole numbers by turns."""
+    """Return a sorting key: texts and integers in turn."""
     parts = re.split(r"([0-9]+)", label)
     return [int(part) if index % 2 else part for index, part in enumerate(parts)], label
 
 
 def occurring(labels: pd.Series) -> list[str]:
-    """The categories of a column of labels that occur in it, in their order."""
+    """Return the categories that occur in a column of labels, in their order."""
     return ordered(labels.unique(), list(labels.cat.categories))
 
 
@@ -58,7 +58,7 @@ class Keys:
     """KEY of every trial.
 
     Attributes:
-        labels: task, agent and method, a category a trial.
+        labels: task, agent and method, one category per trial.
         seeds: int64, [number of trials].
     """
 
@@ -68,9 +68,9 @@ class Keys:
     def put_before(
         self, rows: pd.DataFrame, columns: Sequence[str], of_costs: Sequence[str] = ()
     ) -> pd.DataFrame:
-        """The rows sorted by KEY, behind KEY instead of TRIAL.
+        """Return the rows sorted by KEY, with KEY in place of TRIAL.
 
-        ``columns`` exist even if there is no row, ``of_costs`` also where no trial with so many has one.
+        ``columns`` and ``of_costs`` exist even without a row.
         """
         if not len(rows):
             rows = pd.DataFrame(columns=[TRIAL, *columns, *of_costs], dtype=float).astype({TRIAL: np.int64})
@@ -87,10 +87,10 @@ class Keys:
 
 
 def keys_of(specs: Sequence[TrialSpec]) -> tuple[Keys, list[str]]:
-    """The trials' labels, and notes on those that had to be told apart.
+    """Return the trials' labels, and notes on labels that had to be made unique.
 
-    Two groups of trials may have the same labels but different settings (say, budgets). They must not be
-    averaged: their method's name then carries the group.
+    Two groups of trials may have the same labels but different settings (for example budgets). They must not
+    be averaged, so the group is appended to the method's label.
     """
     groups: dict[tuple[str, ...], set[str]] = {}
     identities = [spec.group for spec in specs]

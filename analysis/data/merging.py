@@ -1,8 +1,8 @@
-"""Parts of one sweep, run in several places, as the sweep that they make together.
+"""Merge parts of a sweep that ran in several places.
 
-A grid's trials may be shared out with ``launch --only``, or a sweep may have to go on where the folder of its
-first trials is not. Each place exports what it has (``recrl.analysis.data.export``); here the parts are
-joined. Trials are the same if their specs are, whatever the parts are called.
+A grid's trials may be divided with ``launch --only``, or a sweep may continue without the folder of its first
+trials. Each place makes an export (``recrl.analysis.data.export``); here they are joined. Trials are the same
+if their specs are, independent of the parts' names.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from recrl.analysis.data.labels import TRIAL
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble, is_made_again
 from recrl.orchestrator.spec import TrialState
 
-OUTCOMES = ("phases", "evaluations")  # the frames that every source has unrounded
-NAMED = 3  # trials that a note names, at most
+OUTCOMES = ("phases", "evaluations")  # data frames that every source has unrounded
+NAMED = 3  # largest number of trials in a note
 
 
 def merge(parts: Sequence[Sweep]) -> Sweep:
-    """All trials of some sweeps, each once, as the part has it that got furthest with it.
+    """Return all trials of some sweeps, each once, from the part with the most progress.
 
-    A damaged trial is less far than any other, a complete one further; then its steps count, then whether it
-    was begun; of equals the first part is taken. Two parts can have completed a trial with different
-    outcomes, as other machines and versions round differently; then a note says so.
+    Damaged trials rank below all others, complete ones above. Then the steps count, then whether the trial
+    was begun; among equals the first part is used. Two parts may have completed a trial with different
+    outcomes, because machines and versions round differently. Then there is a note.
 
     Args:
-        parts: at least one. The first gives the name and the grid file; its trials come first, then those
-            that only others have.
+        parts: at least one. The first gives the name and the grid file; its trials come first, then the
+            trials of other parts.
     """
     trials = [{trial.spec.trial_id: trial for trial in part.facts} for part in parts]
     having: dict[str, list[int]] = {}
@@ -63,7 +63,7 @@ def _reached(trial: TrialFacts) -> tuple[bool, bool, int, bool]:
 
 
 def _taken(parts: Sequence[Sweep], name: str, taken: Mapping[str, int]) -> pd.DataFrame:
-    """A frame's rows of the trials, each from the part that it is taken from."""
+    """Return a data frame's rows of the trials, each from its part."""
     positions = {trial_id: position for position, trial_id in enumerate(taken)}
     kept = []
     for number, part in enumerate(parts):
@@ -71,13 +71,13 @@ def _taken(parts: Sequence[Sweep], name: str, taken: Mapping[str, int]) -> pd.Da
         ids = np.array([trial.spec.trial_id for trial in part.facts], dtype=object)[rows[TRIAL].to_numpy()]
         rows = rows.assign(**{TRIAL: [positions[trial_id] for trial_id in ids]})
         rows = rows[[taken[trial_id] == number for trial_id in ids]]
-        if len(rows):  # empty frames have no types of their own
+        if len(rows):  # empty data frames have no column types
             kept.append(rows)
     return pd.concat(kept, ignore_index=True) if kept else pd.DataFrame()
 
 
 def _disagreements(parts: Sequence[Sweep], having: Mapping[str, Sequence[int]]) -> list[str]:
-    """A sentence on trials that several parts completed, and not alike."""
+    """Describe trials that several parts completed with different outcomes."""
     outcomes = [_outcomes(part) for part in parts]
     differing = [
         trial_id
@@ -96,7 +96,7 @@ def _disagreements(parts: Sequence[Sweep], having: Mapping[str, Sequence[int]]) 
 
 
 def _outcomes(part: Sweep) -> dict[str, str]:
-    """What the episodes of each complete trial came to, as text, by the trial's id."""
+    """Return the outcomes of the episodes of each complete trial, as text, by the trial's id."""
     texts = {position: "" for position, trial in enumerate(part.facts) if trial.status is TrialState.COMPLETE}
     for name in OUTCOMES:
         for key, rows in part.rows(name).groupby(TRIAL):

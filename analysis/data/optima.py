@@ -1,4 +1,4 @@
-"""J*(d_d) of a sweep's trials, where it is known."""
+"""J*(d_d) of a sweep's trials, if known."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UNKNOWN_OPTIMUM = "the optimum is unknown here, because"
 
 
 def optima_of(specs: Sequence[TrialSpec]) -> tuple[list[float], list[str]]:
-    """J*(d_d) of every trial, NaN where unknown, and a note for each task that is not installed here."""
+    """Return J*(d_d) of every trial, NaN if unknown, and a note for each task that is not installed."""
     optima: list[float] = []
     notes: dict[str, str] = {}
     for spec in specs:

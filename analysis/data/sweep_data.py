@@ -1,32 +1,32 @@
-"""A sweep as tidy pandas frames: the one thing that metrics, figures, tables and notebooks start from.
+"""A sweep as tidy pandas data frames, the basis of metrics, figures, tables and notebooks.
 
-Every frame begins with the columns KEY = task, agent, method, seed. The first three are ordered categories
-(tasks by name, agents and methods in the order of AGENT_ORDER and METHOD_ORDER), so that every table and
-legend has one order. i counts the costs, 0 ... k-1; where tasks of a sweep have different k, the columns a
-task lacks are NaN. All returns and costs are undiscounted sums over an episode.
+Every data frame begins with the columns KEY = task, agent, method, seed. The first three are ordered
+categories, so that every table and legend has the same order: tasks by name, agents and methods by
+AGENT_ORDER and METHOD_ORDER. i counts the costs, 0 ... k-1. If tasks of a sweep have different k, the columns
+that a task lacks are NaN. All returns and costs are undiscounted sums over an episode.
 
-    trials       a row a trial of the sweep's last launch, started or not:
+    trials       one row per trial of the sweep's last launch, started or not:
                  KEY, trial_id, group, status, error, task_name, agent_name, method_name, num_costs,
                  train_steps, boundary_step (the first step under d_d: B rounded up to a policy update),
                  total_steps (rounded up likewise), steps_per_update, env_steps (taken so far),
                  cpu_seconds, train_limit_i, deploy_limit_i, start_limit_i (measured d_t, or NaN),
-                 optimal_return (J*(d_d), or NaN where nobody knows it)
-    phases       a row a trial and phase with at least one episode, summed over its episodes:
+                 optimal_return (J*(d_d), or NaN if unknown)
+    phases       one row per trial and phase with at least one episode, summed over its episodes:
                  KEY, phase, episodes, steps, episode_return and cost_i (means), episode_return_std and
                  cost_i_std (over episodes, NaN for one), cost_i_total, excess_i_total: the sum of
-                 max(0, C_i - d_d,i), what went over the deployment limit
-    updates      a row a policy update: KEY, store.UPDATE_COLUMNS, cost_i, limit_i (in force when the
+                 max(0, C_i - d_d,i), the cost above the deployment limit
+    updates      one row per policy update: KEY, store.UPDATE_COLUMNS, cost_i, limit_i (in force when the
                  batch was collected), then the agents' own metrics
-    evaluations  a row an episode of the frozen policy: KEY, store.EVALUATION_COLUMNS, cost_i
-    events       a row an event: KEY, update, end_step, event
-    policies     a row a state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
+    evaluations  one row per episode of the final policy: KEY, store.EVALUATION_COLUMNS, cost_i
+    events       one row per event: KEY, update, end_step, event
+    policies     one row per state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
 
-Two sources give the same frames: the trials' files (``load``, here) and the export file of a sweep
-(``recrl.analysis.data.export``), which MLflow has as well (``recrl.analysis.data.from_mlflow``). Each tells
-``assemble`` the trials and, for each of the other frames, its rows.
+Two sources give the same data frames: the trials' files (``load``, here) and the export file of a sweep
+(``recrl.analysis.data.export``), which MLflow has as well (``recrl.analysis.data.from_mlflow``). Each calls
+``assemble`` with the trials and the rows of the other data frames.
 
-Episode files can hold 500,000 rows a trial. ``load`` reads them one at a time and keeps their sums
-(``phases``); ``load_episodes`` gives the rows themselves to whoever wants them.
+Episode files may have 500,000 rows per trial. ``load`` reads them one at a time and keeps their sums
+(``phases``); ``load_episodes`` returns the rows themselves.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ TRIAL_COLUMNS = (
 PHASE_COLUMNS = ("phase", "episodes", "steps", "episode_return", "episode_return_std")
 PHASE_COST_COLUMNS = (("cost", ""), ("cost", "_std"), ("cost", "_total"), ("excess", "_total"))
 EVENT_COLUMNS = ("update", "end_step", "event")
-ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the frames that are given to it
+ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the data frames that it receives
 
-# The agents' metrics that figures and tables read; MLflow and the compact file give no others.
+# The agents' metrics in figures and tables; MLflow and the export file have no others.
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
 
 logger = logging.getLogger("recrl.frames")
@@ -85,17 +85,17 @@ logger = logging.getLogger("recrl.frames")
 
 @dataclass(frozen=True)
 class TrialFacts:
-    """What is known of a trial as a whole.
+    """Facts of a whole trial.
 
     Attributes:
-        spec: what it is.
-        status: where it stands.
-        error: one line saying why it failed, or empty.
+        spec: of the trial.
+        status: in its files.
+        error: one line with the reason of a failure, or empty.
         env_steps: environment steps taken so far.
         cpu_seconds: CPU time so far.
-        start_limits: the d_t that its teacher measured, [k], or None.
-        provenance: of each attempt versions, commit, machine and digests of the code, as its file has them;
-            empty if unknown.
+        start_limits: the d_t that its curriculum measured, [k], or None.
+        provenance: versions, commit, machine and digests of the code of each attempt, as in its file; empty
+            if unknown.
     """
 
     spec: TrialSpec
@@ -109,20 +109,20 @@ class TrialFacts:
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """The frames of one sweep; the module's docstring lists their columns.
+    """The data frames of one sweep; the module's docstring lists their columns.
 
     Attributes:
         name: the sweep's name.
-        trials: a row a trial.
-        phases: a row a trial and phase.
-        updates: a row a policy update.
-        evaluations: a row an episode of the frozen policy.
-        events: a row an event.
-        policies: a row a state of a complete trial's final policy.
+        trials: one row per trial.
+        phases: one row per trial and phase.
+        updates: one row per policy update.
+        evaluations: one row per episode of the final policy.
+        events: one row per event.
+        policies: one row per state of a complete trial's final policy.
         facts: the trials themselves, in the order of the grid.
         grid: the grid file of the last launch, or empty.
-        notes: sentences on what a reader of the frames must know, for example an unknown optimum.
-        folder: of the sweep's files, or None where the frames come from an export or from MLflow.
+        notes: remarks for readers of the data frames, for example an unknown optimum.
+        folder: of the sweep's files, or None if the data are from an export or from MLflow.
     """
 
     name: str
@@ -146,7 +146,7 @@ class Sweep:
 
     @property
     def num_costs(self) -> int:
-        """The largest k of the sweep's tasks; 0 for an empty sweep."""
+        """Largest k of the sweep's tasks; 0 for an empty sweep."""
         return int(self.trials["num_costs"].max()) if len(self.trials) else 0
 
     @cached_property
@@ -156,7 +156,7 @@ class Sweep:
 
     @cached_property
     def exact(self) -> pd.DataFrame:
-        """The final policies' exact values where the task is finite, as of ``exact_values``."""
+        """Exact values of the final policies of finite tasks, from ``exact_values``."""
         tasks = {str(label) for label in self.policies["task"].unique()}
         choices = {it.spec.task.label: it.spec.task for it in self.facts if it.spec.task.label in tasks}
         models = {label: finite_model(it.name, it.options) for label, it in choices.items()}
@@ -168,7 +168,7 @@ class Sweep:
         return {it.spec.agent.label: it.spec.agent.options for it in self.facts}
 
     def rows(self, name: str) -> pd.DataFrame:
-        """One of the frames ROWS as ``assemble`` takes it: TRIAL, a position in ``facts``, instead of KEY."""
+        """Return one of the data frames ROWS for ``assemble``: with TRIAL instead of KEY."""
         frame: pd.DataFrame = getattr(self, name)
         of = [self._positions[key] for key in zip(*(frame[label] for label in KEY), strict=True)]
         rows = frame.drop(columns=list(KEY))
@@ -177,15 +177,15 @@ class Sweep:
 
     @cached_property
     def _positions(self) -> Mapping[tuple[Any, ...], int]:
-        """The position in ``facts`` of every trial, by its KEY; a method's label may carry its group."""
+        """Return every trial's position in ``facts``, by its KEY; a label may include the group."""
         keys = {row[0]: row[1:] for row in self.trials[["trial_id", *KEY]].itertuples(index=False, name=None)}
         return {keys[it.spec.trial_id]: position for position, it in enumerate(self.facts)}
 
 
 def load(store: SweepStore) -> Sweep:
-    """Read a finished or running sweep: the trials of its last launch, or else all that are on disk.
+    """Read a finished or running sweep: the trials of its last launch, or else all on disk.
 
-    Every file is held against its committed length and digest. Of a damaged trial there is only its row in
+    Every file is checked against its committed length and digest. A damaged trial has only a row in
     ``trials``, with the status ``damaged`` and a sentence in ``error``.
 
     Args:
@@ -210,11 +210,11 @@ def load(store: SweepStore) -> Sweep:
 def load_episodes(
     store: SweepStore, *, columns: Sequence[str] | None = None, phase: Phase | None = None
 ) -> pd.DataFrame:
-    """The episodes themselves: KEY, store.EPISODE_COLUMNS, cost_i, limit_i; a row an episode.
+    """Read all episodes: KEY, store.EPISODE_COLUMNS, cost_i, limit_i; one row per episode.
 
     Args:
         store: the sweep's folder.
-        columns: only these columns beside KEY.
+        columns: only these columns besides KEY.
         phase: only the episodes that ended in this phase.
     """
     specs, trials = _trials(store)
@@ -241,14 +241,14 @@ def assemble(
     grid: str = "",
     notes: Sequence[str] = (),
 ) -> Sweep:
-    """Return the tables of a sweep from what a source knows of it.
+    """Return the tables of a sweep from a source's data.
 
     Args:
         name: of the sweep.
         facts: its trials, in the order of the grid.
         rows: the tables ROWS, in order for each trial, with a column TRIAL instead of KEY.
         grid: the grid file, or empty.
-        notes: what the source has to say.
+        notes: of the source.
     """
     keys, doubles = keys_of([it.spec for it in facts])
     try:
@@ -278,19 +278,19 @@ def assemble(
 
 
 def is_made_again(note: str) -> bool:
-    """Whether ``assemble`` made a note from the trials, and will from others if it is still true."""
+    """Whether ``assemble`` made a note from the trials, and will make it again if it still holds."""
     return DOUBLES in note or UNKNOWN_OPTIMUM in note
 
 
 def joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """The trials' frames below each other, with the column TRIAL: their position among ``frames``."""
+    """Concatenate the trials' data frames, with the column TRIAL: their position in ``frames``."""
     filled = [frame for frame in frames if len(frame)]
     rows = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
     return rows.assign(**{TRIAL: np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])})
 
 
 def drawn_columns(columns: Iterable[str]) -> list[str]:
-    """Those columns of ``updates`` that figures and tables read: all but timing and other metrics.
+    """Return the columns of ``updates`` in figures and tables: all except timing and other metrics.
 
     >>> drawn_columns(["update", "time", "collect_seconds", "cost_0", "limit_0", "entropy", "kl"])
     ['update', 'cost_0', 'limit_0', 'kl']
@@ -332,13 +332,13 @@ def _trial_row(trial: TrialFacts, optimum: float) -> dict[str, Any]:
 
 
 def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialStore]]:
-    """The trials of the sweep's last launch, or else all that are on disk."""
+    """Return the trials of the sweep's last launch, or else all on disk."""
     specs = store.specs() or [trial.spec for trial in store.trials()]
     return specs, [store.trial(spec) for spec in specs]
 
 
 def _read(spec: TrialSpec, trial: TrialStore) -> tuple[TrialFacts, dict[str, pd.DataFrame]]:
-    """A trial's facts and its rows of the frames ROWS; none of a damaged one."""
+    """Return a trial's facts and its rows of the data frames ROWS; no rows for a damaged trial."""
     record = trial.record()
     if record.status is not TrialState.DAMAGED:
         try:

@@ -1,4 +1,4 @@
-"""What speaks against a sweep's numbers: damaged trials, other code, and curricula that are none."""
+"""Remarks on the validity of a sweep's numbers: damaged trials, other code, ineffective curricula."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from recrl.orchestrator.spec import TrialState
 
 
 def damages(sweep: Sweep) -> list[str]:
-    """A sentence for each damaged trial, of which nothing is in the frames."""
+    """Return a sentence for each damaged trial, whose data are not in the data frames."""
     return [f"{it.spec.title}: {it.error}" for it in sweep.facts if it.status is TrialState.DAMAGED]
 
 
 def doubts(sweep: Sweep) -> list[str]:
-    """Sentences on trials that ran other code than is installed now, and on curricula that are none."""
+    """Return sentences on trials that ran other code than is installed now, and on ineffective curricula."""
     changed = [it for it in sweep.facts if other_code(_attempts(it), it.spec)]
     complete = sum(it.status is TrialState.COMPLETE for it in changed)
     code = other_code_sentence(complete, len(changed) - complete)
@@ -67,7 +67,7 @@ def _titles(flags: pd.DataFrame, flag: str) -> list[str]:
 
 
 def _attempts(trial: TrialFacts) -> list[dict[str, Any]]:
-    """What is known of where each attempt comes from; nothing where no attempt began."""
+    """Return the known provenance of each attempt; empty if no attempt began."""
     try:
         attempts = json.loads(trial.provenance).get("attempts", [])
     except (ValueError, AttributeError):

@@ -1,1 +1,1 @@
-"""The figures, one file each, and the style that they share."""
+"""The figures, one file each, and their common style."""

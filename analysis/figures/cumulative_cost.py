@@ -1,8 +1,8 @@
-"""The cumulative cost of training beside its bounds: Proposition 1 on one axis with what happened.
+"""The cumulative cost of training against its bounds: Proposition 1 and measured costs on one axis.
 
-A row a task, a column a method; policies of the training phase are added up from left to right, one expected
-episode each. What the lines are is in ``recrl.analysis.statistics.cumulative_cost``. The cost axis is
-logarithmic, as the proven bounds are far from what happens; each panel says how far.
+One row per task, one column per method. Costs are summed over the policies of the training phase, one
+expected episode each. ``recrl.analysis.statistics.cumulative_cost`` defines the lines. The cost axis is
+logarithmic, because the proven bounds are far above the measured costs; each panel has the ratio.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.cumulative_cost import policies_of, training_runs
 from recrl.environments.cmdp import Floats
 
-# Colour, dashes and name of every sum but the measured one.
+# Colour, dashes and name of every sum except the measured one.
 REFERENCES: dict[str, tuple[str, Literal["-"] | tuple[float, Sequence[float]], str]] = {
     "limit": (LIMIT_COLOUR, panels.DASHED, "limits in force"),
     "discounted_bound": ("#5b3a8c", (0.0, (1.2, 1.2)), "Proposition 1, discounted cost"),
@@ -38,11 +38,11 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
     Args:
         sweep: the frames.
         agent: the agent's label.
-        cost: i, which cost.
+        cost: i, index of the cost.
 
     Returns:
-        Every run thin, the mean over runs thick; or None if no trial of the agent has finished its
-        training phase.
+        The figure, with runs as thin lines and their mean as a thick one; or None if no trial of the agent
+        has finished its training phase.
     """
     trials = sweep.trials[
         (sweep.trials["agent"] == agent)
@@ -77,7 +77,7 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
 
 
 def _panel(axes: Axes, series: list[pd.DataFrame], style: MethodStyle) -> None:
-    """One method's sums; ``series`` are of ``policy_costs``, one a run."""
+    """Draw one method's sums; ``series`` are of ``policy_costs``, one per run."""
     steps = series[0]["end_step"].to_numpy(np.float64)
     measured = _sums(series, "cost")
     axes.set_yscale("log")
@@ -96,7 +96,7 @@ def _panel(axes: Axes, series: list[pd.DataFrame], style: MethodStyle) -> None:
 
 
 def _sums(series: list[pd.DataFrame], name: str) -> Floats:
-    """Running sums of every run, [n, policies]; an infinite limit counts as the cost, as in ``limit_sum``."""
+    """Return running sums of every run, [n, policies]; an infinite limit counts as the cost."""
     rows = []
     for run in series:
         values = run[name].to_numpy(np.float64)
@@ -107,7 +107,7 @@ def _sums(series: list[pd.DataFrame], name: str) -> Floats:
 
 
 def _legend(figure: Figure, agent: str, drawn: set[str]) -> None:
-    """What is drawn: agents but CPO have no bounds, unknown tasks no ceiling."""
+    """Return the drawn sums: agents except CPO have no bounds, unknown tasks no trivial bound."""
     handles = [Line2D([], [], color="0.2", linewidth=1.5, label="measured cost, undiscounted")]
     handles += [
         Line2D([], [], color=colour, linestyle=dashes, linewidth=0.9, label=name)

@@ -1,6 +1,7 @@
-"""What limits a teacher would have set on recorded runs, beside those that were in force.
+"""Limits that another curriculum would have set on recorded runs, against the limits in force.
 
-A row a task and agent, a column a method of the sweep; a line a run. Limits that are infinite are left out.
+One row per task and agent, one column per method of the sweep, one line per run. Infinite limits are left
+out.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ DASHED = (0.0, (3.0, 1.2))
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """A run and what another teacher makes of it.
+    """A run and its replay under another curriculum.
 
     Attributes:
         spec: the run.
-        rows: of ``replay.replay``.
+        rows: from ``curriculum_replay.replay``.
     """
 
     spec: TrialSpec
@@ -40,12 +41,12 @@ class Replayed:
 
 
 def replayed_limits(runs: Sequence[Replayed], teacher: str, *, cost: int = 0) -> Figure:
-    """The figure.
+    """Draw the figure.
 
     Args:
         runs: at least one.
-        teacher: what the teacher that was asked is called.
-        cost: i, which cost and limit to show.
+        teacher: label of the other curriculum.
+        cost: i, index of the cost and limit.
     """
     methods = ordered([run.spec.method.label for run in runs], METHOD_ORDER)
     agents = ordered([run.spec.agent.label for run in runs], AGENT_ORDER)

@@ -1,10 +1,9 @@
-"""What a curriculum did to its agent: limit, cost, multiplier and step size on one axis, for each method.
+"""Diagnostics of a curriculum: limit, cost, multiplier and step size over training, for each method.
 
-A figure a task and agent; a column a method. From above: the agent's own cost under the limit in force;
-the mean multipliers (where the agent has them); what the critics of the reward and of the cost explain of
-the variance of fresh returns; the mean KL divergence of its updates. Ticks below the costs mark where noise
-was added to some run's policy; ticks below the KL divergence mark CPO's recovery steps, in which it only
-lowers the cost.
+One figure per task and agent, one column per method. From top to bottom: the agent's own cost and the limit
+in force; the mean multipliers, if the agent has them; the explained variance of the reward and cost critics;
+the mean KL divergence of its updates. Ticks below the costs mark policy noise in some run. Ticks below the KL
+divergence mark CPO's recovery steps, which only decrease the cost.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ from recrl.environments.cmdp import Floats
 
 BINS = 100
 NOISE_EVENT = "policy noise"
-RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only lowers the cost
+RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only decreases the cost
 LARGE_MULTIPLIER = 50.0
-EVENT_TICK = (0.0, 0.05)  # share of the panel's height
+EVENT_TICK = (0.0, 0.05)  # fraction of the panel's height
 EXPLAINED = "explained_variance_"
-LEAST_EXPLAINED = -0.5  # critics may be arbitrarily wrong; what is below this is cut off
+LEAST_EXPLAINED = -0.5  # critics may be arbitrarily wrong; smaller values are cut off
 
 
 def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0) -> Figure:
-    """Limit, cost, multiplier, KL divergence and events of every method.
+    """Draw limit, cost, multiplier, KL divergence and events of every method.
 
     Args:
         sweep: with at least one update of this task and agent.
         task: its label.
         agent: the agent's label.
-        cost: i, which cost and limit to show.
+        cost: i, index of the cost and limit.
 
     Returns:
         Lines are means over seeds, bands one standard error.
@@ -95,7 +94,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
 
 
 def _label(quantity: str) -> str:
-    """What an axis is called."""
+    """Return the label of an axis."""
     if quantity.startswith(EXPLAINED):
         signal = quantity.removeprefix(EXPLAINED).split("_")[0]
         return f"explained\nvariance, {signal}"
@@ -112,7 +111,7 @@ def _panel(axes: Axes, updates: pd.DataFrame, quantity: str, edges: Floats, styl
 
 
 def _limits(axes: Axes, updates: pd.DataFrame, quantity: str) -> None:
-    """Every run's limit; infinite ones are left out."""
+    """Draw every run's limit; infinite limits are left out."""
     for _, run in updates.groupby("seed"):
         values = run[quantity].where(np.isfinite(run[quantity]))
         axes.plot(
@@ -121,7 +120,7 @@ def _limits(axes: Axes, updates: pd.DataFrame, quantity: str) -> None:
 
 
 def _event_ticks(axes: Axes, steps: Iterable[float], style: MethodStyle) -> None:
-    """A tick at the lower edge for every event."""
+    """Draw a tick at the lower edge for every event."""
     for step in sorted(set(steps)):
         axes.plot(
             [step, step],

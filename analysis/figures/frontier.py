@@ -1,7 +1,7 @@
-"""Return against cost: which final policies are feasible, and how far they are below the best return J*(d).
+"""Return against cost of the final policies, with the feasible region and the best return J*(d).
 
-A policy to the right of the limit is infeasible. None lies above the frontier, but by the chance of sampled
-episodes. The points are the stochastic final policies (``Measure.STOCHASTIC``), exact where the task is
+A policy to the right of the limit is infeasible. None lies above the frontier, except by the sampling error
+of episodes. The points are the stochastic final policies (``Measure.STOCHASTIC``), exact if the task is
 finite. The deployment phase, which averages many policies, is not drawn.
 """
 
@@ -24,14 +24,14 @@ from recrl.analysis.statistics.metrics import Measure
 from recrl.environments.cmdp import CostLimits, Floats
 from recrl.environments.registry import optimal_return
 
-COST, LIMIT = "shown_cost", "shown_limit"  # the columns of the cost that a row of panels shows
+COST, LIMIT = "shown_cost", "shown_limit"  # columns of the cost in a row of panels
 FAR_COST = 10.0  # times the limit: points beyond are drawn at the right edge
 
 
 def return_against_cost(sweep: Sweep) -> Figure | None:
-    """A row a task and cost, a column an agent; a point a run.
+    """Draw one row per task and cost, one column per agent, one point per run.
 
-    The limit is a line, and the region beyond it is shaded. The frontier J*(d) is drawn where a task has one
+    The limit is a line, and the region beyond it is shaded. The frontier J*(d) is drawn if a task has one
     cost and a known optimum.
 
     Args:
@@ -72,7 +72,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
 
 
 def _cells(sweep: Sweep, rows: pd.DataFrame) -> list[tuple[str, int]]:
-    """The tasks that have a complete trial, with each of their costs."""
+    """Return the tasks with a complete trial, with each of their costs."""
     return [
         (task, i)
         for task in occurring(rows["task"])
@@ -82,12 +82,12 @@ def _cells(sweep: Sweep, rows: pd.DataFrame) -> list[tuple[str, int]]:
 
 
 def concave_frontier(optimum: Callable[[float], float], far: float, *, tolerance: float) -> Floats:
-    """Sample a concave function of the limit finely where it bends and nowhere else.
+    """Sample a concave function of the limit, finely only where it bends.
 
     Args:
         optimum: d -> J*(d), concave and non-decreasing.
         far: the largest d, above 0.
-        tolerance: how far the polyline may lie below the function at the middle of a piece.
+        tolerance: largest distance of the polyline below the function at the middle of a piece.
 
     Returns:
         Points (d, J*(d)) in ascending d, [p, 2].
@@ -106,7 +106,7 @@ def concave_frontier(optimum: Callable[[float], float], far: float, *, tolerance
 
 
 def _frontier(sweep: Sweep, trials: pd.DataFrame, *, far: float) -> tuple[Floats, Floats]:
-    """J*(d) of a task for limits 0 ... ``far``, with the deployment limits among them; empty if unknown."""
+    """Return J*(d) of a task for limits 0 ... ``far``, deployment limits included; empty if unknown."""
     first = trials.iloc[0]
     if first["num_costs"] > 1 or not np.isfinite(first["optimal_return"]):
         return np.empty(0), np.empty(0)
@@ -114,7 +114,7 @@ def _frontier(sweep: Sweep, trials: pd.DataFrame, *, far: float) -> tuple[Floats
 
     def optimum(limit: float) -> float:
         value = optimal_return(name, options, CostLimits((limit,)))
-        assert value is not None  # the task knew it for d_d
+        assert value is not None  # it was known for d_d
         return value
 
     scale = abs(optimum(far) - optimum(0.0)) + 1e-9
@@ -125,16 +125,16 @@ def _frontier(sweep: Sweep, trials: pd.DataFrame, *, far: float) -> tuple[Floats
 
 
 def _right_edge(rows: pd.DataFrame) -> float:
-    """A cost that shows the limit and nearly all points."""
+    """Return the upper end of a cost axis that shows the limit and nearly all points."""
     limit = float(rows[LIMIT].max())
     scale = limit if limit > 0.0 else 1.0
     return min(max(2.0 * scale, 1.15 * float(rows[COST].max())), FAR_COST * scale)
 
 
 def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far: float) -> None:
-    """An open mark a run; what lies too far right sits on the edge.
+    """Draw an open mark per run; runs too far to the right are at the edge.
 
-    The marks shrink from method to method, so that equal runs show as marks within each other.
+    The marks get smaller from method to method, so that equal runs are visible as nested marks.
     """
     for position, (method, style) in enumerate(look.items()):
         chosen = rows[rows["method"] == method]

@@ -1,11 +1,11 @@
-"""The paper's figures, from a sweep's frames: functions that return a matplotlib Figure.
+"""The paper's figures from a sweep's data frames, as matplotlib figures.
 
-``learning_curves`` is Figures 3 and 4 (one an agent): return and cost over training, and magnified over
+``learning_curves`` is Figures 3 and 4 (one per agent): return and cost over training, and magnified over
 deployment. ``curricula`` is Figure 5: the limits in force. Trials are averaged on a common grid of
 environment steps (``curves.step_grid``), about 100 bins over a whole trial and 25 over its deployment.
 
-Costs begin far above the limit and end near it. Where they exceed ten limits, the cost axis is linear up to
-the deployment limit and logarithmic above it, so that the limit can be read; the axis says so.
+Costs begin far above the limit and end near it. If they exceed ten limits, the cost axis is linear up to the
+deployment limit and logarithmic above, which its label mentions.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
 LEAST_SHOWN = 0.2  # of a limit, above and below it
 LEAST_SHOWN_RETURN = 2.0 * OPTIMAL_GAP  # above and below J*(d_d)
-WORTH_MARKING = 0.03  # of a trial: shorter spells of infinite limits (the measuring of d_t) are not marked
+WORTH_MARKING = 0.03  # of a trial: shorter periods of infinite limits (the measurement of d_t) are not marked
 
 
 def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) -> Figure:
-    """The paper's Figures 3 and 4: a row a task, return and cost over training and over deployment.
+    """Draw the paper's Figures 3 and 4: one row per task, return and cost over training and deployment.
 
     Args:
         sweep: with at least one update of this agent.
         agent: its label.
-        averaging: what lines and bands are; means and standard errors as in the paper by default.
+        averaging: kind of lines and bands; by default means and standard errors as in the paper.
     """
     trials = sweep.trials[sweep.trials["agent"] == agent]
     updates = sweep.updates[sweep.updates["agent"] == agent]
@@ -75,11 +75,11 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) ->
 
 
 def curricula(sweep: Sweep) -> Figure:
-    """The paper's Figure 5: the cost limits in force; a row a task and cost, a column an agent.
+    """Draw the paper's Figure 5: the limits in force; one row per task and cost, one column per agent.
 
     Every run is a thin line, the mean over seeds a thick one; the agent's own cost, a mean over seeds too,
-    is a faint line. Infinite limits, which no axis reaches, are drawn along the upper edge and marked with
-    the sign of infinity, unless they only last as long as the measuring of d_t.
+    is a faint line. Infinite limits are drawn along the upper edge with the sign of infinity, unless they
+    only last during the measurement of d_t.
 
     Args:
         sweep: with at least one update.
@@ -132,7 +132,7 @@ def _task_row(
     *,
     averaging: Averaging,
 ) -> None:
-    """One task's panels: return, return in deployment, then the same for each cost."""
+    """Draw one task's panels: return, return in deployment, then the same for each cost."""
     boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
     count = int(trials["total_steps"].max() // trials["steps_per_update"].min())
     whole = step_grid(boundary, total, updates=count, bins=BINS)
@@ -141,7 +141,7 @@ def _task_row(
     quantities = ["episode_return", *(f"cost_{i}" for i in range((len(row) - 2) // 2))]
     deployed = updates[updates["end_step"] > boundary]
     for position, quantity in enumerate(quantities):
-        if not updates[quantity].notna().any():  # this task has fewer costs than another one
+        if not updates[quantity].notna().any():  # this task has fewer costs than another
             row[2 * position].set_axis_off()
             row[2 * position + 1].set_axis_off()
             continue
@@ -170,7 +170,7 @@ def _task_row(
 
 
 def _shade(panels_of_cost: Sequence[Axes], limit: float) -> None:
-    """Shade what is above the limit, and keep the axes as they are."""
+    """Shade the region above the limit, without changing the axes."""
     for axes in panels_of_cost:
         low, high = axes.get_ylim()
         panels.infeasible_region(axes, limit)
@@ -186,7 +186,7 @@ def _curves(
     *,
     averaging: Averaging,
 ) -> None:
-    """Every method's line with its band; markers are staggered so that equal lines can be told apart."""
+    """Draw every method's line with its band; markers are staggered so that equal lines remain visible."""
     for position, (method, style) in enumerate(look.items()):
         chosen = updates[updates["method"] == method]
         if not len(chosen):

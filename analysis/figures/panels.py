@@ -1,4 +1,4 @@
-"""Parts that all panels over environment steps share: axes, reference lines, titles, the legend."""
+"""Common parts of all panels over environment steps: axes, reference lines, titles, the legend."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ FAR_ABOVE = 1e6  # times the limit: the shaded region has no upper end
 def draw_curve(
     axes: Axes, curve: Curve, style: MethodStyle, *, place: tuple[int, int], wider: float = 0.0
 ) -> None:
-    """A method's line; methods that coincide can be told apart.
+    """Draw a method's line so that coinciding methods remain visible.
 
     Markers are staggered from method to method, and dashed lines lie on top of solid ones.
 
     Args:
         axes: to draw on.
-        curve: what to draw; bins without data are bridged.
+        curve: its data; bins without data are bridged.
         style: of the method.
         place: the method's position and the number of methods.
         wider: points added to the line's width.
@@ -56,7 +56,7 @@ def draw_curve(
 
 
 def draw_band(axes: Axes, curve: Curve, style: MethodStyle) -> None:
-    """The band around the line."""
+    """Draw the band around the line."""
     drawn = np.isfinite(curve.centre)
     axes.fill_between(
         curve.steps[drawn],
@@ -70,7 +70,7 @@ def draw_band(axes: Axes, curve: Curve, style: MethodStyle) -> None:
 
 
 def reference_lines(axes: Axes, trials: pd.DataFrame, quantity: str) -> None:
-    """The deployment limit on cost panels, the optimum J*(d_d) on return panels."""
+    """Draw the deployment limit on cost panels, the optimum J*(d_d) on return panels."""
     if quantity == "episode_return":
         for optimum in sorted(set(trials["optimal_return"].dropna())):
             axes.axhline(optimum, color=OPTIMUM_COLOUR, linewidth=0.7, zorder=1.0)
@@ -86,12 +86,12 @@ def infeasible_region(axes: Axes, limit: float) -> None:
 
 
 def widen(axes: Axes, centre: float, least: float) -> None:
-    """Make a y-axis show at least ``centre`` ± ``least``, so that rounding errors do not fill a panel.
+    """Make a y-axis cover at least ``centre`` ± ``least``, so that rounding errors do not fill a panel.
 
     Args:
         axes: to change.
         centre: for example a limit; nothing happens if it is not finite.
-        least: half the height that must be shown.
+        least: half of the least height.
     """
     if np.isfinite(centre):
         low, high = axes.get_ylim()
@@ -99,20 +99,20 @@ def widen(axes: Axes, centre: float, least: float) -> None:
 
 
 def phase_boundary(axes: Axes, step: int, total: int) -> None:
-    """Where deployment begins."""
+    """Mark the beginning of deployment."""
     if 0 < step < total:
         axes.axvline(step, color="black", linewidth=0.8, linestyle=DASHED, zorder=1.5)
 
 
 def step_axis(axes: Axes, first: float, last: float) -> None:
-    """Ticks like 0.5M: short enough for small panels."""
+    """Set ticks like 0.5M, short enough for small panels."""
     axes.set_xlim(first, last)
     axes.xaxis.set_major_locator(MaxNLocator(4 if first == 0.0 else 2, steps=[1, 2, 2.5, 5, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_steps(value)))
 
 
 def cost_axis(axes: Axes, limit: float, largest: float) -> None:
-    """Linear to the limit and logarithmic above, if the costs exceed ten limits; begins just below 0."""
+    """Make a cost axis linear to the limit and logarithmic above, if the costs exceed ten limits."""
     if largest <= LOG_AXIS_FROM * limit:
         axes.set_ylim(bottom=-0.04 * largest)
         return
@@ -126,7 +126,7 @@ def cost_axis(axes: Axes, limit: float, largest: float) -> None:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten within [low, high]; with 2 and 5 times each, if there are fewer than two.
+    """Return powers of ten within [low, high], with 2 and 5 times each if there are fewer than two.
 
     >>> _log_ticks(2.0, 120.0), _log_ticks(10.0, 90.0)
     ([10.0, 100.0], [10.0, 20.0, 50.0])
@@ -138,7 +138,7 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 
 def short_steps(steps: float) -> str:
-    """A number of steps in at most five characters.
+    """Format a number of steps in at most five characters.
 
     >>> [short_steps(value) for value in (0, 500, 12_000, 960_000, 1_260_000, 1e7)]
     ['0', '500', '12k', '960k', '1.26M', '10M']
@@ -149,7 +149,7 @@ def short_steps(steps: float) -> str:
 
 
 def panel_title(trials: pd.DataFrame, updates: pd.DataFrame, *, separator: str = ": ") -> str:
-    """Task, number of seeds (a range, if not every method has as many at the end) and steps."""
+    """Return task, number of seeds (a range if methods differ) and steps."""
     seeds = updates.groupby("method", observed=True)["seed"]
     ended = updates[updates["end_step"] >= trials["total_steps"].max()]
     finished = ended.groupby("method", observed=True)["seed"].nunique()
@@ -161,7 +161,7 @@ def panel_title(trials: pd.DataFrame, updates: pd.DataFrame, *, separator: str =
 
 
 def infeasible_patch() -> Patch:
-    """The infeasible region in a legend."""
+    """Return the legend's entry for the infeasible region."""
     return Patch(facecolor=INFEASIBLE["color"], alpha=0.2, linewidth=0.0, label="infeasible (above $d_d$)")
 
 
@@ -173,7 +173,7 @@ def legend(
     optimum: bool,
     title: str,
 ) -> None:
-    """The methods, in their order, above all panels, and the reference lines below."""
+    """Draw the legend: methods above all panels, in order, and reference lines below."""
     lines = [
         Line2D([], [], **look[method].line, marker=look[method].marker, markeredgewidth=0.0, label=method)
         for method in methods

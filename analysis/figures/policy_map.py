@@ -1,10 +1,10 @@
-"""What the final policies do on RiverGrid: where they are and where they go, drawn on the map.
+"""Final policies on RiverGrid: their visits and movements, drawn on the map.
 
-A row a task, a column a method. Each map is the mean over the method's runs: a square's shade is the
-expected number of steps that an episode spends on it; an arrow leaves a square in the direction of the
-agent's heading, as long as the policy is likely to go forward from there, and as dark as it is likely to be
-seen there at all. Where a policy would rather turn, there is a dot. Nothing is sampled: visits, returns and
-costs are computed from the tables of the policy and the task (``exact.evaluate_policy``).
+One row per task, one column per method. Each map is the mean over the method's runs. A square's shade is the
+expected number of steps on it in an episode. An arrow has the direction of a heading; its length is the
+probability of going forward, its darkness that of a visit. A dot means that the policy mostly turns. Visits,
+returns and costs are not sampled, but computed from the tables of policy and task
+(``exact_solver.evaluate_policy``).
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from recrl.environments.rivergrid.maps import GOAL, MUD, RIVER, STEPS, WALL, Riv
 TILE_COLOURS = {WALL: "#4a4a4a", RIVER: "#b9dcf2", MUD: "#d9c29a", GOAL: "#a8dba8"}
 DRY_COLOUR = "#f6f1e4"
 VISIT_COLOURS = "Oranges"
-LEAST_VISITS = 0.01  # squares and headings seen less often an episode are left as they are
+LEAST_VISITS = 0.01  # squares and headings with fewer visits per episode are not drawn
 MAX_COLUMNS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class MeanBehaviour:
-    """What the runs of a method do, on average.
+    """Mean behaviour of a method's runs.
 
     Attributes:
-        visits: expected times that each pair is left in an episode, [S, A], the mean over runs.
+        visits: expected visits of each (state, action) pair in an episode, [S, A], the mean over runs.
         episode_return: expected, the mean over runs.
         costs: expected, the mean over runs, [k].
         runs: n.
@@ -64,7 +64,7 @@ class MeanBehaviour:
 
 
 def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
-    """The final policies of an agent on the maps of its RiverGrid tasks.
+    """Draw the final policies of an agent on the maps of its RiverGrid tasks.
 
     Args:
         sweep: its trials with a policy table are drawn.
@@ -86,7 +86,7 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.flat:
             axes.set_axis_off()
-            axes.set(xticks=[], yticks=[])  # invisible ticks would be laid out all the same
+            axes.set(xticks=[], yticks=[])  # invisible ticks would still take space in the layout
         for number, (task, (river_map, options)) in enumerate(maps.items()):
             panels = grid.reshape(-1)[number * panels_of_a_map :][:panels_of_a_map]
             for axes, method in zip(panels, methods, strict=False):
@@ -107,9 +107,9 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
 
 
 def _layout(num_maps: int, num_methods: int) -> tuple[int, int, int]:
-    """Rows and columns of the grid of panels, and how many of them, one after the other, each map has.
+    """Return rows and columns of the grid of panels, and the number of consecutive panels per map.
 
-    Each map has lines of its own; if there is but one method, the maps lie side by side.
+    Each map has rows of its own; with a single method, the maps are side by side.
     """
     if num_methods == 1:
         rows = math.ceil(num_maps / MAX_COLUMNS)
@@ -120,7 +120,7 @@ def _layout(num_maps: int, num_methods: int) -> tuple[int, int, int]:
 
 
 def river_task(sweep: Sweep, task: str) -> tuple[RiverMap, RiverGridOptions] | None:
-    """The map and the settings of a task, if it is a RiverGrid."""
+    """Return the map and the settings of a task, if it is a RiverGrid."""
     name = str(sweep.trials.loc[sweep.trials["task"] == task, "task_name"].iloc[0])
     if name.partition("-")[0] != "rivergrid":
         return None
@@ -131,7 +131,7 @@ def river_task(sweep: Sweep, task: str) -> tuple[RiverMap, RiverGridOptions] | N
 
 
 def mean_behaviour(policies: pd.DataFrame, river_map: RiverMap, options: RiverGridOptions) -> MeanBehaviour:
-    """Evaluate the policies of several runs exactly and average.
+    """Evaluate the policies of several runs exactly, and average.
 
     Args:
         policies: rows of ``Sweep.policies``, of one task, agent and method.
@@ -152,7 +152,7 @@ def mean_behaviour(policies: pd.DataFrame, river_map: RiverMap, options: RiverGr
 
 
 def draw_map(axes: Axes, river_map: RiverMap) -> None:
-    """The tiles; x to the right, y downwards."""
+    """Draw the tiles; x to the right, y downwards."""
     colours = [[to_rgb(TILE_COLOURS.get(tile, DRY_COLOUR)) for tile in row] for row in river_map.rows]
     axes.pcolormesh(np.array(colours), edgecolors="white", linewidth=0.3)
     for x, y in river_map.cells(GOAL):
@@ -165,13 +165,13 @@ def draw_map(axes: Axes, river_map: RiverMap) -> None:
 
 
 def _draw_behaviour(axes: Axes, river_map: RiverMap, behaviour: MeanBehaviour, scale: LogNorm) -> None:
-    """Shades, inset so that the tile below stays visible, then arrows and dots."""
+    """Draw shades, inset so that the tile below stays visible, then arrows and dots."""
     visits = behaviour.visits.reshape(river_map.width, river_map.height, HEADINGS, -1)
     squares = np.argwhere(visits.sum(axis=(2, 3)) >= LEAST_VISITS)
     steps = visits.sum(axis=(2, 3))[tuple(squares.T)]
     insets = [Rectangle((x + 0.14, y + 0.14), 0.72, 0.72) for x, y in squares.tolist()]
     shades = ScalarMappable(scale, VISIT_COLOURS).to_rgba(steps)
-    # the edge tells a visited square from the river in greyscale too
+    # the edge distinguishes a visited square from the river in greyscale
     axes.add_collection(
         PatchCollection(insets, facecolors=shades, edgecolors="0.3", linewidths=0.3, zorder=2.0)
     )

@@ -1,9 +1,9 @@
 """Performance profiles: for every return, the fraction of runs that are feasible and return more.
 
-An infeasible run counts as worse than any return. Its line starts below 1 and never rises.
-The profile shows the whole distribution over runs where a mean shows one number: with five seeds, one that
-failed is a step of a fifth. Agarwal et al. 2021, figure 4; here a panel a task and agent, so that returns
-of different tasks need not be normalised.
+An infeasible run counts as worse than any return, so lines may start below 1; they never rise. The profile
+shows the whole distribution over runs: with five seeds, a failed run is a step of a fifth. From Agarwal et
+al. 2021, figure 4. There is one panel per task and agent, so that returns of different tasks need not be
+normalised.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ THRESHOLDS = 400
 
 
 def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
-    """A row a task, a column an agent, a line a curriculum.
+    """Draw one row per task, one column per agent, one line per curriculum.
 
     Args:
         sweep: its complete trials are drawn.
-        measure: which outcome.
+        measure: the outcome.
 
     Returns:
         The figure, or None if no trial is complete.
@@ -73,7 +73,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
 
 
 def feasible_scores(rows: pd.DataFrame) -> Floats:
-    """The returns of runs, minus infinity for an infeasible one, [n, 1].
+    """Return the returns of runs, minus infinity for an infeasible run, [n, 1].
 
     Args:
         rows: of ``metrics.outcomes``.
@@ -83,7 +83,7 @@ def feasible_scores(rows: pd.DataFrame) -> Floats:
 
 
 def _thresholds(rows: pd.DataFrame) -> Floats:
-    """Returns around those of the feasible runs, or of all runs if none is feasible, and the optimum."""
+    """Return thresholds around the optimum and the returns of feasible runs, or all if none is."""
     shown = rows[rows["feasible"]] if rows["feasible"].any() else rows
     values = np.concatenate([shown["episode_return"], rows["optimal_return"]])
     values = values[np.isfinite(values)]

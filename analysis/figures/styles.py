@@ -1,9 +1,9 @@
-"""How every figure looks: one colour, dash and marker a method, print sizes, and files that never vary.
+"""Common style of figures: colour, dashes and marker of each method, print sizes, reproducible files.
 
-Colours are Okabe and Ito's (2008), told apart by all common forms of colour blindness; dashes and markers
-tell them apart in greyscale. A known method keeps its style in every figure of every sweep; others take the
-spare styles in order of their names. Nothing here touches matplotlib's global state: ``context`` holds for
-a ``with`` block.
+Colours are Okabe and Ito's (2008), distinguishable with all common forms of colour blindness; dashes and
+markers are distinguishable in greyscale. A known method has the same style in every figure of every sweep;
+others take the spare styles in order of their names. Matplotlib's global state does not change: ``context``
+applies to a ``with`` block.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from matplotlib.text import Text
 
 from recrl.analysis.data.labels import METHOD_ORDER, ordered
 
-# The formulas in figures: ours, and those that matplotlib makes of numbers on an axis.
+# Formulas in figures: ours, and matplotlib's for numbers on an axis.
 OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$")
 TEXT_WIDTH = 7.0  # inches, of a page with two columns
 PNG_DPI = 200
@@ -31,7 +31,7 @@ OPTIMUM_COLOUR = "#8a8a8a"
 
 @dataclass(frozen=True)
 class MethodStyle:
-    """How a method's line looks.
+    """Style of a method's line.
 
     Attributes:
         colour: hexadecimal.
@@ -47,12 +47,12 @@ class MethodStyle:
 
     @property
     def linestyle(self) -> Literal["-"] | tuple[float, Sequence[float]]:
-        """As matplotlib wants it."""
+        """Return the line style for matplotlib."""
         return (0.0, self.dashes) if self.dashes else "-"
 
     @property
     def line(self) -> dict[str, Any]:
-        """The line as keywords of ``Axes.plot``, without the marker."""
+        """Return the line's keywords of ``Axes.plot``, without the marker."""
         return {"color": self.colour, "linestyle": self.linestyle, "linewidth": self.width}
 
 
@@ -76,7 +76,7 @@ SPARE_STYLES = (
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
-    """The style of every method, in the order of METHOD_ORDER and then of the names.
+    """Return the style of every method, in the order of METHOD_ORDER, then of the names.
 
     >>> list(method_styles(["mine", "dynamic", "none"]))
     ['none', 'dynamic', 'mine']
@@ -87,7 +87,7 @@ def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
 
 
 def context() -> AbstractContextManager[None]:
-    """Matplotlib's defaults with our sizes, whatever the user's own settings are, for a ``with`` block."""
+    """Use matplotlib's defaults with our sizes for a ``with`` block, independent of the user's settings."""
     settings = dict(mpl.rcParamsDefault)
     settings.pop("backend", None)  # setting it would load a user interface
     settings |= {
@@ -109,7 +109,7 @@ def context() -> AbstractContextManager[None]:
         "ytick.major.size": 2.5,
         "lines.markersize": 3.0,
         "legend.frameon": False,
-        "pdf.fonttype": 42,  # TrueType: text stays text, as publishers ask
+        "pdf.fonttype": 42,  # TrueType: text stays text, as publishers require
         "figure.dpi": 100,
     }
     return mpl.rc_context(settings)
@@ -120,13 +120,13 @@ def save(figure: Figure, folder: Path, stem: str) -> list[Path]:
 
     Args:
         figure: made within ``context``.
-        folder: made if it is not there.
+        folder: created if necessary.
         stem: of the two file names.
     """
     pdf, png = folder / f"{stem}.pdf", save_png(figure, folder / f"{stem}.png")
     blank = {"Creator": "recrl", "Producer": None, "CreationDate": None}
-    with context():  # ticks are only made now
-        figure.set_layout_engine("none")  # keep the places just found: finding them takes a second
+    with context():  # ticks exist only now
+        figure.set_layout_engine("none")  # keep the places just found: the layout takes a second
         figure.savefig(pdf, metadata=blank)
     return [pdf, png]
 
@@ -136,7 +136,7 @@ def save_png(figure: Figure, path: Path) -> Path:
 
     Args:
         figure: made within ``context``.
-        path: of the file; its folder is made if it is not there.
+        path: of the file; its folder is created if necessary.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _show_dollars(figure)
@@ -146,7 +146,7 @@ def save_png(figure: Figure, path: Path) -> Path:
 
 
 def _show_dollars(figure: Figure) -> None:
-    """Let a label that holds a dollar sign be text and not TeX, which it need not be right as."""
+    """Escape dollar signs in a label, which would start TeX."""
     for text in figure.findobj(Text):
         if isinstance(text, Text) and "$" in OUR_FORMULAS.sub("", text.get_text()):
             text.set_parse_math(False)

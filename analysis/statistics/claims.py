@@ -1,11 +1,11 @@
-"""The paper's claims about RiverGrid's two instances, counted: with how many seeds does each hold?
+"""Count in how many seeds each of the paper's claims about RiverGrid's two instances holds.
 
-The paper (sections 5, 5.1 and 5.3) tells what happens on its figure 1a, where the only way leads through the
-river, and on 1b, where a safe path exists, in words. Here each sentence is a predicate of a trial's final
-policy, and the table says with how many of the seeds it holds, and Wilson's interval of that share. The same
-count for the deployment phase, in which learning goes on, stands beside it.
+The paper (sections 5, 5.1 and 5.3) describes results on its figure 1a, where every path crosses the river,
+and on 1b, which has a safe path. Here each sentence is a predicate of a trial's final policy. The table has
+the fraction of seeds in which it holds, with Wilson's interval. It also has the count for the deployment
+phase, in which learning goes on.
 
-What the words are taken to mean is fixed by the tolerance of ``recrl.analysis.statistics.metrics``.
+The predicates use the tolerance of ``recrl.analysis.statistics.feasibility``.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ STATIC = ("linear", "cosine", "exponential")
 
 
 def violates(rows: pd.DataFrame) -> pd.Series[bool]:
-    """A mean cost above d_d, beyond the tolerance."""
+    """Whether a mean cost is above d_d, beyond the tolerance."""
     return ~within_limits(rows)
 
 
 def stays(rows: pd.DataFrame) -> pd.Series[bool]:
-    """A return below 0: most episodes end without the goal, which alone is worth 10."""
+    """Whether the return is below 0: most episodes end without the goal, whose reward is 10."""
     return rows["episode_return"] < 0.0
 
 
@@ -37,11 +37,11 @@ class Claim:
     """A sentence of the paper.
 
     Attributes:
-        section: where it is.
-        text: what it says.
-        task: whom it is about.
-        methods: likewise, of the grid's names.
-        holds: for which rows of ``metrics.outcomes``.
+        section: of the paper.
+        text: the claim.
+        task: of the claim.
+        methods: of the claim, by the grid's names.
+        holds: predicate on rows of ``metrics.outcomes``.
     """
 
     section: str
@@ -62,14 +62,14 @@ CLAIMS = (
 
 
 def weigh(rows: pd.DataFrame) -> pd.DataFrame:
-    """With how many trials each claim holds, a row a claim and agent.
+    """Count the trials in which each claim holds, one row per claim and agent.
 
     Args:
         rows: of ``metrics.outcomes``.
 
     Returns:
-        section, claim, agent, trials, held, share, share_low, share_high (95%), deployment_held (by the
-        deployment phase instead of the final policy); no row where a grid has no such trial.
+        section, claim, agent, trials, held, share, share_low, share_high (95%), deployment_held (for the
+        deployment phase instead of the final policy); no row without such trials.
     """
     lines = []
     final, deployed = (
@@ -101,7 +101,7 @@ def _about(rows: pd.DataFrame, claim: Claim) -> pd.DataFrame:
 
 
 def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
-    """``weigh`` as text: "4 of 5 (38–96%)"."""
+    """Format the result of ``weigh``: "4 of 5 (38–96%)"."""
     shares = zip(weighed["held"], weighed["trials"], weighed["share_low"], weighed["share_high"], strict=True)
     beside = zip(weighed["deployment_held"], weighed["trials"], strict=True)
     return pd.DataFrame(

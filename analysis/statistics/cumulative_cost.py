@@ -1,35 +1,35 @@
-"""What a training phase cost beside what theory allows: Proposition 1 on the trials of a sweep.
+"""Cumulative cost of a training phase against its theoretical bounds: Proposition 1 on a sweep's trials.
 
 Everything is summed over the n policies of the training phase, one expected episode each, as in
 ``recrl.teachers.bounds``; a trial that collects E episodes with each policy costs E times as much.
 
-Undiscounted (the unit of all limits here), a row a trial:
+Undiscounted (the unit of all limits here), one row per trial:
 
     cost_sum         sum_b C_b, the measured mean episode cost of each policy
-    limit_sum        sum_b D_b, the limits that were in force (the cost itself where they were infinite)
-    overshoot_sum    sum_b max(0, C_b - D_b), what the agent really went over them
-    violation_sum    sum_b max(0, C_b - d_d), what relaxing really cost
-    bound            H c_max + sum_{b<n} min(D_b + excess_b, H c_max), what the n policies are expected to
-                     cost at most if every update solves CPO's problem: policy b + 1 is the answer to the
-                     problem with limit D_b (``bounds.undiscounted_excess``), the first one is nobody's
-    ceiling_sum      n H c_max, what n policies can cost at all
+    limit_sum        sum_b D_b, the limits in force (the cost itself where they were infinite)
+    overshoot_sum    sum_b max(0, C_b - D_b), the cost above the limits in force
+    violation_sum    sum_b max(0, C_b - d_d), the cost above the deployment limit
+    bound            H c_max + sum_{b<n} min(D_b + excess_b, H c_max), an upper bound on the expected cost of
+                     the n policies if every update solves CPO's problem: policy b + 1 solves the problem
+                     with limit D_b (``bounds.undiscounted_excess``), the first policy solves none
+    ceiling_sum      n H c_max, the trivial bound of n policies
 
-Discounted, as the paper has it, never to be added to the above:
+Discounted, as in the paper; do not add these to the above:
 
     discounted_excess_sum   the sum over b < n of Lemma 1's sqrt(2 delta_b) gamma eps_b / (1 - gamma)^2
-    discounted_bound        H c_max + sum_{b<n} min(D_b + discounted excess_b, H c_max): Proposition 1 on the
-                            limits that were in force
+    discounted_bound        H c_max + sum_{b<n} min(D_b + discounted excess_b, H c_max): Proposition 1 for the
+                            limits in force
 
-delta_b is the mean KL divergence that the trial measured of the update from policy b, gamma the agent's
-own. eps_b is at most c_max / (1 - gamma). Where the agent reports its largest cost advantage in the batch
-(``cost_advantage_max_i``), that is taken if it is less: an estimate, which no proof covers. The undiscounted
-advantages are not measured: H c_max bounds them, crudely, and so the undiscounted bound is near the ceiling.
-A policy's discounted cost, which is not recorded, is at most its undiscounted one: a run whose cost_sum is
-within ``discounted_bound`` keeps Proposition 1 all the more.
+delta_b is the measured mean KL divergence of the update from policy b, gamma the agent's own. eps_b is at
+most c_max / (1 - gamma). If the agent reports its largest cost advantage in the batch
+(``cost_advantage_max_i``) and it is smaller, that is used: an estimate without proof. The undiscounted
+advantages are not measured. H c_max is a crude bound on them, so the undiscounted bound is near the trivial
+one. A policy's discounted cost is not recorded, but at most its undiscounted cost. So a run with a cost_sum
+within ``discounted_bound`` satisfies Proposition 1.
 
-Updates under an infinite limit (a d_t that is still being measured) have no bound but the ceiling. Where
-horizon and largest cost are unknown there is no ceiling: the first policy then counts with what it cost, and
-only ``discounted_bound`` can be told.
+Updates under an infinite limit (during the measurement of d_t) have only the trivial bound. If horizon and
+largest cost are unknown, there is no trivial bound. Then the first policy counts with its measured cost, and
+only ``discounted_bound`` is known.
 
 Notation: b policies, n their number, C_b, D_b cost and limit, d_t, d_d training and deployment limit, H
 horizon, c_max largest cost of a step, delta, eps, gamma as in ``bounds``.
@@ -61,10 +61,10 @@ from recrl.teachers.bounds import (
 
 @dataclass(frozen=True)
 class TaskSizes:
-    """What bounds any policy's cost on a finite task.
+    """Quantities that bound any policy's cost on a finite task.
 
     Attributes:
-        horizon: H, most steps of an episode.
+        horizon: H, largest number of steps of an episode.
         largest_cost: c_max, of a step.
     """
 
@@ -73,26 +73,28 @@ class TaskSizes:
 
     @property
     def ceiling(self) -> float:
-        """H c_max, the most that an episode can cost."""
+        """H c_max, the largest possible cost of an episode."""
         return self.horizon * self.largest_cost
 
 
 def policy_costs(
     updates: pd.DataFrame, *, cost: int, sizes: TaskSizes | None, discount: float | None
 ) -> pd.DataFrame:
-    """What each policy of one trial's training phase cost, and at most was expected to: a row a policy.
+    """Return measured cost and bounds of each policy of one trial's training phase: one row per policy.
 
     Args:
         updates: of the trial's training phase.
-        cost: i, which cost.
+        cost: i, index of the cost.
         sizes: of the task, None if unknown.
-        discount: gamma of a CPO agent; None for others, of which nothing is proven.
+        discount: gamma of a CPO agent; None for others, which have no bounds.
 
     Returns:
         end_step, cost, limit, ceiling, bound, discounted_excess (of the update that made the policy, 0 for
-        the first), discounted_bound: the summands of what the module's docstring lists; NaN where unknown.
+        the first), discounted_bound: the summands of the module's sums; NaN if unknown.
     """
-    costs = updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)  # none ended: as the one before
+    costs = (
+        updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)
+    )  # no episode ended: as for the policy before
     limits = updates[f"limit_{cost}"].to_numpy(np.float64)
     ceiling = math.inf if sizes is None else sizes.ceiling
     first = costs[0] if sizes is None else ceiling
@@ -119,7 +121,7 @@ def policy_costs(
 
 
 def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, discount: float) -> Floats:
-    """The eps of each update: the largest that can be, or that the agent saw, if that is less."""
+    """Return eps of each update: the largest possible value, or the agent's measured one if smaller."""
     largest = math.inf if sizes is None else sizes.largest_cost / (1.0 - discount)
     name = f"cost_advantage_max_{cost}"
     seen = updates[name].to_numpy(np.float64) if name in updates else np.full(len(updates), math.inf)
@@ -127,16 +129,16 @@ def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, disco
 
 
 def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
-    """Measured sums and bounds: a row a trial whose training phase is done.
+    """Return measured sums and bounds: one row per trial with a finished training phase.
 
     Args:
         sweep: the frames.
-        cost: i, which cost.
+        cost: i, index of the cost.
 
     Returns:
         KEY, policies (n), episodes_per_policy, train_limit (the d_t in force at the start of the
-        curriculum), deploy_limit, and the quantities that the module's docstring lists; NaN where they are
-        unknown, the bounds also for agents but CPO, of which nothing is proven.
+        curriculum), deploy_limit, and the quantities in the module's docstring; NaN if unknown, bounds also
+        for agents other than CPO.
     """
     trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
     runs = training_runs(sweep)
@@ -159,21 +161,20 @@ def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
 
 
 def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.DataFrame:
-    """The largest d_t that a budget of cumulative violation allows: a row a GROUP with a bound.
+    """Return the largest d_t within a budget of cumulative violation: one row per GROUP with a bound.
 
-    The inverse of Proposition 1 (``bounds.largest_train_limit``). The excess of an update is not the proven
-    one, which allows nothing, but the mean overshoot that the group's runs measured, the worst run's.
+    This is the inverse of Proposition 1 (``bounds.largest_train_limit``). The proven excess of an update is
+    too large for any budget. So the measured mean overshoot of the group's worst run is used.
 
     Args:
         rows: of ``cumulative_costs``.
-        sweep: the same.
+        sweep: of these rows.
         budget: expected cost above d_d, summed over all episodes of a training phase, at least 0.
 
     Returns:
-        GROUP, policies, episodes_per_policy, overshoot (assumed, per policy), used_train_limit (the
-        largest of the runs'), measured_violation (of the worst run, all its episodes),
-        largest_train_limit (NaN where d_t = d_d already exceeds the budget, infinite where d_t does not
-        matter).
+        GROUP, policies, episodes_per_policy, overshoot (assumed, per policy); used_train_limit (the largest
+        of the runs); measured_violation (of the worst run, over all episodes); largest_train_limit (NaN if
+        d_t = d_d exceeds the budget, infinite if d_t does not matter).
     """
     if not budget >= 0.0:
         raise RecrlError(f"--budget: must be at least 0, got {budget:g}")
@@ -190,7 +191,7 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
             limit = largest_train_limit(
                 curriculum, allowed, deploy, excesses=[overshoot] * policies, clock="start"
             )
-        except ValueError:  # less than what d_t = d_d costs
+        except ValueError:  # less than the bound for d_t = d_d
             limit = math.nan
         lines.append(
             dict(zip(GROUP, group, strict=True))
@@ -203,7 +204,7 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
 
 
 def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """The sums of ``cumulative_costs`` as text: a row a GROUP, means over its runs."""
+    """Format the sums of ``cumulative_costs``: one row per GROUP, means over its runs."""
     lines = []
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
         line = {name: str(label) for name, label in zip(GROUP, group, strict=True)}
@@ -223,7 +224,7 @@ def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """The limits of ``admissible_limits`` as text."""
+    """Format the limits of ``admissible_limits``."""
     lines = []
     for _, row in rows.iterrows():
         limit = float(row["largest_train_limit"])
@@ -238,32 +239,32 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def training_runs(sweep: Sweep) -> dict[Any, pd.DataFrame]:
-    """The updates of every trial's training phase, by KEY."""
+    """Return the updates of every trial's training phase, by KEY."""
     updates = sweep.updates[sweep.updates["phase"] == Phase.TRAINING.value]
     return dict(iter(updates.groupby(list(KEY), observed=True)))
 
 
 def policies_of(sweep: Sweep, trial: pd.Series, updates: pd.DataFrame, *, cost: int) -> pd.DataFrame:
-    """``policy_costs`` of a trial.
+    """Compute ``policy_costs`` of a trial.
 
     Args:
-        sweep: what it is a trial of.
+        sweep: of the trial.
         trial: its row of ``sweep.trials``.
         updates: of its training phase.
-        cost: i, which cost.
+        cost: i, index of the cost.
     """
     sizes = task_sizes(str(trial["task_name"]), sweep.task_options[str(trial["task"])], cost)
     return policy_costs(updates, cost=cost, sizes=sizes, discount=_discount(sweep, trial))
 
 
 def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | None:
-    """Horizon and largest cost of a step of a finite task; None for others."""
+    """Return horizon and largest cost of a step of a finite task; None for others."""
     model = finite_model(name, options)
     return None if model is None else TaskSizes(model.horizon, float(model.costs[:, :, cost].max()))
 
 
 def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
-    """The discount gamma of a CPO agent, None for others: Lemma 1 is not about them."""
+    """Return the discount gamma of a CPO agent, None for others: Lemma 1 is not about them."""
     options = sweep.agent_options[str(trial["agent"])]
     discount = options.get("discount", math.nan)
     if trial["agent_name"] != "cpo":
@@ -272,7 +273,7 @@ def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
 
 
 def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:
-    """The sums over the policies of a trial."""
+    """Sum over the policies of a trial."""
     costs, limits = policies["cost"].to_numpy(np.float64), policies["limit"].to_numpy(np.float64)
     return {
         "policies": len(costs),
@@ -288,6 +289,6 @@ def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:
 
 
 def _sum(values: pd.Series[float]) -> float:
-    """NaN where one is unknown or infinite: then nothing is told."""
+    """Sum, or return NaN if a value is unknown or infinite."""
     total = math.fsum(values) if np.isfinite(values).all() else math.nan
     return float(total)

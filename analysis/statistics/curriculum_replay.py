@@ -1,11 +1,12 @@
-"""What limits another teacher would have set on the recorded episodes of a run.
+"""Limits that another curriculum would have set on the recorded episodes of a run.
 
-A teacher is a pure function of what it is told, so a run's files are enough to ask it again: every policy
-update becomes the ``ProgressReport`` that the trial sent. A run's own teacher gives the run's own limits.
+A teacher is a pure function of the trial's reports, so it can be called again with a run's files. Every
+policy update becomes the ``ProgressReport`` that the trial sent. A run's own teacher gives the run's own
+limits.
 
-What it cannot say is how the agent would have done under the other limits: the episodes stay those that
-were played under the recorded ones. It shows what a teacher makes of a given course of training, for example
-whether a dynamic curriculum's window or tolerance would have let it move.
+The replay does not predict the agent's results under the other limits: the episodes are still those under the
+recorded limits. It shows the effect of a curriculum's options on given episodes, for example of a dynamic
+curriculum's window or tolerance.
 """
 
 from __future__ import annotations
@@ -26,18 +27,18 @@ from recrl.teachers.teacher import ProgressReport, TeacherSpec
 
 
 def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
-    """Ask a teacher for its limits on a run's recorded episodes: a row a policy update.
+    """Compute a curriculum's limits on a run's recorded episodes: one row per policy update.
 
     Args:
         trial: the run, finished or not.
-        method: the teacher and its options.
+        method: the curriculum and its options.
 
     Returns:
         update, phase, end_step, cost_i, limit_i and noise as recorded, replayed_limit_i and replayed_noise.
 
     Raises:
         RecrlError: the run has no update yet.
-        UnknownNameError: nobody provides the teacher.
+        UnknownNameError: the curriculum is not known.
         pydantic.ValidationError: its options are wrong.
     """
     updates = trial.updates()
@@ -63,7 +64,7 @@ def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
 
 
 def progress_reports(trial: TrialStore, updates: pd.DataFrame) -> Iterator[ProgressReport]:
-    """What the trial told its teacher after each policy update.
+    """Yield the trial's report to its teacher after each policy update.
 
     Args:
         trial: the run.
@@ -82,7 +83,7 @@ def progress_reports(trial: TrialStore, updates: pd.DataFrame) -> Iterator[Progr
 
 
 def replay_summary(trial: TrialStore, rows: pd.DataFrame) -> pd.DataFrame:
-    """How far a replay departs from the record: a row a cost, as text.
+    """Summarise the differences between replay and record: one row per cost, as text.
 
     Args:
         trial: the run.
@@ -122,13 +123,13 @@ def _episode(row: dict[Any, Any], num_costs: int) -> EpisodeStats:
 
 
 def _mean(limits: Sequence[float] | np.ndarray) -> str:
-    """The mean of the finite limits."""
+    """Return the mean of the finite limits."""
     finite = np.asarray(limits)[np.isfinite(limits)]
     return number(float(finite.mean())) if len(finite) else "∞"
 
 
 def _reached(training: pd.DataFrame, limits: np.ndarray, deploy: float) -> str:
-    """When a limit is first d_d, as a share of the training phase."""
+    """Return when a limit first equals d_d, as a percentage of the training phase."""
     steps = training.loc[limits <= deploy, "end_step"]
     return f"{steps.iloc[0] / training['end_step'].iloc[-1]:.0%}" if len(steps) else "at its end"
 

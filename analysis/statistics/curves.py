@@ -23,10 +23,10 @@ class Curve:
 
     Attributes:
         steps: centres of the grid's bins, [g].
-        centre: mean or interquartile mean over the runs that have data in the bin, [g]; NaN where none has.
-        low: lower end of the band, [g]; NaN where fewer than two have.
+        centre: mean or interquartile mean over the runs with data in the bin, [g]; NaN without any.
+        low: lower end of the band, [g]; NaN with fewer than two such runs.
         high: upper end, likewise.
-        runs: how many have, int [g].
+        runs: number of such runs, int [g].
     """
 
     steps: Floats
@@ -38,12 +38,12 @@ class Curve:
 
 @dataclass(frozen=True)
 class Averaging:
-    """A way to make one line with a band of several runs.
+    """Method that turns several runs into a line with a band.
 
     Attributes:
         description: of line and band, for legends.
-        curve: (updates, column, edges) as of ``mean_curve``.
-        enough_runs: with fewer the band is narrower than it says.
+        curve: (updates, column, edges) as in ``mean_curve``.
+        enough_runs: with fewer the band is narrower than its nominal level.
     """
 
     description: str
@@ -51,7 +51,7 @@ class Averaging:
     enough_runs: int = 1
 
     def describe(self, runs: int) -> str:
-        """The description, with a warning where there are too few runs; one run has no band."""
+        """Return the description, with a warning for too few runs; a single run has no band."""
         if runs == 1:
             return "one seed, no interval"
         warning = f"; {runs} seeds are too few for it: the band is too narrow"
@@ -59,13 +59,13 @@ class Averaging:
 
 
 def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) -> Floats:
-    """Edges of bins over a trial's steps, one of them at the phase boundary so that no bin mixes phases.
+    """Return edges of bins over a trial's steps, one at the phase boundary so that no bin mixes phases.
 
     Args:
         boundary_step: first step under d_d.
         total_steps: environment steps of the trial.
         updates: policy updates of the trial: there are never more bins than updates.
-        bins: bins wanted over the whole trial, at least 2.
+        bins: number of bins over the whole trial, at least 2.
 
     Returns:
         Ascending edges from 0 to ``total_steps``, about [min(bins, updates) + 1].
@@ -79,14 +79,14 @@ def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) 
 
 
 def binned_runs(updates: pd.DataFrame, column: str, edges: Floats) -> Floats:
-    """Every run's curve on a common grid.
+    """Return every run's curve on a common grid.
 
-    A bin (e_j, e_j+1] holds the mean of the run's updates that end in it, each weighted with its number of
-    episodes (limits and the agent's own metrics: each update once), NaN if there is none.
+    A bin (e_j, e_j+1] has the mean of the run's updates that end in it, weighted by their numbers of
+    episodes, or NaN. Limits and the agent's own metrics are not weighted.
 
     Args:
         updates: of one task, agent and method; of a ``Sweep``.
-        column: what to average.
+        column: the averaged column.
         edges: ascending, [g + 1].
 
     Returns:
@@ -107,11 +107,11 @@ def binned_runs(updates: pd.DataFrame, column: str, edges: Floats) -> Floats:
 
 
 def mean_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
-    """Mean and standard error over seeds of ``binned_runs``.
+    """Return mean and standard error over seeds of ``binned_runs``.
 
     Args:
         updates: of one task, agent and method.
-        column: what to average.
+        column: the averaged column.
         edges: ascending, [g + 1].
     """
     runs = binned_runs(updates, column, edges)
@@ -126,13 +126,13 @@ def mean_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
 def interquartile_curve(
     updates: pd.DataFrame, column: str, edges: Floats, generator: np.random.Generator
 ) -> Curve:
-    """Interquartile mean over seeds of ``binned_runs``, with its 95% percentile bootstrap band.
+    """Return the interquartile mean over seeds of ``binned_runs``, with a 95% bootstrap band.
 
-    Whole runs are resampled, so that a band's neighbouring bins rest on the same resamples.
+    Whole runs are resampled, so that neighbouring bins have the same resamples.
 
     Args:
         updates: of one task, agent and method.
-        column: what to average.
+        column: the averaged column.
         edges: ascending, [g + 1].
         generator: draws the resamples.
     """
@@ -142,7 +142,7 @@ def interquartile_curve(
     patterns, pattern_of = np.unique(present, axis=1, return_inverse=True)
     for index, members in enumerate(patterns.T):
         bins = np.flatnonzero(pattern_of.reshape(-1) == index)
-        scores = runs[np.ix_(members, bins)].T  # [b, n] of the n runs that have data in these b bins
+        scores = runs[np.ix_(members, bins)].T  # [b, n] of the n runs with data in these b bins
         count = scores.shape[1]
         if count == 0:
             continue
@@ -175,5 +175,5 @@ def _centres(edges: Floats) -> Floats:
 
 
 def _divided(numerator: Floats, denominator: npt.NDArray[np.integer]) -> Floats:
-    """The quotient, NaN where the denominator is not positive."""
+    """Return the quotient, NaN where the denominator is not positive."""
     return np.where(denominator > 0, numerator / np.maximum(denominator, 1), np.nan)

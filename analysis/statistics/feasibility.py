@@ -1,10 +1,10 @@
-"""The verdict on a policy: feasible, and solved.
+"""Verdicts on a policy: feasible, solved.
 
-There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``: a share
-COST_TOLERANCE of the limit, or one standard error of the mean where that is more. A policy with softmax
-outputs cannot meet a limit exactly where the optimum does: each action keeps some probability.
+There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``. This is a
+fraction COST_TOLERANCE of the limit, or one standard error of the mean if that is larger. A policy with
+softmax outputs cannot meet a limit exactly like the optimum, because each action keeps some probability.
 
-Solved (the column ``optimal``) means feasible and at most OPTIMAL_GAP below J*(d_d), where that is known.
+Solved (the column ``optimal``) means feasible and at most OPTIMAL_GAP below J*(d_d), if that is known.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ ROUNDING = 1e-9  # of a difference of two returns: 9.5 - 9.3 is more than 0.2
 
 
 def within_limits(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether every mean cost is at most its limit plus ``tolerance``; costs that a task lacks are.
+    """Whether every mean cost is at most its limit plus ``tolerance``; missing costs count as feasible.
 
     Args:
-        rows: cost_i, deploy_limit_i (NaN where the task lacks it), and cost_i_se where costs are sampled.
+        rows: cost_i, deploy_limit_i (NaN if the task lacks it), and cost_i_se if costs are sampled.
     """
     within: pd.Series[bool] = pd.Series(True, index=rows.index)
     for i in costs_of(rows):
@@ -34,7 +34,7 @@ def within_limits(rows: pd.DataFrame) -> pd.Series[bool]:
 
 
 def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[float]:
-    """How far a mean cost may be above its limit: COST_TOLERANCE of it, or a standard error if that is more.
+    """Return the tolerance of a mean cost: COST_TOLERANCE of its limit, or a standard error if larger.
 
     Args:
         limits: d_d,i; at a limit of 0 the tolerance is COST_TOLERANCE itself.
@@ -45,10 +45,10 @@ def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[f
 
 
 def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether a trial is solved: feasible, and at most OPTIMAL_GAP below J*(d_d), which is known.
+    """Whether a trial is solved: feasible, and at most OPTIMAL_GAP below a known J*(d_d).
 
     Args:
-        rows: gap, and what ``within_limits`` takes.
+        rows: gap, and the columns for ``within_limits``.
     """
     near = (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & (rows["gap"] > -math.inf)  # NaN is neither
     return near & within_limits(rows)
@@ -66,7 +66,7 @@ def tie(optimal_return: float) -> float:
 
 
 def costs_of(rows: pd.DataFrame) -> list[str]:
-    """Which i have a column deploy_limit_i."""
+    """Return each i with a column deploy_limit_i."""
     names = [str(name) for name in rows]
     return [name.removeprefix("deploy_limit_") for name in names if name.startswith("deploy_limit_")]
 

@@ -1,12 +1,13 @@
-"""Estimates over few seeds, and how sure they are: pure functions on arrays, one estimator each.
+"""Estimates over few seeds with intervals: pure functions on arrays, one per estimator.
 
 The paper reports means and standard errors of five seeds. The other estimators are those of Agarwal et al.
-2021, "Deep RL at the edge of the statistical precipice" (rliable): interquartile mean, stratified percentile
-bootstrap, probability of improvement, performance profiles. Shares of seeds get Wilson's interval.
+2021, "Deep RL at the edge of the statistical precipice" (rliable). They are interquartile mean, stratified
+percentile bootstrap, probability of improvement and performance profiles. Fractions of seeds get Wilson's
+interval.
 
-What five seeds can carry: the percentile bootstrap resamples only the values that were seen, so its "95%"
-intervals are too short where n is small. Simulated with normal data (4,000 samples, so +- .004;
-tests/benchmarks/interval_statistics.py), they cover the truth this often:
+Coverage with few seeds: the percentile bootstrap resamples only observed values, so its "95%" intervals are
+too short for small n. Simulated coverage with normal data (4,000 samples, so +- .004;
+tests/benchmarks/interval_statistics.py):
 
     runs a task                           5      10      20
     mean                               .838    .908    .927
@@ -18,13 +19,13 @@ tests/benchmarks/interval_statistics.py), they cover the truth this often:
     share of 0.8, Wilson               .944    .964    .958
     share of 0.95, Wilson              .981    .917    .917
 
-The same script finds point estimates equal to rliable 1.2.0's within 2e-16 on 500 random tables.
+The same script shows that point estimates equal those of rliable 1.2.0 within 2e-16 on 500 random tables.
 
 ``Interval.is_small`` is true below ``ENOUGH_RUNS``; tables then print a mark. ``mean_interval`` (Student's t)
-keeps its promise for normal data at any n >= 2, and is the one to trust at n = 5.
+has its nominal coverage for normal data at any n >= 2; use it at n = 5.
 
 Notation: n runs (seeds), m tasks, r bootstrap replications. Scores are [..., n, m]: runs in rows, tasks in
-columns. NaN never enters: drop unfinished runs first.
+columns. NaN is not allowed: drop unfinished runs first.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri, stdtrit  # scipy.stats takes a second and a half to be imported
+from scipy.special import ndtri, stdtrit  # importing scipy.stats takes a second and a half
 
 from recrl.environments.cmdp import Floats
 
 ENOUGH_RUNS = 10
-ENOUGH_FOR_SHARES = 5  # runs: with fewer, Wilson's interval says next to nothing
+ENOUGH_FOR_SHARES = 5  # runs: with fewer, Wilson's interval is very wide
 REPLICATIONS = 2000
 CONFIDENCE = 0.95
 
@@ -52,10 +53,10 @@ class Interval:
 
     Attributes:
         estimate: from all runs.
-        low: lower end; NaN where n is too small for any interval.
+        low: lower end; NaN if n is too small for any interval.
         high: upper end, likewise.
-        runs: n, on which all of it rests.
-        is_small: whether n is too small for the interval to cover what it promises.
+        runs: n.
+        is_small: whether n is too small for the nominal coverage.
     """
 
     estimate: float
@@ -66,7 +67,7 @@ class Interval:
 
 
 def mean_and_standard_error(values: Floats) -> tuple[float, float]:
-    """The mean of n values and its standard error s / sqrt(n), with s the sample's deviation (n - 1).
+    """Return the mean of n values and its standard error s / sqrt(n), s with n - 1 degrees of freedom.
 
     Args:
         values: [n]; for n = 0 both are NaN, for n = 1 the standard error is.
@@ -82,10 +83,10 @@ def mean_and_standard_error(values: Floats) -> tuple[float, float]:
 
 
 def mean_interval(values: Floats, *, confidence: float = CONFIDENCE) -> Interval:
-    """Student's t interval of a mean: mean +- t_{n-1} s / sqrt(n).
+    """Return Student's t interval of a mean: mean +- t_{n-1} s / sqrt(n).
 
     Args:
-        values: [n], thought of as normal.
+        values: [n], assumed normal.
         confidence: of the interval, in (0, 1).
     """
     mean, error = mean_and_standard_error(values)
@@ -97,7 +98,7 @@ def mean_interval(values: Floats, *, confidence: float = CONFIDENCE) -> Interval
 
 
 def interquartile_mean(scores: Floats) -> Floats:
-    """IQM: the mean of the middle half of all n m scores; floor(n m / 4) are cut off at either end.
+    """Return the IQM: the mean of the middle half of all n m scores, without floor(n m / 4) at either end.
 
     Args:
         scores: [..., n, m].
@@ -111,12 +112,12 @@ def interquartile_mean(scores: Floats) -> Floats:
 
 
 def mean_of_tasks(scores: Floats) -> Floats:
-    """The mean over runs and tasks, [..., n, m] -> [...]."""
+    """Return the mean over runs and tasks, [..., n, m] -> [...]."""
     return np.asarray(np.mean(scores, axis=(-2, -1)))
 
 
 def performance_profile(scores: Floats, thresholds: Floats) -> Floats:
-    """Share of runs, averaged over tasks, that score above each threshold: F(tau) = mean 1[x > tau].
+    """Return the fraction of runs above each threshold, averaged over tasks: F(tau) = mean 1[x > tau].
 
     Args:
         scores: [..., n, m].
@@ -129,7 +130,7 @@ def performance_profile(scores: Floats, thresholds: Floats) -> Floats:
 
 
 def probability_of_improvement(scores: Floats, others: Floats, *, tie: float = 0.0) -> Floats:
-    """P(X > Y): mean over tasks and pairs of runs of 1[x > y] + 1[x = y] / 2 (Mann-Whitney's U / n n').
+    """Return P(X > Y), the mean over tasks and pairs of 1[x > y] + 1[x = y] / 2 (Mann-Whitney's U / n n').
 
     Args:
         scores: x, [..., n, m].
@@ -152,7 +153,7 @@ def stratified_bootstrap(
     confidence: float = CONFIDENCE,
     replications: int = REPLICATIONS,
 ) -> Interval:
-    """Percentile interval of a statistic, the runs resampled with replacement within every task.
+    """Return the percentile interval of a statistic; runs are resampled within every task.
 
     Args:
         scores: [n, m].
@@ -174,7 +175,7 @@ def improvement_interval(
     confidence: float = CONFIDENCE,
     replications: int = REPLICATIONS,
 ) -> Interval:
-    """Stratified bootstrap of P(X > Y); the runs of both are resampled, independently.
+    """Return the stratified bootstrap interval of P(X > Y); the runs of both are resampled independently.
 
     Args:
         scores: x, [n, m].
@@ -192,7 +193,7 @@ def improvement_interval(
 
 
 def paired_difference(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Interval:
-    """Mean of the differences between runs of equal seeds, with Student's t interval.
+    """Return the mean difference between runs of equal seeds, with Student's t interval.
 
     Equal seeds share the first policy and the stream of the environment, so that differences within a
     seed vary less than differences between seeds.
@@ -206,7 +207,7 @@ def paired_difference(values: Floats, baseline: Floats, *, confidence: float = C
 
 
 def wilson_interval(successes: int, runs: int, *, confidence: float = CONFIDENCE) -> Interval:
-    """Wilson's (1927) score interval of a share p = successes / n.
+    """Return Wilson's (1927) score interval of a fraction p = successes / n.
 
     With z the normal quantile: (p + z^2/2n +- z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n). Unlike
     p +- standard error it stays in [0, 1] and does not collapse at 0 or n successes.
@@ -224,15 +225,15 @@ def wilson_interval(successes: int, runs: int, *, confidence: float = CONFIDENCE
     reach = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     scale = 1 + z**2 / n
     low, high = (centre - reach) / scale, (centre + reach) / scale
-    return Interval(p, max(0.0, min(p, low)), min(1.0, max(p, high)), n, False)  # rounding may cross p
+    return Interval(p, max(0.0, min(p, low)), min(1.0, max(p, high)), n, False)  # rounding may exceed p
 
 
 def share_text(successes: int, runs: int, low: float, high: float) -> str:
-    """A share of runs as text, with its interval from ENOUGH_FOR_SHARES runs on.
+    """Format a fraction of runs, with its interval from ENOUGH_FOR_SHARES runs on.
 
     Args:
-        successes: how many.
-        runs: of how many.
+        successes: their number.
+        runs: total number.
         low: lower end of the interval, in [0, 1].
         high: upper end, likewise.
 
@@ -244,7 +245,7 @@ def share_text(successes: int, runs: int, low: float, high: float) -> str:
 
 
 def _resampled(scores: Floats, generator: np.random.Generator, replications: int) -> Floats:
-    """[n, m] -> [r, n, m]: every task's column resampled by itself."""
+    """Resample [n, m] -> [r, n, m]: every task's column independently."""
     runs, tasks = scores.shape
     rows = generator.integers(runs, size=(replications, runs, tasks))
     return scores[rows, np.arange(tasks)]

@@ -1,10 +1,10 @@
-"""What a trial achieved: functions from tables to tables.
+"""Outcomes of trials: functions from tables to tables.
 
-A trial's outcome is measured three ways, never mixed (``Measure``). Learning goes on in the deployment phase,
-so that phase averages over policies. The final policy is the one a user would take away. Its values are exact
-where the task is finite and its table was recorded; otherwise they are means over episodes.
+A trial's outcome has three separate measures (``Measure``). Learning goes on in the deployment phase, so that
+phase averages over policies. The final policy is the result of training. Its values are exact if the task is
+finite and its table was recorded; otherwise they are means over episodes.
 
-What is feasible and what is solved: ``recrl.analysis.statistics.feasibility``.
+``recrl.analysis.statistics.feasibility`` defines feasible and solved.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from recrl.orchestrator.spec import TrialState
 
 
 class Measure(StrEnum):
-    """The episodes that a trial's outcome is averaged over."""
+    """The episodes or policies that an outcome is averaged over."""
 
     DEPLOYMENT = "deployment"
     STOCHASTIC = "stochastic"
@@ -40,7 +40,7 @@ class Measure(StrEnum):
 
     @property
     def description(self) -> str:
-        """What it is, for captions."""
+        """Description for captions."""
         return {
             Measure.DEPLOYMENT: "the deployment phase (learning goes on)",
             Measure.STOCHASTIC: "the final policy, stochastic",
@@ -49,9 +49,9 @@ class Measure(StrEnum):
 
 
 def outcomes(sweep: Sweep) -> pd.DataFrame:
-    """What every complete trial achieved: a row a trial and measure.
+    """Return the outcomes of all complete trials: one row per trial and measure.
 
-    Trials that are not complete are left out: half a deployment phase is no outcome.
+    Incomplete trials are left out.
 
     Returns:
         KEY, measure, episodes, exact (whether computed, not sampled), episode_return, episode_return_se,
@@ -78,12 +78,12 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
 
 
 def training_totals(sweep: Sweep) -> pd.DataFrame:
-    """What relaxed training cost: a row a trial whose training phase is done.
+    """Return the cost of relaxed training: one row per trial with a finished training phase.
 
     Returns:
-        KEY, episodes, steps, cost_i_total (the paper's SUM-J_C,i: all cost incurred in training, within
-        the limit or not), excess_i_total (the part of it above d_d, episode by episode), updates_over_i
-        (policy updates whose mean cost was above the limit in force).
+        KEY, episodes, steps; cost_i_total (the paper's SUM-J_C,i: all cost of training, within the limit or
+        not); excess_i_total (its part above d_d, episode by episode); updates_over_i (policy updates with a
+        mean cost above the limit in force).
     """
     trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
     phases = sweep.phases[sweep.phases["phase"] == Phase.TRAINING.value]
@@ -98,7 +98,7 @@ def training_totals(sweep: Sweep) -> pd.DataFrame:
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Outcomes averaged over seeds: a row a task, agent, method and measure.
+    """Average outcomes over seeds: one row per task, agent, method and measure.
 
     Args:
         rows: of ``outcomes``.
@@ -136,7 +136,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.DataFrame:
-    """Interquartile means of the return with 95% bootstrap intervals: a row a GROUP and measure.
+    """Return interquartile means of the return with 95% bootstrap intervals: one row per GROUP and measure.
 
     Args:
         rows: of ``outcomes``.
@@ -161,18 +161,18 @@ def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.Dat
 def comparisons(
     rows: pd.DataFrame, generator: np.random.Generator, *, baseline: str = "none"
 ) -> pd.DataFrame:
-    """Every method against the agent without a curriculum: a row a GROUP (but the baseline) and measure.
+    """Compare every method with the baseline: one row per other GROUP and measure.
 
     Args:
         rows: of ``outcomes``.
         generator: draws the resamples.
-        baseline: the method that the others are compared to.
+        baseline: the method for comparison.
 
     Returns:
         GROUP, measure, pairs (seeds that both have), then mean paired differences to the baseline with
         Student's 95% interval: return_difference, _low, _high, and the same for cost_i_difference; then
-        improvement, the probability that a run returns more than one of the baseline's (ties count half:
-        ``feasibility.tie``), with its bootstrap interval _low, _high, and too_few_seeds (that interval is
+        improvement, the probability that a run returns more than a run of the baseline (ties count half:
+        ``feasibility.tie``), with its bootstrap interval _low, _high; and too_few_seeds (that interval is
         then too short).
     """
     costs = [str(name) for name in rows if is_cost(str(name))]
@@ -226,7 +226,7 @@ def _frozen(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
 
 
 def _with_exact(sampled: pd.DataFrame, exact: pd.DataFrame) -> pd.DataFrame:
-    """Replace sampled means by exact values where there are some; their standard errors are 0."""
+    """Replace sampled means by exact values if known; their standard errors are 0."""
     if not len(exact):
         return sampled
     key = [*KEY, "measure"]

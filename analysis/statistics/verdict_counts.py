@@ -1,7 +1,8 @@
-"""Verdicts on the final policies (solved, feasible, infeasible), for each task, agent and curriculum.
+"""Counts of verdicts on the final policies (solved, feasible, infeasible), by task, agent and curriculum.
 
-Every verdict is on the stochastic final policy, evaluated without learning. What the words mean is defined in
-``recrl.analysis.statistics.metrics``. The deployment phase stands beside it for comparison only.
+Every verdict is on the stochastic final policy, evaluated without learning.
+``recrl.analysis.statistics.feasibility`` defines the verdicts. The deployment phase is given for comparison
+only.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ FINAL = Measure.STOCHASTIC
 
 
 def verdicts(rows: pd.DataFrame, compared: pd.DataFrame, flags: pd.DataFrame) -> pd.DataFrame:
-    """Count the verdicts: a row a GROUP.
+    """Count the verdicts: one row per GROUP.
 
     Args:
         rows: of ``metrics.outcomes``.
@@ -63,7 +64,7 @@ def _counts(seeds: pd.DataFrame) -> dict[str, int]:
 
 
 def _worst(seeds: pd.DataFrame, costs: list[str]) -> dict[str, float]:
-    """The largest excess among the infeasible seeds, and its share of the limit."""
+    """Return the largest excess among the infeasible seeds, and its fraction of the limit."""
     broken = seeds[~seeds["feasible"]]
     limits = {name: seeds[f"deploy_{name.replace('cost', 'limit')}"].iloc[0] for name in costs}
     excess = [(float((broken[name] - limits[name]).max()), float(limits[name])) for name in costs]

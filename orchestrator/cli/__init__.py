@@ -1,1 +1,1 @@
-"""The command line ``recrl-sweep``: arguments, commands, and what a terminal shows."""
+"""The command line ``recrl-sweep``: arguments, commands, and terminal output."""

@@ -1,4 +1,4 @@
-"""What the command line accepts as a folder, a file or a number; anything else is one sentence."""
+"""Types of command-line arguments: folders, files and numbers. Other values are an error of one sentence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def folder(text: str) -> Path:
     """A path that is a folder, or can become one."""
     from recrl.orchestrator.redaction import redacted  # noqa: PLC0415
 
-    if "://" in text:  # trials append to their files and hold locks, which object stores know nothing of
+    if "://" in text:  # trials append to files and lock them, which object stores do not support
         raise argparse.ArgumentTypeError(
             "must be a folder, on a file system that all nodes share where there are several; an object "
             f"store is given by --storage, got {redacted(text)!r}"
@@ -44,7 +44,7 @@ def _nopath_of(text: str, error: OSError | ValueError) -> str:
 
 
 def zip_file(text: str) -> Path:
-    """A file that ends with ``.zip``, by which all commands tell it from a sweep's name."""
+    """A file that ends with ``.zip``, which distinguishes it from a sweep's name."""
     path = path_of(text)
     try:
         if path.suffix != ".zip" or path.is_dir():
@@ -55,17 +55,17 @@ def zip_file(text: str) -> Path:
 
 
 def at_least_one(text: str) -> int:
-    """A whole number from 1."""
+    """An integer of at least 1."""
     return _whole(text, least=1)
 
 
 def at_least_zero(text: str) -> int:
-    """A whole number from 0."""
+    """An integer of at least 0."""
     return _whole(text, least=0)
 
 
 def port(text: str) -> int:
-    """A port's number."""
+    """A port number."""
     return _whole(text, least=1, most=65535)
 
 

@@ -1,6 +1,6 @@
-"""The arguments of ``recrl-sweep``: builds the parser, and makes of its answer a typed request.
+"""The arguments of ``recrl-sweep``: the parser, and its result as a typed request.
 
-Imports next to nothing, so that ``--help`` is quick.
+Imports almost nothing, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ from recrl.orchestrator.cli.requests import VIDEOS, Request
 
 DESCRIPTION = """\
 Run constrained reinforcement learning under cost-limit curricula: every task x agent x method x seed of a
-grid file, on all cores or a Ray cluster, so that nothing is lost and nothing is run twice."""
+grid file, on all cores or a Ray cluster. Interrupted sweeps resume exactly."""
 
 EPILOG = """\
 A first sweep:
   recrl-sweep init                        write demo.yaml, a grid file with comments
-  recrl-sweep validate demo.yaml          is the file right? (all mistakes at once, with their lines)
-  recrl-sweep plan demo.yaml --measure    what would run, how long, how much memory
-  recrl-sweep launch demo.yaml            run it, watch it, draw the figures, print the results
-  recrl-sweep ui demo                     open MLflow's pages about it
+  recrl-sweep validate demo.yaml          check the file; all mistakes at once, with their lines
+  recrl-sweep plan demo.yaml --measure    show the trials, and estimates of time and memory
+  recrl-sweep launch demo.yaml            run it, show progress, draw figures, print results
+  recrl-sweep ui demo                     open it in MLflow
 
-What there is:
-  recrl-sweep list tasks                  and agents, and curricula
+Reference:
+  recrl-sweep list tasks                  also: agents, curricula
   recrl-sweep options cpo                 all options of a task, an agent or a curriculum
   recrl-sweep schema                      the grid file's JSON schema, for editors
 
-Going on:
+Later:
   recrl-sweep status demo                 from any terminal, whether it runs or not
   recrl-sweep launch demo.yaml            after a crash, Ctrl-C or with more seeds: the same command; complete
-                                          trials are kept, begun ones go on from their last checkpoint
-  recrl-sweep stop demo                   from another terminal: trials save where they are, the launch ends
+                                          trials are kept, others continue from their last checkpoint
+  recrl-sweep stop demo                   from another terminal: trials save their state, the launch ends
   recrl-sweep logs demo 3f2a --follow     a trial's log, by the beginning of its id or title
-  recrl-sweep evaluate demo 3f2a --video  run its policy again, and film an episode
-  recrl-sweep check demo                  are all files as they were written? one line for each that is not
+  recrl-sweep evaluate demo 3f2a --video  evaluate its policy again, and film an episode
+  recrl-sweep check demo                  check all files against their digests
   recrl-sweep launch demo.yaml --retry-failed
   recrl-sweep launch demo.yaml --only method=dynamic task=rivergrid-1b
   recrl-sweep launch demo.yaml --address auto --storage s3://bucket/folder
-  recrl-sweep status demo --storage s3://bucket/folder     from any machine that has its credentials
+  recrl-sweep status demo --storage s3://bucket/folder     from any machine with credentials
 
 Exit codes:
   0    done, or nothing to do
@@ -51,7 +51,7 @@ Exit codes:
   3    another process is running this sweep
   4    Ray, MLflow or the storage could not be reached, or files could not be written
   5    plan --check: a launch would have something to do
-  130  stopped by Ctrl-C or SIGTERM; the same launch goes on"""
+  130  stopped by Ctrl-C or SIGTERM; the same launch continues"""
 
 # Each command and the function that does it, in the order of the help. The function's module is imported when
 # it is needed.
@@ -82,7 +82,7 @@ LONGEST_LINE = 1000  # characters of an error
 
 
 def readable(sentence: str) -> str:
-    """What may be shown of a sentence, its lines cut where they quote something endless."""
+    """Return a sentence for display: passwords hidden, long lines cut."""
     from recrl.orchestrator.redaction import shown  # noqa: PLC0415  (--help is to be quick)
 
     lines = shown(sentence).split("\n")
@@ -96,10 +96,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parse(given: Sequence[str]) -> Request:
-    """The request that the arguments make.
+    """Parse arguments to a request.
 
     Raises:
-        SystemExit: they are wrong, or ask for help.
+        SystemExit: they are wrong, or contain ``--help``.
     """
     parsed = parser().parse_args(spread(given))
     parsed.given = tuple(given)
@@ -108,7 +108,7 @@ def parse(given: Sequence[str]) -> Request:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Everything that can be asked."""
+    """Return the parser of all commands."""
     top = _Parser(
         prog="recrl-sweep",
         description=DESCRIPTION,
@@ -127,7 +127,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def spread(given: Sequence[str]) -> list[str]:
-    """The arguments, so that no list swallows the grid file or the sweep behind it.
+    """Return the arguments with lists split, so that no list includes the grid file or sweep after it.
 
     >>> spread(["--only", "method=none", "seed=0", "grid.yaml"])
     ['--only', 'method=none', '--only', 'seed=0', 'grid.yaml']

@@ -1,4 +1,4 @@
-"""``list``, ``options`` and ``schema``: what a grid file can name, and how it is written."""
+"""``list``, ``options`` and ``schema``: the names and options that a grid file may use."""
 
 from __future__ import annotations
 

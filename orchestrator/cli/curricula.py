@@ -1,4 +1,4 @@
-"""``bound`` and ``replay``: what relaxed training cost, and what other limits there would have been."""
+"""``bound`` and ``replay``: the cost of training against its bounds, and limits of other curricula."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from recrl.teachers.registry import teacher_config
 
 
 def run_bound(request: BoundRequest, console: Console) -> ExitCode:
-    """Say what training cost beside its bounds, and which d_t a budget would have allowed."""
+    """Compare the cost of training with its bounds; find the largest d_t within a budget."""
     from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415  (imports pandas and SciPy)
 
     sweep, _ = source(request)
@@ -35,7 +35,8 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
         raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
     show(cumulative_cost.bound_table(rows), console)
     say(
-        console, "Summed over policies, one expected episode each; means over runs; undiscounted but for one."
+        console,
+        "Summed over policies, one expected episode each; means over runs; undiscounted unless stated.",
     )
     if request.budget is not None:
         allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
@@ -45,7 +46,7 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
 
 
 def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
-    """Say what limits another teacher would have set on the recorded episodes."""
+    """Print the limits that another curriculum would have set on the recorded episodes."""
     import pandas as pd  # noqa: PLC0415  (commands that do not need it are quick to start)
 
     from recrl.analysis.figures import styles  # noqa: PLC0415
@@ -87,7 +88,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
 
 
 def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
-    """The teacher to ask: a method of the sweep by its label, or any teacher by its name."""
+    """Return the curriculum: a method of the sweep by its label, or any curriculum by its name."""
     known = {spec.method.label: spec.method for spec in store.specs()}
     method = known.get(request.teacher, Choice(request.teacher))
     options = dict(method.options)
@@ -111,7 +112,7 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
 
 
 def _parsed(text: str) -> Any:
-    """A JSON value, or the text itself."""
+    """Parse a JSON value; other text stays text."""
     try:
         return json.loads(text)
     except json.JSONDecodeError:

@@ -1,4 +1,4 @@
-"""How plans and progress look on a terminal; words and tables only, nothing is decided here."""
+"""Plans and progress as text and tables for a terminal."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _STYLES = {
 
 
 def plan_table(plan: Plan) -> Table:
-    """Every trial and what a launch would do with it."""
+    """Return a table of all trials and their planned actions."""
     table = _table("trial", "seed", "action", "done", "id")
     for trial in plan.trials:
         done = 0 if trial.action in (PlannedAction.REPAIR, PlannedAction.DAMAGED) else trial.record.env_steps
@@ -55,12 +55,12 @@ def plan_table(plan: Plan) -> Table:
 
 
 def plan_sentence(plan: Plan) -> str:
-    """``20 trials: 12 new, 3 to resume, 5 complete``."""
+    """Summarise a plan: ``20 trials: 12 new, 3 to resume, 5 complete``."""
     words = {
         PlannedAction.NEW: "new",
         PlannedAction.RESUME: "to resume",
         PlannedAction.RETRY: "to try again",
-        PlannedAction.REPAIR: "damaged, to go on from what is whole",
+        PlannedAction.REPAIR: "damaged, to continue from the intact files",
         PlannedAction.RERUN: "to run again on the present code",
         PlannedAction.COMPLETE: "complete",
         PlannedAction.FAILED: "failed",
@@ -71,7 +71,7 @@ def plan_sentence(plan: Plan) -> str:
 
 
 def estimate_sentence(estimate: Estimate, where: str) -> str:
-    """``about 4 min with 2 trials at once on this machine, about 1.9 GB of memory``."""
+    """Summarise an estimate: ``about 4 min with 2 trials at once on this machine, about 1.9 GB``."""
     if not estimate.concurrent:
         return "nothing to do"
     memory = f"about {estimate.gigabytes:.1f} GB of memory"
@@ -83,7 +83,7 @@ def estimate_sentence(estimate: Estimate, where: str) -> str:
 
 
 def status_table(progress: SweepProgress) -> Table:
-    """Every trial and where it stands."""
+    """Return a table of all trials and their status."""
     table = _table("trial", "seed", "status", "done", "steps/s", "CPU", "tries", "id")
     for trial in progress.trials:
         running = trial.status is DisplayStatus.RUNNING
@@ -101,7 +101,7 @@ def status_table(progress: SweepProgress) -> Table:
 
 
 def status_sentence(progress: SweepProgress) -> str:
-    """``12 of 20 complete, 2 running, 6 waiting, 0 failed; 61%; 22,400 steps/s; 1 min 43 s left``."""
+    """Summarise progress: ``12 of 20 complete, 2 running, 6 waiting, 0 failed; 61%; 22,400 steps/s; ...``."""
     counts = progress.counts
     parts = [
         f"{counts[DisplayStatus.COMPLETE]} of {len(progress.trials)} complete",
@@ -124,28 +124,28 @@ def status_sentence(progress: SweepProgress) -> str:
 
 
 def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress], str]) -> Iterator[str]:
-    """For every trial that broke off: which, why, and where its log and traceback are."""
+    """Describe every trial with an error: its name, the error, and the place of its log and traceback."""
     for trial in trials:
         broken = trial.status in (DisplayStatus.FAILED, DisplayStatus.DAMAGED)
         word = str(trial.status) if broken else "waiting"
-        yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was left'}"
+        yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was recorded'}"
         what = "its files" if trial.status is DisplayStatus.DAMAGED else "log and traceback"
         yield f"        {what}: {folder_of(trial)}"
 
 
 def damages_of_plan(plan: Plan) -> Iterator[str]:
-    """For every damaged trial: which, what is wrong, and what a launch does about it."""
+    """Describe every damaged trial, with the damage and the remedy."""
     for trial in plan.trials:
         if trial.record.status is TrialState.DAMAGED:
             yield f"damaged: {trial.spec.title}: {trial.record.error}"
 
 
 def lines_of(trial: TrialStore, *, follow: bool) -> Iterator[str]:
-    """The lines of a trial's log, without their ends.
+    """Yield the lines of a trial's log.
 
     Args:
         trial: on disk.
-        follow: whether to wait for more as long as the trial runs.
+        follow: whether to wait for new lines as long as the trial runs.
     """
     offset, rest = 0, ""
     while True:
@@ -163,7 +163,7 @@ def lines_of(trial: TrialStore, *, follow: bool) -> Iterator[str]:
 
 
 def duration(seconds: float) -> str:
-    """A time as people say it.
+    """Format a time in its two largest units.
 
     >>> duration(0.4), duration(103), duration(7260), duration(200_000)
     ('1 s', '1 min 43 s', '2 h 1 min', '2 d 7 h')
@@ -182,9 +182,10 @@ def duration(seconds: float) -> str:
 
 @contextmanager
 def live_progress(ask: Callable[[], SweepProgress], console: Console) -> Iterator[None]:
-    """Show the progress while the context lasts.
+    """Show the progress until the end of the ``with`` block.
 
-    On a terminal in place, once a second; elsewhere a line every ten seconds, if anything has changed.
+    On a terminal it updates in place every second. Otherwise it prints a line every ten seconds, if anything
+    has changed.
 
     Args:
         ask: reads the progress from the files.
@@ -200,7 +201,7 @@ def _show_in_place(ask: Callable[[], SweepProgress], console: Console, done: thr
         while True:
             began = time.monotonic()
             live.update(_picture(ask()), refresh=True)
-            # reading the files of a very large sweep must not become the main work
+            # reading the files of a very large sweep must not take much of the time
             if done.wait(max(TERMINAL_SECONDS, 20.0 * (time.monotonic() - began))):
                 return
 
@@ -238,7 +239,7 @@ def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 
 
 def folded_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, width: int) -> Table:
-    """A table of finished text whose cells are folded, so that it fits a width in characters."""
+    """A table of finished text with folded cells, so that it fits a width in characters."""
     table = Table(box=None, header_style="bold", pad_edge=False, width=width, padding=(0, 2, 0, 0))
     for index, column in enumerate(columns):
         table.add_column(column, overflow="fold", no_wrap=index == 0, ratio=None if index < 3 else 1)

@@ -1,4 +1,4 @@
-"""``evaluate``: the policies of trials, evaluated without learning, and filmed."""
+"""``evaluate``: evaluate and film the policies of trials without learning."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 
-DEFAULT_EPISODES = 100  # of an evaluation, for trials that make none themselves
+DEFAULT_EPISODES = 100  # episodes, for trials without an evaluation of their own
 
 
 def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
-    """Run the frozen policies of trials for whole episodes, and film them where that is asked for."""
+    """Evaluate the policies of trials for whole episodes, and film them on request."""
     import pandas as pd  # noqa: PLC0415
 
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415  (imports gymnasium)
@@ -55,7 +55,7 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     changed = [saved for saved in loaded if has_other_code(saved.store, saved.spec)]
     complete = sum(saved.store.record().status is TrialState.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
-        say(console, f"warning: {sentence}; here their policies met the present code")
+        say(console, f"warning: {sentence}; these evaluations use the installed code")
     if request.video:
         for saved in loaded:
             for policy in policies:
@@ -66,7 +66,7 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
 
 
 def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
-    """The trials on disk whose name begins so, and that ``--only`` leaves."""
+    """Return the trials on disk by the beginning of their names and by ``--only``."""
     text = " ".join(request.trial)
     found = store.find(text)
     only = wanted(request.only)
@@ -84,7 +84,7 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
 
 
 def _tell_mlflow(store: SweepStore, request: EvaluateRequest, console: Console) -> None:
-    """Bring MLflow up to the files, if it was ever told of the sweep."""
+    """Bring MLflow up to date, if it has the sweep."""
     uri = tracking_uri(store, request.tracking_uri)
     if last_report(store, uri) is None:
         return

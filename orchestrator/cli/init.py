@@ -1,4 +1,4 @@
-"""``init``: writes a grid file with comments to start from, and never overwrites one."""
+"""``init``: write a commented grid file; existing files are never overwritten."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODULE = "my_task.py"
 
 
 def run_init(request: InitRequest, console: Console) -> ExitCode:
-    """Write the template, and say what comes next."""
+    """Write the template, and print the next command."""
     grid = request.file or Path(f"{request.template}.yaml")
     if grid.suffix not in (".yaml", ".yml"):
         raise RecrlError(f"{grid}: the name of a grid file must end with .yaml")

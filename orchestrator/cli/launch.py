@@ -1,4 +1,4 @@
-"""``launch``: runs what is not complete, draws, films, and says what came of it."""
+"""``launch``: run incomplete trials, draw figures, film, and print the results."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ logger = logging.getLogger("recrl.sweep")
 
 
 def run_launch(request: LaunchRequest, console: Console) -> ExitCode:
-    """Work on everything in the grid that is not complete."""
+    """Run the incomplete trials of a grid file."""
     return launch_grid(read_grid(request.grid), request, console)
 
 
 def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> ExitCode:
-    """Work on everything in a checked grid that is not complete; ``request.grid`` is not read."""
+    """Run the incomplete trials of a checked grid; ``request.grid`` is not read."""
     from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
 
     store = SweepStore(request.root, grid.name)
@@ -61,7 +61,7 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
     at_once, where = room(grid, request)
     uri = tracking_uri(store, request.tracking_uri) if request.mlflow else None
     stop = threading.Event()
-    read: list[Sweep] = []  # at the end, if anything is complete
+    read: list[Sweep] = []  # at the end, if any trial is complete
 
     def watch(plan: Plan) -> None:
         say_plan(plan, grid, console, at_once=at_once, where=where)
@@ -83,7 +83,7 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
             _film(grid, after, store, stop, console)
 
     def say_stopping() -> None:
-        say(console, "Stopping: running trials save where they are. Once more to stop at once.")
+        say(console, "Stopping: running trials save their state. Press again to stop at once.")
 
     with contextlib.ExitStack() as shown, _listening(stop, say_stopping):
         settings = LaunchSettings(
@@ -112,7 +112,7 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
 
 
 def _listening(stop: threading.Event, say_stopping: Callable[[], None]) -> AbstractContextManager[None]:
-    """Stop on signals; only a process's main thread can."""
+    """Stop on signals; only the main thread of a process can."""
     is_main = threading.current_thread() is threading.main_thread()
     return stopping_on_signals(stop, say_stopping) if is_main else contextlib.nullcontext()
 
@@ -123,9 +123,7 @@ def _executor(grid: GridSpec, place: SweepPlace, request: LaunchRequest) -> Exec
     if request.executor == "inline":
         return InlineExecutor()
     if place.uri.startswith("memory://"):
-        raise RecrlError(
-            f"{place.uri}: is one process's memory, which others do not see; see --executor inline"
-        )
+        raise RecrlError(f"{place.uri}: is memory of a single process; use --executor inline")
     from recrl.orchestrator.ray.executor import RayExecutor  # noqa: PLC0415  (imports ray)
 
     return RayExecutor(
@@ -150,7 +148,7 @@ def _say_starting(request: LaunchRequest, console: Console) -> None:
 
 
 def _say_results(sweep: Sweep, console: Console) -> None:
-    """Print what the final policies earn and cost."""
+    """Print return and cost of the final policies."""
     from recrl.analysis.data.validity import curriculum_warnings  # noqa: PLC0415
     from recrl.orchestrator.cli.result_table import CAPTION, result_table  # noqa: PLC0415
 
@@ -165,21 +163,24 @@ def _say_results(sweep: Sweep, console: Console) -> None:
 
 
 def _draw_at_end(sweep: Sweep, store: SweepStore, console: Console) -> None:
-    """Draw a launch's figures; if that fails, say so and go on: the trials are done and MLflow waits."""
+    """Draw a launch's figures. If that fails, log the error and continue: MLflow must still be updated."""
     try:
         draw(sweep, store.figures_folder, console)
     except (RecrlError, OSError):
         raise
     except Exception as error:
         logger.debug("figures of %s", store.name, exc_info=True)
-        say(console, f"Figures    not all are drawn ({type(error).__name__}: {error}), by a mistake in recrl")
+        say(
+            console,
+            f"Figures    not all are drawn ({type(error).__name__}: {error}), because of a bug in recrl",
+        )
         say(console, f"           for its traceback: recrl-sweep figures {store.name}")
 
 
 def _film(
     grid: GridSpec, after: SweepProgress, store: SweepStore, stop: threading.Event, console: Console
 ) -> None:
-    """Film the complete trials that the grid wants filmed and that have no video yet."""
+    """Film complete trials without a video, if the grid requests it."""
     seeds = {"none": (), "first-seed": grid.seeds[:1], "all": grid.seeds}[grid.run.videos]
     complete = [trial.spec for trial in after.with_status(DisplayStatus.COMPLETE) if trial.spec.seed in seeds]
     unseen = [store.trial(spec) for spec in complete if not any(store.trial(spec).videos_folder.glob("*"))]
@@ -195,14 +196,14 @@ def _film(
             return
         try:
             SavedTrial.load(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
-        except RecrlError as error:  # a picture is no reason to call a finished sweep broken
+        except RecrlError as error:  # a failed video is no failure of the sweep
             say(console, f"           no video: {error}")
 
 
 def _say_synced(
     result: SweepResult, store: SweepStore, uri: str, request: LaunchRequest, console: Console
 ) -> None:
-    """Say where MLflow's view is and how to open it, and whether it is up to date."""
+    """Print the address of the sweep in MLflow, the command to open it, and whether it is up to date."""
     place = [store.name]
     if request.root != DEFAULT_ROOT:
         place += ["--root", str(request.root)]
@@ -211,7 +212,7 @@ def _say_synced(
     where = redacted(uri) if request.tracking_uri else short(store.mlflow_database)
     say(console, f"MLflow     {where}")
     say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
-    if not result.synced:  # a mirror that came to no end leaves the report of an earlier pass
+    if not result.synced:  # a sync that was killed leaves the report of an earlier pass
         report = last_report(store, uri)
         problem = f" ({report.problem})" if report and report.problem else ""
         again = shlex.join(["recrl-sweep", "sync", *place])
@@ -219,22 +220,22 @@ def _say_synced(
 
 
 def _say_result(result: SweepResult, store: SweepStore, request: LaunchRequest, console: Console) -> ExitCode:
-    """Say what came of a launch, and how to go on."""
+    """Print the result of a launch, and how to continue."""
     say(console, f"{store.name}: {display.status_sentence(result.progress)}")
     say_failures(result.progress, store, console)
     again = shlex.join(["recrl-sweep", *request.given])
     if result.progress.is_complete:
         return ExitCode.OK
     if result.stopped:
-        say(console, f"Stopped; nothing is lost. Go on with: {again}")
+        say(console, f"Stopped; nothing is lost. Continue with: {again}")
         return ExitCode.STOPPED
     if damaged := result.progress.with_status(DisplayStatus.DAMAGED):
         them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
         rerun = again if request.rerun_damaged else f"{again} --rerun-damaged"
-        say(console, f"{them} left alone; what is damaged is moved aside and run again with: {rerun}")
+        say(console, f"{them} left alone; to move the damaged files aside and run again: {rerun}")
     if result.failed:
         retry = again if request.retry_failed else f"{again} --retry-failed"
         say(console, f"Try what failed again with: {retry}")
     elif not damaged:
-        say(console, f"Not everything could be finished. Go on with: {again}")
+        say(console, f"Not everything could be finished. Continue with: {again}")
     return ExitCode.TRIALS_FAILED

@@ -1,6 +1,6 @@
-"""``recrl-sweep``: runs a command, and turns errors into sentences and exit codes.
+"""``recrl-sweep``: run a command, and turn errors into sentences and exit codes.
 
-Imports next to nothing until it knows what is asked, so that ``--help`` is quick.
+Imports almost nothing until the command is known, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 if TYPE_CHECKING:
     from rich.console import Console
 
-# Paths that cannot be: a file for a folder, a name that is too long, links in a circle.
+# Invalid paths: a file for a folder, a name that is too long, circular links.
 NO_PATH = (
     errno.ENOTDIR,
     errno.EISDIR,
@@ -41,10 +41,10 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 
 
 def main(given: Sequence[str] | None = None) -> int:
-    """Do what is asked.
+    """Run the command of the arguments.
 
     Args:
-        given: the arguments; those of the process by default.
+        given: the arguments; by default those of the process.
 
     Returns:
         An exit code.
@@ -65,19 +65,19 @@ def main(given: Sequence[str] | None = None) -> int:
         again = "; go on with the same command" if isinstance(request, LaunchRequest) else ""
         print(f"Stopped at once{again}.", file=sys.stderr)
         return ExitCode.STOPPED
-    except BrokenPipeError:  # the reader, for example ``head``, has seen enough
+    except BrokenPipeError:  # the reader, for example ``head``, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
     except OSError as error:
         if error.errno not in (*NO_ROOM, *NO_PATH):
             raise
         where = error.filename or getattr(request, "root", request.about)
-        _complain(f"recrl-sweep: {where}: {error.strerror}; what was saved stays")
+        _complain(f"recrl-sweep: {where}: {error.strerror}; saved results are kept")
         return ExitCode.CANNOT_RUN if error.errno in NO_ROOM else ExitCode.WRONG_INPUT
 
 
 def _run(request: Request) -> ExitCode:
-    """Do it, without code that a file names unless that is asked for."""
+    """Run the command; follow import paths in files only on request."""
     from recrl.environments.plugins import (  # noqa: PLC0415  (--help is to be quick)
         load_attribute,
         modules_in,
@@ -85,7 +85,7 @@ def _run(request: Request) -> ExitCode:
     )
     from recrl.orchestrator.cli.output import TextConsole, logging_to_stderr  # noqa: PLC0415
 
-    # a file or a pipe has no width that tables would have to fit in
+    # a file or a pipe has no width that tables must fit
     console = TextConsole() if sys.stdout.isatty() else TextConsole(width=160)
     followed = modules_in(Path.cwd()) if request.follows_import_paths else refuse_import_paths()
     try:
@@ -95,11 +95,11 @@ def _run(request: Request) -> ExitCode:
             )
             return run(request, console)
     except SystemExit as error:
-        raise RecrlError(f"something that the sweep names ended the process ({error.code})") from error
+        raise RecrlError(f"code that the sweep names ended the process ({error.code})") from error
 
 
 def _complain(sentence: str) -> None:
-    """Say on the standard error what is wrong; a sentence may quote a file that somebody else made."""
+    """Print an error to the standard error; a sentence may quote an untrusted file."""
     print(readable(sentence), file=sys.stderr)
 
 

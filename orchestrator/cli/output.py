@@ -1,4 +1,4 @@
-"""What a command writes to a terminal: nothing there is obeyed that came from a file."""
+"""Terminal output: control characters from files are escaped."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 
 class TextConsole(Console):
-    """A console on which labels, errors and logs are text, whatever control characters they hold."""
+    """A console that shows labels, errors and logs as text, with control characters escaped."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Render, with the control characters of texts escaped; colours are Rich's own."""
+        """Render with escaped control characters of texts; colours are Rich's own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=printable(segment.text))
 
 
 @contextmanager
 def logging_to_stderr() -> Iterator[None]:
-    """Write recrl's warnings to the standard error, as they may be shown, until the end of the block."""
+    """Write recrl's warnings to the standard error until the end of the block, without secrets."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setLevel(logging.WARNING)
     handler.setFormatter(_Sentence())
@@ -44,25 +44,25 @@ def logging_to_stderr() -> Iterator[None]:
 
 
 class _Sentence(logging.Formatter):
-    """Formats records without secrets and control characters; tracebacks are in the trials' own logs."""
+    """Formatter without secrets and control characters; tracebacks are in the trials' own logs."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's message."""
+        """Return the record's message."""
         return shown(record.getMessage())
 
 
 def short(path: Path) -> Path:
-    """The path as seen from here, where it is below."""
+    """Return the path relative to the working directory, if it is below."""
     with contextlib.suppress(ValueError):
         return path.relative_to(Path.cwd())
     return path
 
 
 def say(console: Console, sentence: str) -> None:
-    """One line as it is, but for secrets and control characters: no markup, no colours, no wrapping."""
+    """Print one line without secrets and control characters: no markup, no colours, no wrapping."""
     console.print(shown(sentence), markup=False, highlight=False, soft_wrap=True)
 
 
 def show(table: pd.DataFrame, console: Console) -> None:
-    """A table of finished text."""
+    """Print a table of finished text."""
     console.print(display.text_table(list(map(str, table)), table.to_numpy().tolist()))

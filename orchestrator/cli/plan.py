@@ -1,4 +1,4 @@
-"""``validate`` and ``plan``: what a grid is, and what a launch of it would do."""
+"""``validate`` and ``plan``: check a grid, and show what a launch would do."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
     try:
         grid = read_grid(request.grid, build=True)
     except UncalledError as error:
-        say(console, f"{error}; all else is right")
+        say(console, f"{error}; everything else is right")
         return ExitCode.OK
     sizes = (len(grid.tasks), len(grid.agents), len(grid.methods), len(grid.seeds))
     product = " x ".join(str(size) for size in sizes)
@@ -39,7 +39,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
 
 
 def run_plan(request: PlanRequest, console: Console) -> ExitCode:
-    """Say what a launch would do; nothing is started, and nothing written but the copy of an object store."""
+    """Print what a launch would do; nothing is started, and only the copy of an object store is written."""
     grid = read_grid(request.grid)
     store = SweepStore(request.root, grid.name)
     sweep_place(store, request.storage).refresh()
@@ -64,25 +64,25 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     for problem in store.damages():
         say(console, f"damaged: {problem}")
     for orphan in plan.orphans:
-        say(console, f"not in the grid any more, left alone: {short(orphan.folder)}")
+        say(console, f"no longer in the grid, not touched: {short(orphan.folder)}")
     return ExitCode.TRIALS_LEFT if request.check and plan.to_do else ExitCode.OK
 
 
 def room(grid: GridSpec, request: GridRequest) -> tuple[int, str]:
-    """How many trials run at once, and where that is so: on a cluster if there is an address, else here."""
+    """Return the number of parallel trials, and where: on a cluster if there is an address."""
     inline = isinstance(request, LaunchRequest) and request.executor == "inline"
     most = 1 if inline else request.max_concurrent or grid.resources.max_concurrent
     if request.address and not inline:
         from recrl.orchestrator.ray.executor import room_on_cluster  # noqa: PLC0415  (imports ray)
 
-        return most or max(1, room_on_cluster(request.address, grid.resources)), "on the cluster as it is now"
+        return most or max(1, room_on_cluster(request.address, grid.resources)), "on the cluster at present"
     cores = request.cores if isinstance(request, PlanRequest) else None
     fitting = trials_at_once(cpus_per_trial=grid.resources.cpus_per_trial, max_concurrent=most, cores=cores)
     return fitting, f"on {cores} cores" if cores else "on this machine"
 
 
 def _measured(plan: Plan, console: Console) -> dict[str, float]:
-    """Run about a second of each task and agent that has not run yet; their speeds, by kind."""
+    """Measure each task and agent without a known speed for about a second; return speeds by kind."""
     from recrl.orchestrator.trial.speed import measured_speed  # noqa: PLC0415  (imports torch)
 
     speeds = {}
@@ -102,13 +102,13 @@ def say_plan(
     where: str,
     speeds: Mapping[str, float] | None = None,
 ) -> None:
-    """Say what a launch would do, and about what it takes."""
+    """Print what a launch would do, and its estimated time and memory."""
     say(console, f"{grid.name}: {display.plan_sentence(plan)}")
     say(console, display.estimate_sentence(estimate(plan, concurrent=at_once, speeds=speeds), where))
 
 
 def say_other_code(plan: Plan, console: Console) -> None:
-    """Say how many trials ran other code than is installed now."""
+    """Print the number of trials that ran other code than is installed now."""
     changed = plan.other_code
     complete = sum(trial.record.status is TrialState.COMPLETE for trial in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):

@@ -1,8 +1,8 @@
-"""What each command of ``recrl-sweep`` is asked for: one frozen, typed value a command, with its arguments.
+"""Requests of ``recrl-sweep``: one frozen, typed value per command, with its arguments.
 
-A class is a command: its name is the command's, its docstring the summary, and each field an argument, with
-what ``argparse`` has to know of it. ``arguments`` makes the parser. Imports next to nothing, so that
-``--help`` is quick.
+A class is a command: its name is the command's, its docstring the summary, and each field an argument with
+its settings for ``argparse``. ``arguments`` makes the parser. Imports only the standard library, so that
+``--help`` is fast.
 """
 
 # ruff: noqa: RUF009  (what looks like a default is a dataclass field)
@@ -66,18 +66,18 @@ def by_flag(flag: str = "", *, group: str = "", **settings: Any) -> Any:
 
 @dataclass(frozen=True)
 class Request:
-    """What every command has.
+    """Common part of all requests.
 
     Attributes:
         given: the arguments as they were typed.
     """
 
-    trusted: ClassVar[bool] = False  # whether the command itself is the order to run what a file names
+    trusted: ClassVar[bool] = False  # whether the command itself is the permission to follow import paths
     given: tuple[str, ...]
 
     @classmethod
     def of(cls, parsed: argparse.Namespace) -> Self:
-        """The request that parsed arguments make; lists become tuples."""
+        """Make a request of parsed arguments; lists become tuples."""
         values = {field.name: getattr(parsed, field.name) for field in fields(cls)}
         return cls(**{key: tuple(it) if isinstance(it, list) else it for key, it in values.items()})
 
@@ -106,13 +106,13 @@ class Request:
 
     @property
     def follows_import_paths(self) -> bool:
-        """Whether code that a file names by an import path may run."""
+        """Whether import paths in files are followed."""
         return self.trusted or bool(getattr(self, "trust", False))
 
 
 @dataclass(frozen=True)
 class PlaceRequest(Request):
-    """Where sweeps are."""
+    """Location of sweeps."""
 
     root: Path = by_flag(
         type=types.folder, default=DEFAULT_ROOT, help="the folder of all sweeps (default: runs)"
@@ -126,7 +126,7 @@ class PlaceRequest(Request):
 
 @dataclass(frozen=True)
 class GridRequest(PlaceRequest):
-    """A grid, and which of its trials."""
+    """A grid, and a selection of its trials."""
 
     grid: Path = by_place(**_GRID)
     only: tuple[str, ...] = by_flag(**_ONLY)

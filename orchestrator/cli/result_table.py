@@ -1,4 +1,4 @@
-"""The table that a launch ends with: what the final policies earn and cost, by task, agent and method."""
+"""The result table of a launch: return and cost of the final policies, by task, agent and method."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ CAPTION = (
 
 
 def result_table(sweep: Sweep) -> pd.DataFrame:
-    """The results as text, a row a task, agent and method; empty where no complete trial was evaluated.
+    """Return the results as text, one row per task, agent and method; empty without evaluations.
 
     Args:
-        sweep: its complete trials count.
+        sweep: its complete trials are used.
     """
     if sweep.evaluations.empty:
         return pd.DataFrame()

@@ -1,4 +1,4 @@
-"""``figures``, ``export`` and ``merge``: what is made of a sweep's results."""
+"""``figures``, ``export`` and ``merge``: outputs made from a sweep's results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def run_figures(request: FiguresRequest, console: Console) -> ExitCode:
-    """Draw the figures and tables of what is on disk, in a compact file or in MLflow."""
+    """Draw the figures and tables of a sweep in its folder, an export or MLflow."""
     sweep, folder = source(request)
     say_warnings(sweep, console)
     folder = request.to or folder
@@ -65,7 +65,7 @@ def run_merge(request: MergeRequest, console: Console) -> ExitCode:
 
 
 def say_warnings(sweep: Sweep, console: Console) -> None:
-    """Say which trials nothing was made of, and what else speaks against the numbers."""
+    """Print the trials that are left out, and other remarks on validity."""
     from recrl.analysis.data.validity import damages, doubts  # noqa: PLC0415  (imports pandas)
 
     for sentence in damages(sweep):
@@ -81,7 +81,7 @@ def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
 
 
 def source(request: SourceRequest) -> tuple[Sweep, Path]:
-    """The sweep that is meant, from its files, a compact file or MLflow; and a place for figures."""
+    """Yield the sweep, from its files, an export or MLflow, and a folder for figures."""
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415  (imports pandas and SciPy)
 
     given: str | None = request.sweep
@@ -96,7 +96,7 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
 
 
 def draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True) -> None:
-    """Draw a sweep's figures, tables and report, and say where they are."""
+    """Draw a sweep's figures, tables and report, and print their place."""
     from recrl.analysis.report import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
 
     (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])

@@ -1,4 +1,4 @@
-"""``status``, ``check``, ``stop`` and ``logs``: how far a sweep is, and what its trials say."""
+"""``status``, ``check``, ``stop`` and ``logs``: progress of a sweep, and logs of its trials."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from recrl.orchestrator.sweep_progress import (
 
 
 def run_status(request: StatusRequest, console: Console) -> ExitCode:
-    """Say how far a sweep is, from its files alone."""
+    """Print the progress of a sweep, from its files."""
     store = open_store(request)
     specs = store.specs()
     now = progress(specs, store)
@@ -71,7 +71,7 @@ def _events(trial: TrialProgress, store: SweepStore) -> list[str]:
 
 
 def run_check(request: CheckRequest, console: Console) -> ExitCode:
-    """Check every file of a sweep against what was committed; print a line for each that is wrong."""
+    """Check every file of a sweep against its committed digest; print a line for each damaged one."""
     store = open_store(request)
     problems = [f"{store.name}: {problem}" for problem in store.damages()]
     specs = _listed(store)
@@ -88,12 +88,14 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
         f"file{'' if len(problems) == 1 else 's'}",
     )
     if problems:
-        say(console, "launch goes on with damaged trials from what is whole; complete ones: --rerun-damaged")
+        say(
+            console, "launch continues damaged trials from their intact files; complete ones: --rerun-damaged"
+        )
     return ExitCode.TRIALS_FAILED if problems else ExitCode.OK
 
 
 def _listed(store: SweepStore) -> list[TrialSpec]:
-    """The trials of the last launch, none where the file that lists them is damaged: that is said already."""
+    """Return the trials of the last launch; empty if the file that lists them is damaged."""
     try:
         return store.specs()
     except StorageError:
@@ -108,7 +110,7 @@ def run_stop(request: StopRequest, console: Console) -> ExitCode:
     if not still_runs():
         say(console, f"{store.name}: no launch runs this sweep")
         return ExitCode.OK
-    say(console, f"{store.name}: its trials save where they are")
+    say(console, f"{store.name}: its trials save their state")
     while still_runs():
         time.sleep(REQUEST_SECONDS)
     place.refresh()
@@ -117,7 +119,7 @@ def run_stop(request: StopRequest, console: Console) -> ExitCode:
 
 
 def run_logs(request: LogsRequest, console: Console) -> ExitCode:
-    """Print a trial's log, or say where its folder is."""
+    """Print a trial's log, or the path of its folder."""
     store = open_store(request)
     text = " ".join(request.trial)
     if request.folder:
@@ -135,7 +137,7 @@ def run_logs(request: LogsRequest, console: Console) -> ExitCode:
 
 
 def _wait_for_start(store: SweepStore, text: str, console: Console) -> None:
-    """Wait until a trial that is meant has begun, as long as a launch runs that may begin it."""
+    """Wait until a matching trial has begun, as long as a launch runs that may begin it."""
     told = False
     while not _meant(store, text) and store.is_locked():
         if not told:
@@ -145,7 +147,7 @@ def _wait_for_start(store: SweepStore, text: str, console: Console) -> None:
 
 
 def _meant(store: SweepStore, text: str) -> list[TrialStore]:
-    """The trials on disk that a person may mean; those that run if they do not say."""
+    """Return the trials on disk that match a text; the running ones if there is none."""
     found = store.find(text)
     if text:
         return found
@@ -154,19 +156,19 @@ def _meant(store: SweepStore, text: str) -> list[TrialStore]:
 
 
 def _trial(store: SweepStore, text: str) -> TrialStore:
-    """The one trial that a person means."""
+    """Return the one trial on disk that matches a text."""
     found = _meant(store, text)
     if len(found) == 1:
         return found[0]
     titles = [f"{trial.trial_id} {trial.title}" for trial in found[:10]]
     more = f" and {len(found) - 10} more" if len(found) > 10 else ""
-    which = f"say which one, by its id or title: {', '.join(titles)}{more}" if found else "status names them"
+    which = f"give one, by its id or title: {', '.join(titles)}{more}" if found else "status names them"
     what = f"trials on disk begin with {text!r}" if text else "trials are running"
     raise RecrlError(f"{store.name}: {len(found) or 'no'} {what}; {which}")
 
 
 def say_failures(now: SweepProgress, store: SweepStore, console: Console) -> None:
-    """Say which trials broke off, why, and where their logs are."""
+    """Print the trials with errors, the errors, and the places of their logs."""
 
     def folder_of(trial: TrialProgress) -> str:
         return str(short(store.trial(trial.spec).folder))

@@ -1,4 +1,4 @@
-"""Which sweep a command is about: by its name, folder or grid file, here or in an object store."""
+"""Find a command's sweep: by its name, folder or grid file, here or in an object store."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from recrl.orchestrator.validation import nearest
 
 
 def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
-    """The sweep that a person means.
+    """Find the sweep of a command.
 
     Args:
         root: the folder of all sweeps.
-        sweep: its name, its folder or its grid file; None for the only one there.
-        storage: the address of an object store to look at; None to look at ``root``.
+        sweep: its name, its folder or its grid file; None for the only sweep there.
+        storage: the address of an object store to search; None to search ``root``.
 
     Raises:
-        RecrlError: there is no such sweep, or more than one that could be meant.
+        RecrlError: there is no such sweep, or more than one.
     """
     place: str | Path = storage or root
     if storage:
@@ -34,7 +34,7 @@ def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> Sw
     if sweep is None:
         if len(names) == 1:
             return SweepStore(root, names[0])
-        listed = f"say which one: {', '.join(names)}" if names else "launch one first"
+        listed = f"give one: {', '.join(names)}" if names else "launch one first"
         raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
     if sweep.endswith((".yaml", ".yml")):
         sweep = read_name(Path(sweep))
@@ -53,14 +53,14 @@ def is_sweep(folder: Path) -> bool:
 
 
 def open_store(request: SweepRequest, *, checkpoints: bool = False) -> SweepStore:
-    """The folder of the sweep that is meant, up to date also where it is a mirror."""
+    """Return the folder of the sweep, brought up to date if it is a local copy."""
     store = sweep_store(request.root, request.sweep, request.storage)
     sweep_place(store, request.storage).refresh(checkpoints=checkpoints)
     return store
 
 
 def wanted(pairs: Sequence[str]) -> dict[str, list[str]]:
-    """``["method=none,linear", "seed=0"]`` as what ``plan.select`` reads."""
+    """Parse ``["method=none,linear", "seed=0"]`` for ``plan.select``."""
     wanted: dict[str, list[str]] = {}
     for pair in pairs:
         key, equals, values = pair.partition("=")

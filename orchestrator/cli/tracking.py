@@ -1,4 +1,4 @@
-"""``ui`` and ``sync``: MLflow's view of a sweep."""
+"""``ui`` and ``sync``: the sweep in MLflow."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run_ui(request: UIRequest, console: Console) -> ExitCode:
 
 
 def run_sync(request: SyncRequest, console: Console) -> ExitCode:
-    """Bring MLflow up to the files."""
+    """Bring MLflow up to date with the files."""
     store = open_store(request)
     uri = tracking_uri(store, request.tracking_uri)
     report = sync(store, uri, rebuild=request.rebuild, write_export=write_in_own_process)
@@ -44,5 +44,5 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
         )
     say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:
-        say(console, f"without the export file ({report.remark}): readers of MLflow get the last one")
+        say(console, f"without the export file ({report.remark}): MLflow still has the previous one")
     return ExitCode.OK

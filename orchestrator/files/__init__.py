@@ -1,1 +1,1 @@
-"""The files of a sweep: writing, reading, checking, and where their contents come from."""
+"""Files of a sweep: writing, reading, checking, and provenance."""

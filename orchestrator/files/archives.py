@@ -1,4 +1,4 @@
-"""Zip archives that somebody else may have made: unpacked only as far as there is room for them."""
+"""Reading of untrusted zip archives, with a bound on the unpacked size."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import zlib
 from collections.abc import Sequence
 from functools import partial
 
-PIECE_BYTES = 4096  # asked for at once
+PIECE_BYTES = 4096  # bytes per read
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
 
-# What reading a damaged or hostile archive raises; RuntimeError stands for encryption, methods that Python
-# does not know, and deep nesting of what is in it.
+# Exceptions of reading a damaged or hostile archive. RuntimeError is raised for encryption, methods that
+# Python does not know, and deep nesting of the content.
 UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -27,21 +27,20 @@ UNREADABLE = (
 
 
 def unpacked(archive: zipfile.ZipFile, names: Sequence[str], *, max_bytes: int) -> list[bytes]:
-    """The members of these names, if they are small enough all together.
+    """Read the members of these names, if their total size is within a bound.
 
-    An archive says how large its members are before anything is unpacked. It may lie: so they are asked for
-    in small pieces, of which zipfile keeps no more than was said. What a piece unpacks to meanwhile is a
-    thousandfold of its packed length for deflate, some thousandfold for LZMA; bzip2, for which it may be
-    tens of thousands, is refused.
+    An archive declares the sizes of its members, possibly wrongly. So they are read in small pieces, of which
+    zipfile keeps no more than was declared. A piece may unpack to a thousand times its packed length for
+    deflate, and several thousand for LZMA. With bzip2 it may be tens of thousands, so bzip2 is refused.
 
     Args:
         archive: open for reading.
-        names: of the members, each of which must be there.
-        max_bytes: that they may unpack to, at least 0.
+        names: of the members; each must exist.
+        max_bytes: bound on their unpacked size, at least 0.
 
     Raises:
-        ValueError: they are larger, or packed by another method than METHODS. What else is wrong with them
-            raises one of UNREADABLE.
+        ValueError: they are larger, or packed by another method than METHODS. Other damage raises one of
+            UNREADABLE.
     """
     members = [archive.getinfo(name) for name in names]
     if any(member.compress_type not in METHODS for member in members):

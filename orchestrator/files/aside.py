@@ -1,4 +1,4 @@
-"""Keep what is damaged or replaced, instead of deleting it."""
+"""Keep damaged or replaced files instead of deleting them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def move_aside(path: Path, folder: Path, *, copy: bool = False) -> None:
-    """Keep what is at a path in a folder, under a name that is free there; nothing if there is nothing."""
+    """Move a file or folder to another folder, under a free name; do nothing if it does not exist."""
     if not os.path.lexists(path):
         return
     folder.mkdir(parents=True, exist_ok=True)

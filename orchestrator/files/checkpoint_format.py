@@ -1,7 +1,7 @@
-"""Checkpoints: a tree of plain values and arrays in one file that runs no code when it is read.
+"""Checkpoint format: a tree of plain values and arrays in one file; reading it runs no code.
 
 A tree is made of dicts with string keys, lists, strings, numbers, booleans, None and NumPy arrays. The file
-is a magic line, the SHA-256 of the rest, and a safetensors payload whose metadata holds the tree as JSON with
+is a magic line, the SHA-256 of the rest, and a safetensors payload. Its metadata has the tree as JSON, with
 each array replaced by its key. A file cut short or changed in a single bit is refused.
 """
 
@@ -24,7 +24,7 @@ _ARRAY = "__array__"
 
 
 def encode(tree: dict[str, Any]) -> bytes:
-    """The bytes of a checkpoint holding ``tree``.
+    """Encode a tree as the bytes of a checkpoint.
 
     Raises:
         TypeError: a leaf is neither a JSON value nor an array.
@@ -36,11 +36,11 @@ def encode(tree: dict[str, Any]) -> bytes:
 
 
 def decode(data: bytes, *, source: str) -> dict[str, Any]:
-    """The tree that ``encode`` wrote.
+    """Decode the tree of ``encode``.
 
     Args:
         data: a whole checkpoint.
-        source: where it came from, for the error.
+        source: its name for errors.
 
     Raises:
         CheckpointError: the bytes are not an intact checkpoint of this version.
@@ -69,7 +69,7 @@ def decode(data: bytes, *, source: str) -> dict[str, Any]:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """The tree in a checkpoint file.
+    """Read the tree in a checkpoint file.
 
     Raises:
         CheckpointError: the file is missing, truncated, damaged or of another version.
@@ -82,7 +82,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def _without_arrays(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: str) -> Any:
-    """The tree with each array moved to ``arrays`` and replaced by its path."""
+    """Return the tree with each array moved to ``arrays`` and replaced by its path."""
     if isinstance(value, np.ndarray):
         arrays[path] = np.array(value, order="C")
         return {_ARRAY: path}
@@ -101,7 +101,7 @@ def _without_arrays(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: s
 
 
 def _with_arrays(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
-    """The inverse of ``_without_arrays``."""
+    """Inverse of ``_without_arrays``."""
     if isinstance(value, dict):
         if _ARRAY in value:
             return arrays[value[_ARRAY]]

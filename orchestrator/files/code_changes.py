@@ -1,8 +1,8 @@
-"""What code a trial ran, and whether that is the code that is installed now.
+"""Detect whether a trial ran other code than is installed now.
 
-A trial's results depend on recrl's tasks, agents and curricula and on how a trial is run, not on figures or
-commands: only the former are in the digest. Of a task, agent or curriculum that is the user's own, all Python
-files of its top-level package are in it, or its one module. Nothing is imported to find them.
+A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
+only the former are in the digest. For a user's task, agent or curriculum it includes all Python files of the
+top-level package, or the single module. Nothing is imported to find them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from recrl.teachers.registry import TEACHERS
 OURS = "recrl"
 FOLDERS = ("agents", "environments", "teachers")
 MODULES = ("trial/trial.py", "trial/runner.py", "spec.py")  # of the orchestrator
-SUFFIXES = (".py", ".xml", ".txt")  # of what results depend on
+SUFFIXES = (".py", ".xml", ".txt")  # top-level parts that affect results
 KINDS = (
     ("task", "recrl.tasks", TASKS),
     ("agent", "recrl.agents", AGENTS),
@@ -35,7 +35,7 @@ KINDS = (
 
 
 def code_of(spec: TrialSpec) -> dict[str, str]:
-    """Digests of the code that a trial runs: recrl's, and one for each top-level package of the user's own.
+    """Return digests of a trial's code: recrl's, and one for each top-level package of the user.
 
     A package that is not installed here is left out.
     """
@@ -44,7 +44,7 @@ def code_of(spec: TrialSpec) -> dict[str, str]:
         choice = getattr(spec, kind)
         names = [] if choice.name in ours else [_module_of(choice.name, group)]
         if isinstance(identity := choice.options.get("id"), str) and ":" in identity:
-            names.append(identity)  # of Gymnasium: ``module:name``
+            names.append(identity)  # an id of Gymnasium: ``module:name``
         if isinstance(network := choice.options.get("network"), str):
             names.append(network)
         for name in filter(None, names):
@@ -55,7 +55,7 @@ def code_of(spec: TrialSpec) -> dict[str, str]:
 
 
 def other_code(attempts: Iterable[Mapping[str, Any]], spec: TrialSpec) -> bool:
-    """Whether one of a trial's attempts ran other code than is installed now, as far as both are known.
+    """Whether an attempt of a trial ran other code than is installed now; False if unknown.
 
     Args:
         attempts: of ``TrialStore.provenance``.
@@ -70,7 +70,7 @@ def other_code(attempts: Iterable[Mapping[str, Any]], spec: TrialSpec) -> bool:
 
 
 def has_other_code(trial: TrialStore, spec: TrialSpec) -> bool:
-    """``other_code`` for the trial's files; False where these do not say."""
+    """Apply ``other_code`` to the trial's files; False if these are damaged."""
     try:
         return other_code(trial.provenance(), spec)
     except StorageError:
@@ -78,11 +78,11 @@ def has_other_code(trial: TrialStore, spec: TrialSpec) -> bool:
 
 
 def other_code_sentence(complete: int, begun: int) -> str:
-    """What is said of trials that ran other code; empty for none.
+    """Describe trials that ran other code; empty for none.
 
     Args:
         complete: complete ones.
-        begun: those that are not.
+        begun: incomplete ones.
     """
     parts = []
     if complete:
@@ -101,7 +101,7 @@ def other_code_sentence(complete: int, begun: int) -> str:
 
 
 def _module_of(name: str, group: str) -> str:
-    """``module:attribute`` of a name that is not ours: itself, or what its entry point leads to."""
+    """Return the import path of a name that is not recrl's: itself, or that of its entry point."""
     if ":" in name:
         return name
     return next((point.value for point in entry_points(group=group) if point.name == name), "")
@@ -109,7 +109,7 @@ def _module_of(name: str, group: str) -> str:
 
 @functools.cache
 def _own_digest() -> str:
-    """That of what results depend on in recrl."""
+    """Return the digest of the parts of recrl that affect results."""
     files = {
         f"{name}/{path.relative_to(folder_of(name))}": path
         for name in FOLDERS
@@ -118,12 +118,12 @@ def _own_digest() -> str:
     }
     trial = {f"orchestrator/{module}": folder_of("orchestrator") / module for module in MODULES}
     if missing := [str(path) for path in trial.values() if not path.is_file()]:
-        raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is not there")
+        raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is missing")
     return digest_of_files({**files, **trial})[:16]
 
 
 def _package_digest(package: str) -> str:
-    """That of a top-level package or module; empty where it is not found."""
+    """Return the digest of a top-level package or module; empty if it is not found."""
     try:
         spec = importlib.util.find_spec(package)
     except (ImportError, ValueError):

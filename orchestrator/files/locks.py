@@ -1,7 +1,7 @@
-"""Lock files that are opened without being led elsewhere.
+"""Lock files, opened without following symbolic links.
 
-Folders of results are shared and copied: where the lock's name is a symbolic link, whoever truncates the lock
-would empty the file that it points to.
+Folders of results are shared and copied. If the lock were a symbolic link, truncating the lock would empty
+the file that it points to.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ FLAGS = os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
 
 
 def open_lock(path: Path) -> IO[str]:
-    """Open a lock for reading and writing, at its end; make it if it is not there.
+    """Open a lock for reading and writing, at its end; create it if it is missing.
 
     Raises:
-        StorageError: it is a link, a folder or no file at all.
+        StorageError: it is a link, a folder or another non-file.
     """
     return os.fdopen(_opened(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "a+")
 
@@ -45,8 +45,8 @@ def look_at_lock(path: Path) -> IO[str]:
     """Open a lock for reading.
 
     Raises:
-        FileNotFoundError: there is none.
-        StorageError: it is a link, a folder or no file at all.
+        FileNotFoundError: it is missing.
+        StorageError: it is a link, a folder or another non-file.
     """
     return os.fdopen(_opened(path, os.O_RDONLY), "r")
 

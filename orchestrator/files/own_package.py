@@ -1,4 +1,4 @@
-"""recrl's own files as this process imports them: their digest, and a copy to send elsewhere."""
+"""recrl's own files as this process imports them: their digest, and a copy for other machines."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ METADATA = ("METADATA", "PKG-INFO", "entry_points.txt")  # an editable install h
 
 
 def source_digest() -> str:
-    """Ten hex digits that differ whenever a Python file of recrl does: a version alone does not say it."""
+    """Return ten hex digits that change with any Python file of recrl; the version alone is not enough."""
     files = {path.name: path for path in _own_files()}
-    for name in FOLDERS:  # links in a source checkout: a walk from the parent would not enter them
+    for name in FOLDERS:  # links in a source checkout: walking the parent would not follow them
         folder = folder_of(name)
         files |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in folder.rglob("*.py")}
     return digest_of_files(files)[:10]
@@ -40,8 +40,8 @@ def copy_package(parent: Path) -> list[Path]:
         parent: an empty folder that exists.
 
     Returns:
-        The folders to put on a path, each inside a parent of its own: the package's, and its metadata's, by
-        which entry points and the version are found.
+        The folders to put on a path, each in a separate parent: the package, and its metadata with entry
+            points and version.
     """
     package = parent / "package" / DISTRIBUTION
     package.mkdir(parents=True)
@@ -60,7 +60,7 @@ def copy_package(parent: Path) -> list[Path]:
 
 
 def _own_files() -> list[Path]:
-    """Files of the package itself, beside the five folders."""
+    """Return the files of the package itself, outside the five folders."""
     spec = importlib.util.find_spec(DISTRIBUTION)
     assert spec is not None and spec.submodule_search_locations
     return sorted(
@@ -69,7 +69,7 @@ def _own_files() -> list[Path]:
 
 
 def folder_of(name: str) -> Path:
-    """Where one of recrl's packages is."""
+    """Return the folder of one of recrl's packages."""
     spec = importlib.util.find_spec(f"{DISTRIBUTION}.{name}")
     assert spec is not None and spec.submodule_search_locations
     return Path(next(iter(spec.submodule_search_locations)))

@@ -1,7 +1,7 @@
-"""Where a result comes from: commits, versions and the machine, without secrets.
+"""Provenance of a result: commits, versions and the machine, without secrets.
 
-Nothing of the environment's variables, the user's name or the file system is recorded: folders of results
-are made to be shared. The resolved settings are in the trial's ``spec.json``, beside it.
+Environment variables, the user's name and paths are not recorded, because folders of results are shared. The
+resolved settings are in the trial's ``spec.json``.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _GIT_SECONDS = 10.0
 
 
 def recrl_version() -> str:
-    """The installed version of recrl."""
+    """Return the installed version of recrl."""
     return version(DISTRIBUTION)
 
 
 def collect(folder: Path | None = None) -> dict[str, Any]:
-    """What a reader needs to reproduce a result, as JSON values.
+    """Return the data for reproducing a result, as JSON values.
 
     Args:
         folder: the user's project, whose commit is recorded; the working directory by default.
@@ -51,15 +51,15 @@ def collect(folder: Path | None = None) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=16)
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """The commit that is checked out in ``folder`` and whether tracked files differ from it.
+    """Return the commit of ``folder``, and whether tracked files differ from it.
 
-    Asked once per process, so that every trial of a worker says the same.
+    Cached per process, so that it is the same for all trials of a worker.
 
     Returns:
         ``{"commit": 40 hex digits, "dirty": bool}``, or None if there is no repository with a commit, or
         no git.
     """
-    if "site-packages" in folder.parts:  # an installed copy inside somebody's repository is not of it
+    if "site-packages" in folder.parts:  # an installed copy inside another repository is not part of it
         return None
     commit = _git(folder, "rev-parse", "--verify", "HEAD")
     if commit is None:
@@ -69,7 +69,7 @@ def git_state(folder: Path) -> dict[str, Any] | None:
 
 
 def package_versions(names: Iterable[str]) -> dict[str, str]:
-    """The installed version of each distribution; those that are not installed are left out."""
+    """Return the installed version of each distribution; missing ones are left out."""
     versions = {}
     for name in names:
         try:
@@ -80,13 +80,13 @@ def package_versions(names: Iterable[str]) -> dict[str, str]:
 
 
 def _dependencies() -> list[str]:
-    """The requirements of recrl itself, without extras."""
+    """Return the requirements of recrl itself, without extras."""
     needed = [line for line in requires(DISTRIBUTION) or [] if "extra ==" not in line]
     return sorted(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in needed)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """What git prints, or None if it refuses, is missing or hangs."""
+    """Return git's output, or None if it fails, is missing or hangs."""
     try:
         done = subprocess.run(
             ["git", "--no-optional-locks", "-C", str(folder), *arguments],
@@ -101,7 +101,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def _cpu_model() -> str:
-    """The processor's name as the system gives it, or empty."""
+    """Return the processor's name from the system, or empty."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             key, _, value = line.partition(":")

@@ -1,8 +1,7 @@
-"""Files that only grow, a row at a time: what is committed of them, its digest, and the next commit's rows.
+"""Append-only files of rows: committed length and digest, and the rows of the next commit.
 
-The digest of all committed bytes is extended by each commit from the new bytes alone, so that it costs a
-long trial no more than a short one. A writer that takes a file up reads it once and holds it against the
-digest that it was given.
+Each commit extends the digest by its new bytes only, so that its time does not grow with the file. A writer
+that resumes a file reads it once and checks its digest.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ EMPTY_DIGEST = hashlib.sha256().hexdigest()
 
 @dataclass(frozen=True)
 class Extent:
-    """How much of a file is committed.
+    """Committed part of a file.
 
     Attributes:
         length: bytes.
-        sha256: of them, in hex.
+        sha256: of these bytes, in hex.
     """
 
     length: int = 0
@@ -35,13 +34,13 @@ class Extent:
 
     @classmethod
     def of(cls, data: bytes) -> Extent:
-        """That of a whole small file."""
+        """Return the extent of a whole small file."""
         return cls(len(data), hashlib.sha256(data).hexdigest())
 
 
 @dataclass
 class RowFile:
-    """One such file, as its one writer knows it.
+    """Writer of one append-only file.
 
     Attributes:
         path: of the file.
@@ -57,7 +56,7 @@ class RowFile:
 
     @property
     def extent(self) -> Extent:
-        """What is committed."""
+        """Return the committed extent."""
         return Extent(self.length, self._hash.hexdigest())
 
     @property
@@ -66,13 +65,13 @@ class RowFile:
         return bool(self.columns)
 
     def take_up(self, extent: Extent) -> bool:
-        """Go on behind the first bytes of the file, if they are those.
+        """Resume the file after its first bytes, if their digest is right.
 
         Args:
-            extent: what is to be kept; the caller cuts the rest off.
+            extent: the part to keep; the caller truncates the rest.
 
         Returns:
-            Whether the file begins with these bytes; where not, nothing is changed.
+            Whether the file begins with these bytes; if not, nothing is changed.
         """
         found = digest_of(self.path, extent.length)
         if found is None or found.hexdigest() != extent.sha256:
@@ -87,14 +86,14 @@ class RowFile:
         self._rows.append(text)
 
     def add_row(self, row: Mapping[str, Any], *, of: str) -> None:
-        """Add a row to the next commit; the first one fixes the columns, the others are written by name.
+        """Add a row to the next commit; the first row fixes the columns, later rows are matched by name.
 
         Args:
             row: a value for each column, in any order.
-            of: who gives the rows, for the error.
+            of: source of the rows, for errors.
 
         Raises:
-            RowError: the row lacks a column, has one more, or a value that is no cell.
+            RowError: the row has a missing or additional column, or an invalid value.
         """
         if not self.columns:
             self.columns = tuple(row)
@@ -107,7 +106,7 @@ class RowFile:
         self._rows.append(csv_line([row[name] for name in self.columns]))
 
     def write(self) -> tuple[int, Any]:
-        """Write the rows of the next commit behind the committed bytes, and sync; ``settle`` commits them.
+        """Write the rows of the next commit after the committed bytes, and sync; ``settle`` commits them.
 
         Raises:
             DamagedError: the file has fewer bytes than are committed.
@@ -130,7 +129,7 @@ class RowFile:
         return self.length + len(data), extended
 
     def settle(self, written: tuple[int, Any]) -> None:
-        """Take what ``write`` returned for committed."""
+        """Mark the result of ``write`` as committed."""
         self.length, self._hash = written
         self._rows.clear()
 
@@ -154,7 +153,7 @@ def digest_of(path: Path, length: int) -> Any | None:
 
 
 def shortage(found: int, committed: int) -> str:
-    """What is said of a file that is too short."""
+    """Describe a file that is too short."""
     return f"has {found:,} of its {committed:,} committed bytes"
 
 
@@ -173,7 +172,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def csv_line(values: Iterable[Any]) -> str:
-    """A CSV line of numbers and plain words; floats as the shortest text that reads back equal.
+    """Format a CSV line of numbers and plain words; floats as the shortest exact text.
 
     Raises:
         RowError: a value's text has a comma, a quotation mark or a line break in it.
@@ -187,7 +186,7 @@ def csv_line(values: Iterable[Any]) -> str:
 
 
 def _difference(found: Collection[str], expected: Collection[str]) -> str:
-    """``kl is missing; entropy is new``."""
+    """Describe a difference of columns: ``kl is missing; entropy is new``."""
     missing = [name for name in expected if name not in found]
     new = [name for name in found if name not in expected]
     said = [f"{', '.join(missing)} missing" if missing else "", f"{', '.join(new)} new" if new else ""]
@@ -195,7 +194,7 @@ def _difference(found: Collection[str], expected: Collection[str]) -> str:
 
 
 def _first_line(path: Path, length: int) -> tuple[str, ...]:
-    """The names in a CSV file's first line; none if nothing is committed."""
+    """Return the names in a CSV file's first line; none if nothing is committed."""
     if length == 0:
         return ()
     with path.open("rb") as file:

@@ -1,8 +1,8 @@
-"""Folders for what need not outlive a process, and the end of those that a killed process left behind.
+"""Temporary folders of a process, and removal of those left by killed processes.
 
-A folder is held by a lock that ends with its process, however that ends: one whose lock is free belongs to
-nobody. A process number would not do: they are used again, and containers share folders but not numbers. The
-lock is the last thing in a folder that is removed: whatever interrupts the removal, the next one goes on.
+A process holds a lock in its folder, which ends with the process. A folder with a free lock is unused.
+Process ids would not be enough: they are reused, and containers share folders but not ids. The lock is
+removed last, so that an interrupted removal can continue later.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PREFIX = "recrl-"
-LOCK = "recrl-scratch.lock"  # no other folder of ours or of anybody's has such a file
-EMPTY_SECONDS = 60.0  # after which an empty folder is not just being made, or just being removed
-_MADE_HERE = re.compile(re.escape(PREFIX) + "[a-z0-9_]{8}")  # as tempfile names it
+LOCK = "recrl-scratch.lock"  # only scratch folders of recrl have such a file
+EMPTY_SECONDS = 60.0  # older empty folders are not just being made or removed
+_MADE_HERE = re.compile(re.escape(PREFIX) + "[a-z0-9_]{8}")  # prefix and suffix as in tempfile
 
 
 @contextmanager
 def scratch_folder(parent: str) -> Iterator[Path]:
-    """A new folder that only this user can read, removed at the end; those of dead processes are as well.
+    """Make a folder that only this user can read, removed at the end; also remove those of dead processes.
 
     Args:
         parent: the folder to make it in.
@@ -41,11 +41,11 @@ def scratch_folder(parent: str) -> Iterator[Path]:
 
 
 def remove_dead(parent: str) -> None:
-    """Remove this user's scratch folders that no process holds any more."""
+    """Remove this user's scratch folders without a running process."""
     for folder in dead_folders(parent):
         with suppress(OSError):
             _remove(folder)
-    for folder in Path(parent).glob(f"{PREFIX}*"):  # its process died before its lock was there, or after
+    for folder in Path(parent).glob(f"{PREFIX}*"):  # its process died before it made the lock, or after
         with suppress(OSError):
             status = folder.stat()
             is_old = time.time() - status.st_mtime > EMPTY_SECONDS
@@ -64,7 +64,7 @@ def dead_folders(parent: str) -> Iterator[Path]:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a scratch folder, its lock last; what cannot be removed stays."""
+    """Remove a scratch folder, its lock last; files that cannot be removed stay."""
     for path in folder.iterdir():
         if path.name == LOCK:
             continue

@@ -1,7 +1,7 @@
-"""Small files that are read whole: written so that nobody sees a part, and sealed so that a change shows.
+"""Small files that are read whole: written atomically, and sealed by a digest.
 
-A sealed file is a JSON object that says its format, a whole number, and the SHA-256 of everything else in it.
-A file that was cut, emptied, changed in a byte, or replaced by a folder is refused with one sentence.
+A sealed file is a JSON object with the number of its format and the SHA-256 of the rest. A file that was
+truncated, emptied, changed in a byte or replaced by a folder is refused with one sentence.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SEAL_KEY = "sha256"
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a whole file so that a reader, or a crash, sees the old one or the new one, never a part."""
+    """Write a whole file atomically: readers see the old or the new content, also after a crash."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
     try:
         with beside.open("wb") as file:
@@ -43,25 +43,25 @@ def write_sealed(path: Path, value: Mapping[str, Any], *, version: int) -> None:
 
     Args:
         path: of the file.
-        value: what it says; has neither of the keys ``format`` and ``sha256``.
+        value: its content, without the keys ``format`` and ``sha256``.
         version: of the format.
     """
     write_json(path, sealed(value, version=version))
 
 
 def sealed(value: Mapping[str, Any], *, version: int) -> dict[str, Any]:
-    """The value with its format and its seal."""
+    """Return the value with its format and its seal."""
     return {FORMAT_KEY: version, SEAL_KEY: _seal(value, version), **value}
 
 
 def read_sealed(path: Path, *, version: int) -> dict[str, Any]:
-    """Return what ``write_sealed`` wrote, without format and seal.
+    """Read a file of ``write_sealed``, without format and seal.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         OtherFormatError: it has another format.
         DamagedError: it is not what was written.
-        StorageError: the disk does not give it.
+        StorageError: it cannot be read.
     """
     return unsealed(read_whole(path), path.name, version=version)
 
@@ -85,12 +85,12 @@ def unsealed(data: bytes, name: str, *, version: int) -> dict[str, Any]:
 
 
 def read_whole(path: Path) -> bytes:
-    """Return the bytes of a small file.
+    """Read the bytes of a small file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        DamagedError: something else is in its place.
-        StorageError: the disk does not give it.
+        FileNotFoundError: the file does not exist.
+        DamagedError: there is a folder in its place.
+        StorageError: it cannot be read.
     """
     try:
         return path.read_bytes()
@@ -105,10 +105,10 @@ def read_whole(path: Path) -> bytes:
 
 
 def parsed_object(data: bytes, name: str) -> dict[str, Any]:
-    """Return the JSON object in some bytes.
+    """Parse a JSON object.
 
     Raises:
-        DamagedError: they hold none; the sentence begins with ``name``.
+        DamagedError: there is none; the sentence begins with ``name``.
     """
     if not data.strip(b"\0 \r\n\t"):
         raise DamagedError(f"{name} is empty")

@@ -1,4 +1,4 @@
-"""How one run of a sweep tells its workers to save and stop: by a file, or by what stands for one."""
+"""Signals by which one run of a sweep makes its workers save and stop: a file or a similar object."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class StopSign(ABC):
 
 
 class StopFile(StopSign):
-    """A stop sign in the sweep's folder.
+    """Stop signal in the sweep's folder.
 
-    The file is empty as long as they are to go on; they stop when it says anything, or is gone. It is there
-    from the beginning because a network file system may remember for a minute that a file is absent,
-    whereas opening one asks the server.
+    Workers continue as long as the file is empty; they stop when it has content or is missing. It exists from
+    the beginning, because a network file system may cache the absence of a file for a minute. Opening a file
+    asks the server.
 
     Attributes:
         path: the file.
@@ -61,7 +61,7 @@ class StopFile(StopSign):
     @classmethod
     @contextmanager
     def open(cls, folder: Path) -> Iterator[StopFile]:
-        """The stop file of a new run; whatever may be left of earlier runs is told to stop."""
+        """Make the stop file of a new run; workers of earlier runs are stopped."""
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.glob("stop-*"):
             old.unlink(missing_ok=True)
@@ -73,7 +73,7 @@ class StopFile(StopSign):
             stop_file.path.unlink(missing_ok=True)
 
     def set(self) -> None:
-        """Tell the workers to stop."""
+        """Signal the workers to stop."""
         self.path.write_text("stop\n")
 
     def _says_stop(self) -> bool:

@@ -1,39 +1,43 @@
-"""The files of a sweep: the truth that everything else (status, MLflow, figures) is a view of.
+"""The files of a sweep, from which everything else (status, MLflow, figures) is derived.
 
     <root>/<sweep>/
         sweep.json              name, creation time, recrl's version
         grid.yaml               the grid file as given to the last launch
-        trials.jsonl            how many trials that grid has, then a TrialSpec a line, in their order
-        lock                    held by the one process that runs the sweep
-        stop.request            there while somebody asks that process to stop
-        storage.json            of a mirror: the address of the object store that the sweep is kept in
-        figures/                what ``recrl-sweep figures`` drew
+        trials.jsonl            number of trials of that grid, then one TrialSpec per line, in order
+        lock                    held by the process that runs the sweep
+        stop.request            exists while that process is asked to stop
+        storage.json            of a local copy: the address of the object store
+        figures/                output of ``recrl-sweep figures``
         mlflow.db, mlartifacts/ the default MLflow store
-        mirror/                 how far MLflow has been told, for each store it was told to
+        mirror/                 how far each MLflow store is up to date
         trials/<task>__<agent>__<method>__s<seed>__<id>/
             spec.json           the TrialSpec
             state.json          the TrialRecord: status, progress, lease, committed lengths and digests
-            episodes.csv        a row an episode: EPISODE_COLUMNS and one cost_i, limit_i per cost
-            updates.csv         a row a policy update: UPDATE_COLUMNS and the agent's own metrics
-            events.jsonl        a line an event: noise added, limits measured, phase changed
-            evaluation.csv      a row an episode of the frozen-policy evaluations: EVALUATION_COLUMNS
-            policy.csv          of finite tasks: the final policy, a row a state, action_j for each action
-            evaluations/        what ``recrl-sweep evaluate`` measured afterwards; no part of the trial
+            episodes.csv        one row per episode: EPISODE_COLUMNS and one cost_i, limit_i per cost
+            updates.csv         one row per policy update: UPDATE_COLUMNS and the agent's own metrics
+            events.jsonl        one line per event: noise added, limits measured, phase changed
+            evaluation.csv      one row per episode of the final evaluations: EVALUATION_COLUMNS
+            policy.csv          of finite tasks: the final policy, one row per state, action_j per action
+            evaluations/        results of ``recrl-sweep evaluate``; no part of the trial
             videos/             episodes filmed by ``recrl-sweep evaluate --video``; no part of the trial
             checkpoints/        the newest two checkpoints
             provenance.json     of each attempt: versions, commit, machine, digests of the code
             log.txt, error.txt  the trial's log; the traceback of a failed trial
-            aside/              what was damaged or replaced, as it was when an attempt began
-            .reserve            room for a running trial's last words, should the disk be full
+            aside/              damaged or replaced files, moved there when an attempt began
+            .reserve            disk space for the final record of a running trial, if the disk is full
 
-Rules. Small files are written beside and renamed. Rows are appended only by ``TrialWriter.commit``, then
-synced, then a checkpoint that holds the files' lengths and digests is written, then ``state.json``: whatever
-dies between, a restart cuts the files back to the newest intact checkpoint and nothing is there twice.
-Readers look only at committed bytes, and hold them against the record's digests. A file that is shorter than
-its committed length, or whose committed bytes have changed, is damage: the trial's status is then DAMAGED,
-and nothing is made of it. What an attempt cannot use, or replaces, it moves to ``aside/``. A writer holds a
-lease (a token in ``state.json``): once another attempt has taken the trial over, its every write is refused.
-Where the disk is full or gone, a writer's methods raise StorageError, and the last commit stands.
+Rules. Small files are written atomically. Only ``TrialWriter.commit`` appends rows. It syncs them, then
+writes a checkpoint with the files' lengths and digests, then ``state.json``. After a crash in between, a
+restart truncates the files to the newest intact checkpoint, and no row is duplicated. Readers use committed
+bytes only, and check them against the record's digests.
+
+A file that is shorter than its committed length, or whose committed bytes have changed, is damaged. Then the
+trial's status is DAMAGED and its data are not used. An attempt moves unusable or replaced files to
+``aside/``.
+
+A writer holds a lease (a token in ``state.json``). Once another attempt has taken over the trial, all its
+writes are refused. If the disk is full or gone, a writer's methods raise StorageError, and the last commit is
+intact.
 """
 
 from __future__ import annotations
@@ -68,7 +72,7 @@ from recrl.orchestrator.spec import TrialSpec
 
 SPECS_FORMAT = 2
 INFO_FORMAT = 2
-LOOK_SECONDS = 10.0  # that others may take, all together, to look whether a sweep is locked
+LOOK_SECONDS = 10.0  # total time for which readers may hold the lock to see whether a sweep is locked
 
 _TRIAL = re.compile(r"__[0-9a-f]{10}$")
 
@@ -104,7 +108,7 @@ class SweepStore:
         return TrialStore(self.trials_folder / folder_name)
 
     def info(self) -> dict[str, Any]:
-        """What ``sweep.json`` says; nothing if there was no launch.
+        """Return the content of ``sweep.json``; empty if there was no launch.
 
         Raises:
             DamagedError: it is not what was written.
@@ -120,12 +124,12 @@ class SweepStore:
             raise type(error)(f"{self.name}: {error}; launching its grid again writes it anew") from error
 
     def write_info(self, info: Mapping[str, Any]) -> None:
-        """Say in ``sweep.json`` what the sweep is."""
+        """Write ``sweep.json``."""
         self.folder.mkdir(parents=True, exist_ok=True)
         write_sealed(self.info_path, info, version=INFO_FORMAT)
 
     def specs(self) -> list[TrialSpec]:
-        """The trials of the last launch's grid, in their order; none if there was no launch.
+        """Return the trials of the last launch's grid, in order; none if there was no launch.
 
         Raises:
             DamagedError: the file that lists them is not what was written.
@@ -157,7 +161,7 @@ class SweepStore:
         write_atomically(self.specs_path, (json.dumps(header) + "\n").encode() + lines)
 
     def grid_text(self) -> tuple[str, str]:
-        """The grid file of the last launch, and a sentence on what is wrong with it; either may be empty."""
+        """Return the grid file of the last launch, and a sentence on its damage; either may be empty."""
         try:
             data = read_whole(self.grid_path)
         except FileNotFoundError:
@@ -167,17 +171,17 @@ class SweepStore:
         try:
             expected = self._listed()[0]
         except (FileNotFoundError, StorageError):
-            expected = Extent.of(data).sha256  # nobody knows better
+            expected = Extent.of(data).sha256  # no other file has the grid
         if Extent.of(data).sha256 != expected:
             what = "is not what was written" if data else "is missing"
             return "", f"{self.grid_path.name} {what}; launching the grid again writes it anew"
         return data.decode(errors="replace"), ""
 
     def _listed(self) -> tuple[str, list[TrialSpec]]:
-        """The digest of the grid file, and the trials, that ``trials.jsonl`` holds.
+        """Return the digest of the grid file and the trials from ``trials.jsonl``.
 
         Raises:
-            FileNotFoundError: it is not there.
+            FileNotFoundError: it is missing.
             DamagedError: it is not what was written.
         """
         name = self.specs_path.name
@@ -191,7 +195,7 @@ class SweepStore:
         return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
 
     def _created(self) -> float | None:
-        """When the sweep was first launched, seconds since 1970; None if nobody knows."""
+        """Time of the sweep's first launch, seconds since 1970; None if unknown."""
         try:
             return self.info().get("created")
         except StorageError:
@@ -204,7 +208,7 @@ class SweepStore:
             return True
 
     def damages(self) -> list[str]:
-        """A sentence for each file of the sweep itself, not of its trials, that is not what was written."""
+        """Return a sentence for each damaged file of the sweep itself, not of its trials."""
         found = []
         for look in (self.info, self.specs):
             try:
@@ -220,7 +224,7 @@ class SweepStore:
         return found
 
     def trials(self) -> list[TrialStore]:
-        """Every trial on disk, in the order of the folders' names."""
+        """Return every trial on disk, in the order of the folders' names."""
         if not self.trials_folder.is_dir():
             return []
         trials = [TrialStore(path) for path in sorted(self.trials_folder.iterdir())]
@@ -229,11 +233,11 @@ class SweepStore:
             for trial in trials
             if trial.spec_path.exists()
             or trial.state_path.exists()
-            or (_TRIAL.search(trial.folder.name) and not trial.folder.is_dir())  # a file in its place
+            or (_TRIAL.search(trial.folder.name) and not trial.folder.is_dir())  # a file instead of a folder
         ]
 
     def find(self, text: str) -> list[TrialStore]:
-        """The trials on disk that are called so, or else all whose name begins so.
+        """Return the trials on disk with this name, or else all whose name begins with it.
 
         Args:
             text: a trial's id, title or folder, or its beginning.
@@ -245,7 +249,7 @@ class SweepStore:
         return called or [trial for trial, fits in zip(trials, begins, strict=True) if fits]
 
     def is_locked(self) -> bool:
-        """Whether some process runs the sweep."""
+        """Whether a process runs the sweep."""
         try:
             with look_at_lock(self.folder / "lock") as file:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -257,7 +261,7 @@ class SweepStore:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the sweep, so that no second process runs it.
+        """Hold the sweep's lock, so that no second process runs it.
 
         Raises:
             SweepBusyError: another process holds it.
@@ -282,9 +286,9 @@ class SweepStore:
 
 
 def _is_taken(file: IO[str]) -> bool:
-    """Take the exclusive lock of a file, unless somebody else holds it.
+    """Try to take the exclusive lock of a file; return whether it succeeded.
 
-    ``SweepStore.is_locked`` holds a shared one for a moment: who only looks must not keep anybody from it.
+    ``SweepStore.is_locked`` holds a shared lock for a moment, so it tries again for some time.
     """
     end = time.monotonic() + LOOK_SECONDS
     while True:
@@ -299,4 +303,6 @@ def _is_taken(file: IO[str]) -> bool:
             fcntl.flock(file, fcntl.LOCK_UN)
             if time.monotonic() > end:
                 return False
-            time.sleep((1 + secrets.randbelow(10)) / 1000.0)  # two who wait must not keep step
+            time.sleep(
+                (1 + secrets.randbelow(10)) / 1000.0
+            )  # random, so that two waiting processes do not stay in step

@@ -1,4 +1,4 @@
-"""The paths in a trial's folder."""
+"""The paths in a trial's folder; ``sweep_store`` describes the files."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class TrialPaths:
 
     @property
     def is_local_copy(self) -> bool:
-        """Whether the folder only mirrors a trial that is kept in an object store."""
+        """Whether the folder is only a local copy of a trial in an object store."""
         return (self.folder / ".pulled.json").exists()
 
     def checkpoints(self) -> list[Path]:

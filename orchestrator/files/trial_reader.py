@@ -1,7 +1,7 @@
 """Read a trial's spec, record and committed bytes, and find damage.
 
-A file that is shorter than its committed length, or whose committed bytes have changed, is damage: the
-trial's status is then DAMAGED, and nothing is made of it.
+A file that is shorter than its committed length, or whose committed bytes have changed, is damaged. Then the
+trial's status is DAMAGED and its data are not used.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 
 RECORD_FORMAT = 2
 SPEC_FORMAT = 2
-LOOKS = 3  # at files that an attempt may be changing, before they are called damaged
+LOOKS = 3  # reads of files that an attempt may be changing, before they are called damaged
 
 Found = TypeVar("Found")
 
 
 class TrialReader(TrialPaths):
-    """What a trial's files say, as far as they are what was committed."""
+    """Reader of a trial's files, checked against their commits."""
 
     @property
     def title(self) -> str:
-        """What people call the trial: the spec's title, or the folder's name where that is damaged."""
+        """The trial's name for people: the spec's title, or the folder's name if the spec is damaged."""
         try:
             return self.spec.title
         except StorageError:
@@ -40,10 +40,10 @@ class TrialReader(TrialPaths):
 
     @cached_property
     def spec(self) -> TrialSpec:
-        """What the trial is; it must be on disk.
+        """Read the trial's spec; it must be on disk.
 
         Raises:
-            DamagedError: the file that says it is missing, damaged or another trial's.
+            DamagedError: the file is missing, damaged or another trial's.
         """
         try:
             return self._read_spec()
@@ -64,11 +64,10 @@ class TrialReader(TrialPaths):
         return spec
 
     def record(self) -> TrialRecord:
-        """Where the trial stands now; a blank record if it was never started.
+        """Read the trial's present record; a blank record if it was never started.
 
-        The status is DAMAGED, and ``error`` says what is wrong and what to do, where the file that says it is
-        damaged, or a committed file is shorter than it was. Digests are compared where rows are read, and by
-        ``damages``.
+        The status is DAMAGED if ``state.json`` is damaged or a committed file is too short. Then ``error``
+        describes damage and remedy. Digests are checked when rows are read, and by ``damages``.
         """
         try:
             stated, wrong = self._looked_at(self._short)
@@ -88,7 +87,7 @@ class TrialReader(TrialPaths):
         return stated, found
 
     def stated(self) -> TrialRecord:
-        """What ``state.json`` says, whatever the other files are; a blank record if there is none.
+        """Read ``state.json`` without a check of other files; a blank record if it is missing.
 
         Raises:
             DamagedError: it is not what was written.
@@ -113,7 +112,7 @@ class TrialReader(TrialPaths):
             raise DamagedError(f"{self.state_path.name} is no record of a trial ({error})") from error
 
     def _short(self, record: TrialRecord) -> StorageError | None:
-        """What is wrong with the lengths of the committed files, if anything is."""
+        """Return the problem with the lengths of the committed files, if any."""
         for name, length in record.committed.items():
             path = self.folder / name
             if length == 0 and not path.is_dir():
@@ -131,22 +130,24 @@ class TrialReader(TrialPaths):
         return None
 
     def _damaged(self, stated: TrialRecord, error: StorageError) -> TrialRecord:
-        """The record of a damaged trial, with a sentence that says what is wrong and what to do."""
+        """Return the record of a damaged trial, with a sentence on damage and remedy."""
         claims = stated.status if stated.attempt else None
         if isinstance(error, OtherFormatError):
-            claims = TrialState.COMPLETE  # perhaps: nobody is to run it again unasked
+            claims = (
+                TrialState.COMPLETE
+            )  # the status is unknown: the trial must not run again without a request
         if self.is_local_copy:
             remedy = "the sweep's folder is only a local copy: delete it, and it is fetched again"
         elif claims in (TrialState.COMPLETE, TrialState.FAILED):
-            remedy = "launch --rerun-damaged runs the trial again and moves what is damaged aside"
+            remedy = "launch --rerun-damaged runs the trial again and moves the damaged files aside"
         else:
-            remedy = "the next launch goes on from what is whole and moves what is damaged aside"
+            remedy = "the next launch continues from the intact files and moves the damaged ones aside"
         return replace(stated, status=TrialState.DAMAGED, claims=claims, error=f"{error}; {remedy}")
 
     def damages(self) -> list[str]:
-        """A sentence for each file that is not what was committed, by lengths and digests.
+        """Return a sentence for each file that differs from its commit, by lengths and digests.
 
-        Empty for a whole trial, and for one that was never started.
+        Empty for an intact trial, and for a trial that was never started.
         """
         try:
             return self._looked_at(lambda stated: list(self._wrong_files(stated)))[1]
@@ -176,26 +177,26 @@ class TrialReader(TrialPaths):
                 yield str(error).removeprefix(f"{self.folder}/")
 
     def verified_record(self) -> TrialRecord:
-        """``record``, with every file held against its digest as well."""
+        """Return ``record``, after a check of every file's digest."""
         record = self.record()
         found = self.damages() if record.status is not TrialState.DAMAGED else []
         return self._damaged(record, DamagedError(found[0])) if found else record
 
     def require_whole(self) -> None:
-        """Hold every file against what was committed.
+        """Check every file against its committed digest.
 
         Raises:
-            DamagedError: one is damaged; the sentence says which and what to do.
+            DamagedError: a file is damaged; the sentence names it and the remedy.
         """
         record = self.verified_record()
         if record.status is TrialState.DAMAGED:
             raise DamagedError(f"{self.title}: {record.error}")
 
     def committed_bytes(self, path: Path) -> bytes:
-        """The committed bytes of one of the trial's files; none if nothing of it is committed.
+        """Read the committed bytes of one of the trial's files; empty if nothing is committed.
 
         Raises:
-            DamagedError: they are not what was committed.
+            DamagedError: they differ from the commit.
         """
         stated: TrialRecord | None = None
         for _ in range(LOOKS):
@@ -213,7 +214,7 @@ class TrialReader(TrialPaths):
         raise DamagedError(f"{self.folder.name}: {self._damaged(stated, wrong).error}")
 
     def load_checkpoint(self, path: Path) -> dict[str, Any]:
-        """A checkpoint of this trial: ``trial``, the trial's state, and what its writer has to know.
+        """Read a checkpoint of this trial: ``trial``, the trial's state, and the writer's data.
 
         Raises:
             CheckpointError: it is missing, damaged, of another version, or of another trial.
@@ -225,7 +226,7 @@ class TrialReader(TrialPaths):
         return tree
 
     def latest_checkpoint(self) -> dict[str, Any] | None:
-        """The newest intact checkpoint, or None; damaged ones are passed over."""
+        """Return the newest intact checkpoint, or None; damaged ones are skipped."""
         for path in self.checkpoints():
             try:
                 return self.load_checkpoint(path)
@@ -235,7 +236,7 @@ class TrialReader(TrialPaths):
 
 
 def _head(path: Path, length: int) -> bytes:
-    """A file's first bytes, fewer where it has fewer."""
+    """Return a file's first bytes, fewer if it is shorter."""
     if length == 0:
         return b""
     try:

@@ -1,4 +1,4 @@
-"""What is known of a trial from its ``state.json``."""
+"""The record of a trial in its ``state.json``."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from recrl.orchestrator.spec import TrialState
 
 @dataclass(frozen=True)
 class TrialRecord:
-    """What ``state.json`` says of a trial.
+    """Content of ``state.json``.
 
     Attributes:
-        status: where it stands.
-        attempt: how often it was started, from 1; 0 if never.
+        status: the trial's state.
+        attempt: number of starts; 0 if never started.
         token: the lease of the attempt that may write.
         update: policy updates done.
         env_steps: environment steps taken.
         total_steps: environment steps of the whole trial.
         started_at: when the first attempt began, seconds since 1970.
-        heartbeat: when an attempt last said that it lives, seconds since 1970.
+        heartbeat: time of the last sign of life of an attempt, seconds since 1970.
         cpu_seconds: CPU time of all attempts, as far as committed.
         steps_per_second: environment steps per wall second, over the last interval.
         host: the machine of the last attempt.
         pid: its process.
         committed: lengths in bytes of the files, by their names, as of the last commit.
-        digests: SHA-256 of so many bytes of each.
+        digests: SHA-256 of the committed bytes of each.
         checkpoint: name of the checkpoint of the last commit, or empty.
-        start_limits: the training limits d_t the teacher measured, or None.
-        error: one line saying why the trial failed or what of it is damaged, or empty.
-        claims: of a damaged trial the status that its files claim, None if they do not; not in the file.
+        start_limits: the training limits d_t that the curriculum measured, or None.
+        error: one line with the reason of a failure or the damage, or empty.
+        claims: for a damaged trial, the status in its files, or None; not stored.
     """
 
     status: TrialState = TrialState.WAITING
@@ -56,21 +56,21 @@ class TrialRecord:
 
     @property
     def extents(self) -> dict[str, Extent]:
-        """What is committed of each file, by its name."""
+        """Committed extent of each file, by its name."""
         return {name: Extent(length, self.digests.get(name, "")) for name, length in self.committed.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """The record as JSON values; ``from_json`` is its inverse."""
+        """Return the record as JSON values; ``from_json`` is its inverse."""
         return {name: value for name, value in asdict(self).items() if name != "claims"}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrialRecord:
-        """The record that was written as JSON."""
+        """Return the record of ``to_json``."""
         return cls(**{**value, "status": TrialState(value["status"])})
 
 
 def as_fields(extents: Mapping[str, Extent]) -> dict[str, Any]:
-    """The fields of a TrialRecord that say what is committed."""
+    """Return the fields of a TrialRecord that describe committed files."""
     return {
         "committed": {name: extent.length for name, extent in extents.items()},
         "digests": {name: extent.sha256 for name, extent in extents.items()},

@@ -1,7 +1,7 @@
-"""The folder of one trial: what readers may know of it, and how an attempt takes it over.
+"""The folder of one trial: its readers' methods, and its takeover by a new attempt.
 
-What an attempt cannot use, or replaces, it moves to ``aside/``. Where the disk is full or gone, the methods
-raise StorageError, and the last commit stands.
+An attempt moves unusable or replaced files to ``aside/``. If the disk is full or gone, the methods raise
+StorageError, and the last commit is intact.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
-RESERVE_BYTES = 16 * 1024  # a record and a traceback
+RESERVE_BYTES = 16 * 1024  # room for a record and a traceback
 
 logger = logging.getLogger("recrl.trial")
 
 
 class TrialStore(TrialFolder):
-    """The folder of one trial: readers' methods, and those of whoever takes the trial over."""
+    """The folder of one trial: methods for readers, and for starting an attempt."""
 
     def begin(self, spec: TrialSpec) -> TrialWriter:
-        """Take the trial over: from now on only the returned writer may write.
+        """Take over the trial: from now on only the returned writer may write.
 
-        What is damaged is moved to ``aside/`` first.
+        Damaged files are first moved to ``aside/``.
 
         Args:
-            spec: the trial; must be what the folder already holds, if anything.
+            spec: the trial; must equal the spec in the folder, if any.
 
         Raises:
             StorageError: the disk is full or gone.
@@ -74,10 +74,10 @@ class TrialStore(TrialFolder):
         return TrialWriter(self, record, spec)
 
     def _salvaged(self) -> TrialRecord:
-        """What the next attempt goes on from: the record without the files that are not what it says.
+        """Return the starting point of the next attempt: the record without damaged files.
 
-        Those are moved aside, but for row files, of which a copy is: an older checkpoint may still do with
-        their beginning.
+        Damaged files are moved aside, but row files are copied: an older checkpoint may still need their
+        beginning.
         """
         rows = (self.episodes_path, self.updates_path, self.events_path)
         try:
@@ -98,14 +98,14 @@ class TrialStore(TrialFolder):
         return replace(old, **as_fields(whole))
 
     def _attempts_made(self) -> int:
-        """How many attempts there were, where the record that counted them is lost."""
+        """Count the attempts if the record of their number is lost."""
         try:
             return len(parsed_object(read_whole(self.provenance_path), "")["attempts"])
         except (OSError, StorageError, KeyError, TypeError):
             return 0
 
     def _clear_the_way(self) -> None:
-        """Move aside what is a file where a folder must be, or the other way round."""
+        """Move aside files in place of folders, and folders in place of files."""
         if self.folder.exists() and not self.folder.is_dir():
             move_aside(self.folder, self.folder.parent.parent / "aside")
         if self.aside_folder.exists() and not self.aside_folder.is_dir():
@@ -121,7 +121,7 @@ class TrialStore(TrialFolder):
                 self.move_aside(path)
 
     def set_all_aside(self) -> None:
-        """Move everything that attempts have left aside: the next one begins at the beginning.
+        """Move all files of earlier attempts aside, so that the next one starts anew.
 
         Raises:
             StorageError: the disk is full or gone.
@@ -139,9 +139,9 @@ class TrialStore(TrialFolder):
                     path.rename(place / path.name)
 
     def set_status(self, status: TrialState, *, error: str = "") -> None:
-        """Say from outside where the trial stands, for a trial that can no longer say it itself.
+        """Set the status of a trial whose process can no longer do so.
 
-        Revokes the lease of whoever still writes.
+        This revokes the lease of any writer.
 
         Raises:
             StorageError: the disk is full or gone.

@@ -31,31 +31,31 @@ class TrialTables(TrialReader):
     """The committed tables of a trial."""
 
     def episodes(self) -> pd.DataFrame:
-        """The committed episodes: EPISODE_COLUMNS, then cost_i and limit_i for each cost.
+        """Read the committed episodes: EPISODE_COLUMNS, then cost_i and limit_i for each cost.
 
-        This and the other readers of committed files raise DamagedError where one is not what was committed.
+        This and the other readers raise DamagedError if a file differs from its commit.
         """
         return self._committed_csv(self.episodes_path)
 
     def updates(self) -> pd.DataFrame:
-        """The committed policy updates: UPDATE_COLUMNS, cost_i, limit_i, then the agent's metrics."""
+        """Read the committed policy updates: UPDATE_COLUMNS, cost_i, limit_i, then the agent's metrics."""
         return self._committed_csv(self.updates_path)
 
     def events(self) -> list[dict[str, Any]]:
-        """The committed events, in order; each has ``update``, ``end_step`` and ``event``."""
+        """Read the committed events, in order; each has ``update``, ``end_step`` and ``event``."""
         return [json.loads(line) for line in self.committed_bytes(self.events_path).splitlines()]
 
     def evaluation(self) -> pd.DataFrame:
-        """The frozen-policy evaluations: EVALUATION_COLUMNS, then cost_i; empty before the end."""
+        """Read the final evaluations: EVALUATION_COLUMNS, then cost_i; empty before the end."""
         rows = self._committed_csv(self.evaluation_path)
         return rows if len(rows.columns) else pd.DataFrame(columns=list(EVALUATION_COLUMNS))
 
     def policy(self) -> pd.DataFrame:
-        """The final policy pi(a | s): a row a state, columns action_j; empty if there is no table."""
+        """Read the final policy pi(a | s): one row per state, columns action_j; empty if missing."""
         return self._committed_csv(self.policy_path)
 
     def provenance(self) -> list[dict[str, Any]]:
-        """Where each attempt comes from, the first one first; none if the trial never began."""
+        """Read the provenance of each attempt, the first one first; empty if the trial never began."""
         data = self.committed_bytes(self.provenance_path)
         if not data:
             return []

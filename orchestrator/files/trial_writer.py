@@ -1,9 +1,9 @@
-"""The one writer of a trial: it holds the lease, and commits rows together with a checkpoint.
+"""The writer of a trial: it holds the lease, and commits rows together with a checkpoint.
 
-Rows are appended only by ``TrialWriter.commit``, then synced, then a checkpoint that holds the files' lengths
-and digests is written, then ``state.json``: whatever dies between, a restart cuts the files back to the
-newest intact checkpoint and nothing is there twice. A lease is a token in ``state.json``: once another
-attempt has taken the trial over, this one's every write is refused.
+Only ``TrialWriter.commit`` appends rows. It syncs them, then writes a checkpoint with the files' lengths and
+digests, then ``state.json``. After a crash in between, a restart truncates the files to the newest intact
+checkpoint, and no row is duplicated. A lease is a token in ``state.json``. Once another attempt has taken
+over the trial, all writes of this one are refused.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ logger = logging.getLogger("recrl.trial")
 
 
 class TrialWriter:
-    """The lease on a trial: buffers its rows and commits them together with a checkpoint.
+    """Writer with the lease on a trial: buffers its rows and commits them together with a checkpoint.
 
     Attributes:
         store: the trial's folder.
@@ -55,7 +55,7 @@ class TrialWriter:
         self._updates = RowFile(store.updates_path)
         self._events = RowFile(store.events_path)
         self._rows = (self._episodes, self._updates, self._events)
-        names = (store.spec_path.name, PROVENANCE)  # the rest is written anew, or taken up by ``restore``
+        names = (store.spec_path.name, PROVENANCE)  # other files are written anew, or resumed by ``restore``
         self._whole = {name: extent for name, extent in record.extents.items() if name in names}
         self._cpu_origin = time.process_time()
         self._cpu_before = record.cpu_seconds
@@ -66,10 +66,10 @@ class TrialWriter:
         return self._cpu_before + time.process_time() - self._cpu_origin
 
     def restore(self) -> dict[str, Any] | None:
-        """The newest usable checkpoint, with the row files cut back to it; None to start afresh.
+        """Load the newest usable checkpoint and truncate the row files to it; None to start anew.
 
-        A checkpoint is usable if it is intact, of this trial, and the rows that it says are there are. One
-        that is not is renamed ``*.damaged`` and the one before it is used.
+        A checkpoint is usable if it is intact, of this trial, and its rows exist. Otherwise it is renamed to
+        ``*.damaged``, and the one before it is tried.
         """
         with self._lease():
             tree = self._newest_usable()
@@ -83,14 +83,14 @@ class TrialWriter:
             self._cpu_origin = time.process_time()
             self._write_record(
                 **as_fields(self._extents())
-            )  # before the cut: nobody is to see files too short
+            )  # before the truncation: readers must not see files that are too short
             for file in self._rows:
                 if file.path.exists():
                     os.truncate(file.path, file.length)
         return tree["trial"] if tree else None
 
     def _newest_usable(self) -> dict[str, Any] | None:
-        """The newest usable checkpoint; all that are not are renamed."""
+        """Return the newest usable checkpoint; unusable ones are renamed."""
         found: dict[str, Any] | None = None
         for path in self.store.checkpoints():
             try:
@@ -103,7 +103,7 @@ class TrialWriter:
                 if all(file.take_up(_extent_in(tree, file.path.name)) for file in self._rows):
                     found = tree
                     continue
-                logger.warning("%s: its rows are not there any more; it is renamed", path)
+                logger.warning("%s: its rows are missing; it is renamed", path)
             damaged = path.with_suffix(".damaged")
             if os.path.lexists(damaged):
                 self.store.move_aside(damaged)
@@ -114,7 +114,7 @@ class TrialWriter:
         """Add an episode's row to the next commit.
 
         Raises:
-            RowError: it has another number of costs than those before.
+            RowError: it has another number of costs than earlier episodes.
         """
         costs, limits = len(episode.costs), len(episode.limits)
         if not self._episodes.has_header:
@@ -123,17 +123,17 @@ class TrialWriter:
             self._episodes.add_text(",".join(self._episodes.columns) + "\n")
         if len(EPISODE_COLUMNS) + costs + limits != len(self._episodes.columns) or costs != limits:
             raise RowError(
-                f"{self._task}: an episode has {costs} costs and {limits} limits, those before it had "
+                f"{self._task}: an episode has {costs} costs and {limits} limits, earlier ones had "
                 f"{len(self._episodes.columns) - len(EPISODE_COLUMNS)} together"
             )
         cells = (*_episode_values(episode), *episode.costs, *episode.limits.values)
         self._episodes.add_text(",".join(map(str, cells)) + "\n")
 
     def append_update(self, row: Mapping[str, Any]) -> None:
-        """Add an update's row to the next commit; every row of a trial has the same keys, in any order.
+        """Add an update's row to the next commit; all rows of a trial have the same keys, in any order.
 
         Raises:
-            RowError: it has not; the sentence names the agent.
+            RowError: the keys differ; the sentence names the agent.
         """
         self._updates.add_row(row, of=self._agent)
 
@@ -142,15 +142,15 @@ class TrialWriter:
         self._events.add_text(json.dumps(event) + "\n")
 
     def write_evaluation(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write the frozen-policy evaluations, whole; at least one row, all with the same keys."""
+        """Write the final evaluations as a whole; at least one row, all with the same keys."""
         self._write_csv(self.store.evaluation_path, rows)
 
     def write_policy(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write the final policy's table, whole: a row a state, at least one, all with the same keys."""
+        """Write the whole table of the final policy: one row per state, all with the same keys."""
         self._write_csv(self.store.policy_path, rows)
 
     def add_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Say where this attempt comes from, behind what the attempts before it said."""
+        """Append the provenance of this attempt to that of earlier ones."""
         with self._lease():
             before = self.store.provenance() if PROVENANCE in self._whole else []
             if PROVENANCE not in self._whole:
@@ -162,7 +162,7 @@ class TrialWriter:
             self._write_record(**as_fields(committed))
 
     def commit(self, tree: dict[str, Any], *, update: int, env_steps: int, **changes: Any) -> None:
-        """Make everything appended so far, and the trial's state, safe.
+        """Commit everything appended so far, and the trial's state.
 
         Args:
             tree: the trial's whole state after ``update``.
@@ -172,7 +172,8 @@ class TrialWriter:
 
         Raises:
             LostLeaseError: another attempt runs the trial now; nothing was written.
-            StorageError: the disk is full or gone, or a file was cut meanwhile; the previous commit stands.
+            StorageError: the disk is full or gone, or a file was truncated meanwhile; the previous commit is
+                intact.
         """
         with self._lease():
             written = [file.write() for file in self._rows]
@@ -206,7 +207,7 @@ class TrialWriter:
                 old.unlink()
 
     def heartbeat(self, *, update: int, env_steps: int, steps_per_second: float) -> None:
-        """Say that the trial lives and how far it is; commits nothing.
+        """Record a sign of life and the progress; commits nothing.
 
         Raises:
             LostLeaseError: another attempt runs the trial now.
@@ -230,7 +231,7 @@ class TrialWriter:
             yield
 
     def _extents(self) -> dict[str, Extent]:
-        """What is committed of every file."""
+        """Return the committed extents of all files."""
         return {**self._whole, **{file.path.name: file.extent for file in self._rows}}
 
     def _write_record(self, **changes: Any) -> None:
@@ -247,5 +248,5 @@ class TrialWriter:
 
 
 def _extent_in(tree: Mapping[str, Any], name: str) -> Extent:
-    """What a checkpoint says is committed of a row file."""
+    """Return the committed extent of a row file according to a checkpoint."""
     return Extent(int(tree["files"].get(name, 0)), tree["digests"].get(name, Extent().sha256))

@@ -1,1 +1,1 @@
-"""The grid file: its schema, the trials it describes, and the plan that it makes of what is on disk."""
+"""The grid file: its schema, its trials, and the plan for a launch."""

@@ -1,6 +1,6 @@
-"""What a grid file can name: tasks, agents and curricula, with a summary and all options of each.
+"""Names for grid files: tasks, agents and curricula, with a summary and all options of each.
 
-What an installed package adds by an entry point is there too.
+Entry points of installed packages are included.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ REQUIRED = "required"
 
 @dataclass(frozen=True)
 class Kind:
-    """One of the three things that a grid names.
+    """One of the three kinds of names in a grid.
 
     Attributes:
         singular: ``task``, ``agent`` or ``curriculum``.
-        plural: what ``recrl-sweep list`` calls it.
+        plural: its name in ``recrl-sweep list``.
         section: its key in a grid file.
         group: of entry points.
-        ours: the names that recrl itself knows.
-        summary: of a name, one sentence.
-        model: of a name, the pydantic model of its options.
+        ours: recrl's own names.
+        summary: returns one sentence on a name.
+        model: returns the pydantic model of a name's options.
     """
 
     singular: str
@@ -51,7 +51,7 @@ class Kind:
 
     @property
     def names(self) -> list[str]:
-        """Every name that is known here, recrl's own first."""
+        """Return every known name, recrl's own first."""
         return list(dict.fromkeys((*self.ours, *(point.name for point in entry_points(group=self.group)))))
 
 
@@ -61,7 +61,7 @@ class Option:
 
     Attributes:
         name: its key; of an option in an option, ``outer.inner``.
-        type: what is allowed, in words.
+        type: allowed values, in words.
         default: as JSON, or ``required``.
         description: one sentence.
     """
@@ -110,7 +110,7 @@ SECTIONS: Mapping[str, type[BaseModel]] = {"run": Run, "resources": Resources, "
 
 
 def listed(kind: Kind) -> Iterator[tuple[str, str]]:
-    """Every known name of a kind and its summary; of what cannot be loaded, why."""
+    """Return every known name of a kind and its summary; for names that cannot be loaded, the reason."""
     for name in kind.names:
         try:
             yield name, kind.summary(name)
@@ -119,11 +119,11 @@ def listed(kind: Kind) -> Iterator[tuple[str, str]]:
 
 
 def kinds_of(name: str) -> list[Kind]:
-    """The kinds that a name stands for; those of an import path are found by importing it.
+    """Return the kinds of a name; an import path is imported for this.
 
     Raises:
-        RecrlError: nobody provides it.
-        UntrustedNameError: it is an import path, and this process follows none.
+        RecrlError: the name is not known.
+        UntrustedNameError: it is an import path, and this process refuses them.
     """
     if ":" not in name:
         found = [kind for kind in KINDS.values() if name in kind.names]
@@ -151,10 +151,10 @@ def _kind_of_path(path: str) -> Kind:
 
 
 def options_of(model: type[BaseModel]) -> list[Option]:
-    """Every option of a task, an agent, a curriculum or a section, in the order of its model."""
+    """Return every option of a task, an agent, a curriculum or a section, in the order of its model."""
     try:
         defaults: BaseModel | None = model.model_validate({})
-    except ValidationError:  # something is required
+    except ValidationError:  # an option is required
         defaults = None
     return list(_options(model, defaults, ""))
 
@@ -195,7 +195,7 @@ _WORDS: Mapping[Any, str] = {
 
 
 def type_text(annotation: Any) -> str:
-    """What an option may be, in words.
+    """Describe the allowed values of an option.
 
     >>> type_text(Literal["mean", "cvar"]), type_text(int | None), type_text(tuple[float, ...])
     ("'mean' or 'cvar'", 'whole number or null', 'list of number')

@@ -1,4 +1,4 @@
-"""The grid file: which trials a sweep is made of, checked whole before anything starts.
+"""The grid file: the trials of a sweep, checked completely before any of them starts.
 
     name: rivergrid
     tasks:
@@ -9,9 +9,9 @@
     seeds: 5
     run: {total_steps: 960000}
 
-A grid is a product: every task x agent x method x seed, less what ``exclude`` names. ``read_grid`` reports
-every mistake at once, each with its line; ``GridSpec.trials`` is pure, ordered and free of duplicates. Seeds
-are the outermost loop, so that every method gets its first seed before any gets its second.
+A grid is a product: every task x agent x method x seed, without the entries of ``exclude``. ``read_grid``
+reports all mistakes at once, each with its line. ``GridSpec.trials`` is pure, ordered and without duplicates.
+Seeds are the outermost loop, so that every method gets its first seed before any gets its second.
 
 Symbols: ``train_limits`` is d_t, ``deploy_limits`` is d_d, k the number of a task's costs, B the training
 budget, T ``rollout_steps``. Limits are undiscounted costs per episode.
@@ -51,40 +51,39 @@ from recrl.teachers.registry import TEACHERS, make_teacher, teacher_config
 from recrl.teachers.teacher import checked_answer
 
 MAX_TRIALS = 100_000
-ROLLOUT_STEPS = 64  # by default: short rollouts of many environments make many updates
-# d_t: infinite, so that the teacher measures its start. Nobody but the user can say d_d.
+ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many updates
+# Defaults: an infinite d_t, so that the curriculum measures its start. There is no default d_d.
 DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
 
 Model = TypeVar("Model", bound=BaseModel)
-# How a registry validates the options of something it knows by name, defaults filled in.
+# Function of a registry that validates the options of a name and adds defaults.
 OptionsOf = Callable[[str, Mapping[str, Any]], BaseModel]
 
 
 def read_grid(path: Path, *, build: bool = False) -> GridSpec:
-    """The grid in a file, checked whole.
+    """Read and check the grid in a file.
 
     Args:
         path: of the file.
         build: whether to build the user's own agents, networks and curricula once on each task.
 
     Raises:
-        GridError: the file is missing or wrong; one located sentence for every mistake in it.
-        UncalledError: no mistake was found, but something was not checked, as this process follows no
-            import paths.
+        GridError: the file is missing or wrong; one located sentence for each mistake.
+        UncalledError: no mistake was found, but import paths were not checked, as this process refuses them.
     """
     return parse_grid(_read(path), source=str(path), build=build)
 
 
 def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
-    """The grid in ``data``.
+    """Read and check the grid in ``data``.
 
     Args:
         data: a YAML document.
-        source: the file's name, for the sentences.
+        source: the file's name, for errors.
         build: see ``read_grid``.
 
     Raises:
-        GridError: one located sentence for every mistake.
+        GridError: one located sentence for each mistake.
         UncalledError: see ``read_grid``.
     """
     check = _Check(data)
@@ -100,7 +99,7 @@ def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
 
 
 def read_name(path: Path) -> str:
-    """The name of the sweep that a grid file describes; nothing else of the file is checked, nothing called.
+    """Read the sweep's name from a grid file; the rest is not checked, and no code is called.
 
     Raises:
         GridError: the file is missing, no mapping, or its name is wrong.
@@ -127,14 +126,14 @@ def _read(path: Path) -> bytes:
 
 
 class NotJsonError(Exception):
-    """Options that JSON has no words for."""
+    """The options cannot be written as JSON."""
 
 
 class _Check:
-    """One pass over a grid file that goes on after a mistake, as far as what follows still makes sense.
+    """One pass over a grid file; it continues after mistakes as far as possible.
 
-    The whole file is held against its schema; then each entry that has the right form is held against the
-    registries and the other entries, whatever is wrong elsewhere.
+    First the whole file is checked against its schema. Then each entry of the right form is checked against
+    the registries and the other entries, independent of other mistakes.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -146,7 +145,7 @@ class _Check:
         self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
 
     def grid(self) -> GridSpec | None:
-        """The grid, or None where there are problems."""
+        """Return the grid, or None if there are problems."""
         if not isinstance(self._document.value, dict):
             if not self.problems:
                 self._add((), f"a grid must be a mapping of settings, got {shown(self._document.value)}")
@@ -172,7 +171,7 @@ class _Check:
         return None if self.problems else grid
 
     def _check_whole(self, grid: GridSpec) -> None:
-        """Check what concerns the product of all parts."""
+        """Check the product of all parts."""
         size = len(grid.tasks) * len(grid.agents) * len(grid.methods) * len(grid.seeds)
         if size > MAX_TRIALS:
             self._add((), f"a grid must have at most {MAX_TRIALS} trials, got {size}")
@@ -192,7 +191,7 @@ class _Check:
                     hint = nearest(str(value), [str(name) for name in known[key]])
                     self._add(("exclude", index, key), f"this grid has no {key} {shown(value)}{hint}")
         if not self.problems and not grid.trials():
-            self._add(("exclude",), "leaves no trial at all")
+            self._add(("exclude",), "leaves no trial")
 
     def build_own(self, grid: GridSpec) -> None:
         """Build the user's own agents, networks and curricula once on each task that they meet."""
@@ -219,7 +218,7 @@ class _Check:
             self._add(place, f"{what}: {described(error)}")
 
     def _tasks(self) -> list[TaskCell]:
-        """The tasks whose limits and rollouts are right."""
+        """Return the tasks with correct limits and rollouts."""
         run = _valid(Run, self._raw.get("run"))
         cells = []
         for index, task in self._choices("tasks", TaskEntry, task_options).items():
@@ -233,7 +232,7 @@ class _Check:
         return cells
 
     def _choices(self, section: str, model: type[Entry], options_of: OptionsOf) -> dict[int, Choice]:
-        """The entries of a section that name something known and set it right, by their index."""
+        """Return the correct entries of a section, by their index."""
         choices: dict[int, Choice] = {}
         for index, value in enumerate(_items(self._raw.get(section))):
             entry = _valid(model, value)
@@ -248,7 +247,7 @@ class _Check:
         return choices
 
     def _options(self, place: Place, entry: Entry, options_of: OptionsOf) -> dict[str, Any] | None:
-        """The entry's options with defaults filled in, as JSON values."""
+        """Return the entry's options with defaults, as JSON values."""
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
         try:
             options = options_of(entry.name, entry.options).model_dump(mode="json")
@@ -270,7 +269,7 @@ class _Check:
         return None
 
     def _check_network(self, place: Place, options: Mapping[str, Any]) -> None:
-        """Check that an agent's own network can be imported, where import paths are followed."""
+        """Check that a user's network can be imported, if import paths are followed."""
         path = options.get("network")
         if place[0] != "agents" or not isinstance(path, str):
             return
@@ -296,14 +295,14 @@ class _Check:
                 return
 
     def _cmdp(self, index: int, task: Choice) -> CMDPSpec | None:
-        """What the task fixes, found by building one environment of it; a user's is also stepped once."""
+        """Return the task's CMDP, by building one environment; a user's environment also takes one step."""
         try:
             envs = make_vector(task.name, 1, options=task.options)
         except USERS_ERRORS as error:
             self._add(("tasks", index), f"{task.name} cannot be built: {described(error)}")
             return None
         try:
-            if isinstance(envs, SyncCMDPVectorEnv):  # a user's: does a step report its cost?
+            if isinstance(envs, SyncCMDPVectorEnv):  # a user's environment: does a step report its cost?
                 envs.reset(seed=0)
                 envs.action_space.seed(0)
                 envs.step(envs.action_space.sample())
@@ -315,7 +314,7 @@ class _Check:
         return envs.cmdp
 
     def _both_limits(self, index: int, label: str, cmdp: CMDPSpec) -> tuple[CostLimits, CostLimits] | None:
-        """The task's d_t and d_d."""
+        """Return the task's d_t and d_d."""
         train_limits, place = self._limits(index, "train_limits", label, cmdp)
         deploy_limits, _ = self._limits(index, "deploy_limits", label, cmdp)
         if train_limits is None or deploy_limits is None:
@@ -330,14 +329,14 @@ class _Check:
         return train_limits, deploy_limits
 
     def _limits(self, index: int, key: str, label: str, cmdp: CMDPSpec) -> tuple[CostLimits | None, Place]:
-        """One kind of a task's limits, its own or the grid's, and where they are written."""
+        """Return one kind of a task's limits, its own or the grid's, and their place in the file."""
         place: Place = ("tasks", index, key)
         entry = _valid(TaskEntry, self._raw["tasks"][index])
         values = getattr(entry, key)
         if values is None:
             place = (key,)
             shared = _valid(Limits, {key: self._raw.get(key)})
-            if shared is None:  # the schema has reported it
+            if shared is None:  # the schema check has reported it
                 return None, place
             values = getattr(shared, key) or DEFAULT_LIMITS[key]
         if values is None:
@@ -350,7 +349,7 @@ class _Check:
         return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
 
     def _rollout_steps(self, run: Run | None, label: str, cmdp: CMDPSpec) -> int | None:
-        """T: as given, or its default."""
+        """Return T: the given value, or its default."""
         if run is None:
             return None
         default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
@@ -366,7 +365,7 @@ class _Check:
         return None
 
     def _validated(self, model: type[Model], value: Any) -> Model | None:
-        """The value as ``model``; every mistake is added."""
+        """Return the value as ``model``; all mistakes are added to the problems."""
         try:
             return model.model_validate(value)
         except ValidationError as error:
@@ -383,7 +382,7 @@ def _is_own_agent(agent: Choice) -> bool:
 
 
 def _valid(model: type[Model], value: Any) -> Model | None:
-    """The value as ``model``, or None where it is wrong: that has been reported elsewhere."""
+    """Return the value as ``model``, or None if it is wrong; its mistakes are reported elsewhere."""
     try:
         return model.model_validate(value)
     except ValidationError:
@@ -391,7 +390,7 @@ def _valid(model: type[Model], value: Any) -> Model | None:
 
 
 def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:
-    """The class of the options of ``name``, where it can be built without any."""
+    """Return the class of the options of ``name``, if it can be built without arguments."""
     try:
         return type(options_of(name, {}))
     except (ValidationError, *USERS_ERRORS):

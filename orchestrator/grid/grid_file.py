@@ -1,4 +1,4 @@
-"""What a person writes in a grid file, as pydantic models; what it means is in ``grid``.
+"""Pydantic models of a grid file's content; ``grid`` checks its meaning.
 
 Symbols: ``train_limits`` is d_t, ``deploy_limits`` is d_d, T ``rollout_steps``. Limits are undiscounted costs
 per episode.
@@ -36,7 +36,7 @@ def _not_a_truth_value(value: Any) -> Any:
 
 
 def _read_limits(value: Any) -> tuple[float, ...]:
-    """One number for every cost, or a list with one number a cost."""
+    """Read one number for all costs, or a list with one number per cost."""
     values = value if isinstance(value, list) else [value]
     if not values:
         raise ValueError("must be a number or a list of numbers, got []")
@@ -47,7 +47,7 @@ def _read_limits(value: Any) -> tuple[float, ...]:
 
 
 def _read_train_limits(value: Any) -> tuple[float, ...]:
-    """As ``_read_limits``; ``auto`` is infinite: the teacher measures its start."""
+    """As ``_read_limits``; ``auto`` is infinite: the curriculum measures its start."""
     if isinstance(value, str):
         if value != "auto":
             raise ValueError(f"must be 'auto', a number or a list of numbers, got {shown(value)}")
@@ -63,7 +63,7 @@ def _read_deploy_limits(value: Any) -> tuple[float, ...]:
 
 
 def _read_seeds(value: Any) -> tuple[int, ...]:
-    """``5`` is 0, 1, 2, 3, 4; a list is itself."""
+    """Read seeds: ``5`` is 0, 1, 2, 3, 4; a list is itself."""
     if isinstance(value, int) and not isinstance(value, bool):
         if not 1 <= value <= MAX_SEEDS:
             raise ValueError(f"must be a number of seeds from 1 to {MAX_SEEDS}, or a list, got {value}")
@@ -79,7 +79,7 @@ def _read_seeds(value: Any) -> tuple[int, ...]:
 
 
 def _read_custom(value: Any) -> dict[str, float]:
-    """Amounts by the names that a cluster's nodes were given; Ray's own names have settings of their own."""
+    """Read amounts of a cluster's custom resources, by name; Ray's own resources have separate settings."""
     if not isinstance(value, dict):
         raise ValueError(f"must be a mapping of names to amounts, got {shown(value)}")
     for name, amount in value.items():
@@ -105,12 +105,12 @@ def _read_name(value: Any) -> str:
 
 
 def _one_or_list(value: Mapping[str, Any], **others: Any) -> WithJsonSchema:
-    """The JSON schema of a value, of a list of such values, or of something else."""
+    """Return the JSON schema of a value, of a list of such values, or of another type."""
     listed = {"type": "array", "items": value, "minItems": 1}
     return WithJsonSchema({"anyOf": [value, listed, *([others] if others else [])]})
 
 
-# For editors. Digits grouped by _ are a number in YAML 1.1, which recrl reads, and a text in YAML 1.2.
+# For editors. Digits grouped by _ are a number in YAML 1.1, which recrl reads, and text in YAML 1.2.
 _AMOUNT = {"type": "number", "minimum": 0}
 _TEXT = {"type": "string"}
 _COUNT = {"anyOf": [{"type": "integer"}, {"type": "string", "pattern": "^[0-9][0-9_]*$"}]}
@@ -145,10 +145,10 @@ class Entry(_Written):
 
     name: ShortText = Field(description="Registry name, entry point or package.module:attribute.")
     label: PlainText = Field(
-        default="", max_length=60, description="What tables and figures call it; the name by default."
+        default="", max_length=60, description="Label in tables and figures; by default the name."
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="Its settings, checked by its own config class."
+        default_factory=dict, description="Its options, as listed by recrl-sweep options."
     )
 
     @model_validator(mode="before")
@@ -162,7 +162,7 @@ class Entry(_Written):
 
 
 class Limits(_Written):
-    """The limits of a task's costs: one number for every cost, or a list with one number a cost."""
+    """The limits of a task's costs: one number for all costs, or a list with one number per cost."""
 
     train_limits: TrainLimits | None = Field(
         default=None,
@@ -175,64 +175,69 @@ class Limits(_Written):
 
 
 class TaskEntry(Entry, Limits):
-    """A task, and its limits where they are not the grid's."""
+    """A task, with limits if they differ from the grid's."""
 
 
 class Run(_Written):
-    """How long and how wide every trial runs."""
+    """Length and width of every trial."""
 
     total_steps: Whole = Field(
         ge=1, le=MAX_STEPS, description="Environment steps of both phases, over all environments."
     )
     deploy_fraction: Number = Field(
-        default=0.05, ge=0.0, le=0.9, description="Share of the steps in deployment (paper, section 5: 5%)."
+        default=0.05,
+        ge=0.0,
+        le=0.9,
+        description="Fraction of the steps in deployment (paper, section 5: 5%).",
     )
     num_envs: Whole = Field(
         default=64,
         ge=1,
         le=4096,
-        description="Environments stepped together; many, so that an update sees many episodes (ours).",
+        description="Number of parallel environments; many, so that an update has many episodes (ours).",
     )
     rollout_steps: Whole | None = Field(
         default=None,
         ge=1,
         le=10_000_000,
-        description="T, steps of each environment between two policy updates; by default 64, or the task's "
-        "horizon where that is shorter. Episodes go on from one update to the next (ours).",
+        description="T, steps of each environment between two policy updates; by default 64, or "
+        "the task's horizon if that is shorter. Episodes continue across updates "
+        "(ours).",
     )
     evaluation_episodes: Whole = Field(
-        default=100, ge=0, le=1_000_000, description="Episodes of each frozen-policy evaluation (ours)."
+        default=100, ge=0, le=1_000_000, description="Episodes of each final evaluation (ours)."
     )
     videos: Literal["none", "first-seed", "all"] = Field(
         default="none",
-        description="Which complete trials a launch films, an episode each; no result depends on it.",
+        description="The complete trials that a launch films, one episode each; no result depends on it.",
     )
 
 
 class Resources(_Written):
-    """What a trial occupies; no result depends on it."""
+    """Resources of a trial; no result depends on them."""
 
-    cpus_per_trial: Number = Field(default=1.0, gt=0.0, le=1024.0, description="Cores a running trial holds.")
-    gpus_per_trial: Number = Field(default=0.0, ge=0.0, le=64.0, description="GPUs a running trial holds.")
+    cpus_per_trial: Number = Field(default=1.0, gt=0.0, le=1024.0, description="Cores of a running trial.")
+    gpus_per_trial: Number = Field(default=0.0, ge=0.0, le=64.0, description="GPUs of a running trial.")
     custom_per_trial: CustomResources = Field(
         default_factory=dict,
-        description="What else a running trial holds, by the names that a cluster's nodes were started with "
+        description="Custom resources of a running trial, by the names given to a cluster's nodes "
         "(ray start --resources); a launch on one machine has none.",
     )
     max_concurrent: Whole | None = Field(
-        default=None, ge=1, le=10_000, description="Trials at once, at most; by default as many as fit."
+        default=None, ge=1, le=10_000, description="Largest number of parallel trials; by default as fit."
     )
     teacher: Literal["service", "inline"] = Field(
         default="service",
-        description="Where teachers think: in one service for the sweep, or in each trial's own process "
-        "(for hundreds of trials at once whose updates take less than a second).",
+        description="Process of the curricula: one service for the sweep, or each trial's own "
+        "process (for hundreds of parallel trials with updates below a second).",
     )
     silence_seconds: Number = Field(
         default=300.0,
         ge=5.0,
         le=1e7,
-        description="A trial that uses no processor for so long hangs (five times so long before its process "
-        "first speaks of it): it is started again from its last checkpoint. Wall seconds (ours).",
+        description="A trial that uses no processor time for this many wall seconds hangs (five "
+        "times as many before its first sign of life). It is started again from its "
+        "last checkpoint (ours).",
     )
 
 
@@ -245,7 +250,7 @@ class Exclusion(_Written):
     seed: Annotated[list[Whole], BeforeValidator(_listed), _one_or_list(_COUNT)] | None = None
 
     def matches(self, spec: TrialSpec) -> bool:
-        """Whether the trial is to be left out."""
+        """Whether the trial is left out."""
         return all(
             wanted is None or value in wanted
             for wanted, value in (
@@ -258,13 +263,13 @@ class Exclusion(_Written):
 
 
 class GridFile(Limits):
-    """A grid file's content; its limits are those of tasks that give none."""
+    """Content of a grid file; its limits apply to tasks without their own."""
 
-    name: SweepName = Field(description="The sweep's name, and that of its folder.")
+    name: SweepName = Field(description="Name of the sweep and of its folder.")
     tasks: list[TaskEntry] = Field(min_length=1)
     agents: list[Entry] = Field(min_length=1)
     methods: list[Entry] = Field(min_length=1)
-    seeds: Seeds = Field(description="A number of seeds, 5 for 0 to 4, or a list of seeds.")
+    seeds: Seeds = Field(description="A number of seeds (5 for 0 to 4), or a list of seeds.")
     run: Run
     resources: Resources = Resources()
     exclude: list[Exclusion] = []

@@ -1,4 +1,4 @@
-"""A checked grid, and the trials that it is made of."""
+"""A checked grid and its trials."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recrl.orchestrator.spec import Choice, TrialSpec
 
 @dataclass(frozen=True)
 class TaskCell:
-    """A task with everything about it resolved.
+    """A task with its resolved limits and rollout length.
 
     Attributes:
         task: the CMDP.
@@ -33,18 +33,18 @@ class TaskCell:
 
 @dataclass(frozen=True)
 class GridSpec:
-    """A checked grid, every default filled in.
+    """A checked grid with all defaults.
 
     Attributes:
         name: the sweep's name.
         tasks: the CMDPs with their limits.
         agents: the agents.
-        methods: the teachers.
+        methods: the curricula.
         seeds: at least one, all different.
-        run: how long and how wide every trial runs.
-        resources: what a trial occupies.
-        exclude: what to leave out of the product.
-        text: the file as it was given.
+        run: length and width of every trial.
+        resources: of a trial.
+        exclude: trials to leave out of the product.
+        text: the original file.
     """
 
     name: str
@@ -58,7 +58,7 @@ class GridSpec:
     text: bytes
 
     def trials(self) -> tuple[TrialSpec, ...]:
-        """The trials, in the order in which they are to start."""
+        """Return the trials, in their starting order."""
         cells = product(self.seeds, self.tasks, self.agents, self.methods)
         specs = (self._trial(*cell) for cell in cells)
         return tuple(spec for spec in specs if not any(rule.matches(spec) for rule in self.exclude))

@@ -1,7 +1,7 @@
-"""A JSON schema of grid files, with which editors complete keys and mark mistakes while one types.
+"""A JSON schema of grid files, for completion and checks in editors.
 
-It knows the names of recrl's own tasks, agents and curricula, and the options of each. It is no judge:
-``read_grid`` also checks what a schema cannot say.
+It has the names and options of recrl's own tasks, agents and curricula. ``read_grid`` also checks rules that
+a schema cannot express.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MODE: JsonSchemaMode = "validation"
 
 
 class _Lenient(GenerateJsonSchema):
-    """Lets anything pass where Python code alone decides what is right."""
+    """Schema generator that accepts anything where only Python code can check the value."""
 
     def handle_invalid_for_json_schema(self, schema: Any, error_info: str) -> dict[str, Any]:
         """No restriction."""
@@ -28,7 +28,7 @@ class _Lenient(GenerateJsonSchema):
 
 
 def grid_schema() -> dict[str, Any]:
-    """The schema as JSON values."""
+    """Return the schema as JSON values."""
     models = {(kind.plural, name): kind.model(name) for kind in KINDS.values() for name in kind.ours}
     distinct: dict[type[BaseModel], None] = dict.fromkeys((GridFile, *models.values()))
     inputs = [(model, MODE) for model in distinct]
@@ -44,7 +44,7 @@ def grid_schema() -> dict[str, Any]:
 
 
 def _entry(kind: Kind, mapping: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """A name alone, or a mapping with a name and the options that belong to it."""
+    """Schema of a name alone, or a mapping with a name and its options."""
     name = {
         "anyOf": [
             {"enum": kind.names},

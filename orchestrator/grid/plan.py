@@ -1,6 +1,6 @@
-"""A grid held against what is on disk: what a launch would do, and about what it would take.
+"""The plan of a launch: what it would do with each trial, with estimates of time and memory.
 
-The plan is all that decides which trials run: a launch carries it out, ``recrl-sweep plan`` prints it.
+The plan alone decides which trials run: a launch executes it, ``recrl-sweep plan`` prints it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.validation import nearest
 
-# Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the mirror;
-# rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers come on top.
+# Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the MLflow
+# sync; rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers are additional.
 GIGABYTES_PER_TRIAL = 0.35
 GIGABYTES_AROUND = 1.2
 
@@ -28,12 +28,12 @@ SELECTABLE = ("task", "agent", "method", "seed")
 
 
 class PlannedAction(StrEnum):
-    """What a launch would do with a trial."""
+    """Action of a launch for a trial."""
 
     NEW = "new"
     RESUME = "resume"
     RETRY = "retry"
-    REPAIR = "repair"  # damaged; goes on from what is whole
+    REPAIR = "repair"  # damaged; continues from the intact files
     RERUN = "rerun"  # from the beginning, because its code has changed
     COMPLETE = "complete"
     FAILED = "failed"
@@ -41,7 +41,7 @@ class PlannedAction(StrEnum):
 
     @property
     def is_to_do(self) -> bool:
-        """Whether a launch would work on the trial."""
+        """Whether a launch would run the trial."""
         return self in (
             PlannedAction.NEW,
             PlannedAction.RESUME,
@@ -53,13 +53,13 @@ class PlannedAction(StrEnum):
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """One trial of the grid and what is on disk of it.
+    """One trial of the grid and its files.
 
     Attributes:
         spec: the trial.
-        action: what a launch would do with it.
-        record: what its files say.
-        has_other_code: whether an attempt at it ran other code than is installed now.
+        action: the planned action.
+        record: from its files.
+        has_other_code: whether an attempt ran other code than is installed now.
     """
 
     spec: TrialSpec
@@ -76,11 +76,11 @@ class PlannedTrial:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a launch would do.
+    """Plan of a launch.
 
     Attributes:
         trials: the chosen trials of the grid, in their order.
-        orphans: trials on disk that the grid does not contain any more; nobody touches them.
+        orphans: trials on disk that the grid no longer contains; they are not touched.
     """
 
     trials: tuple[PlannedTrial, ...]
@@ -88,7 +88,7 @@ class Plan:
 
     @property
     def to_do(self) -> tuple[TrialSpec, ...]:
-        """The trials to run, in their order."""
+        """Return the trials to run, in order."""
         return tuple(trial.spec for trial in self.trials if trial.action.is_to_do)
 
     def with_action(self, action: PlannedAction) -> tuple[PlannedTrial, ...]:
@@ -97,7 +97,7 @@ class Plan:
 
     @property
     def other_code(self) -> tuple[PlannedTrial, ...]:
-        """The trials that ran other code than is installed now, and are not run again from the beginning."""
+        """Return the trials that ran other code than is installed now and are not run again."""
         return tuple(it for it in self.trials if it.has_other_code and it.action is not PlannedAction.RERUN)
 
     @property
@@ -114,11 +114,11 @@ class Plan:
 
 @dataclass(frozen=True)
 class Estimate:
-    """About what a plan takes.
+    """Estimated resources of a plan.
 
     Attributes:
-        wall_seconds: with ``concurrent`` trials at once; None where no trial of some task and agent has run.
-        concurrent: trials at once.
+        wall_seconds: with ``concurrent`` parallel trials, or None if no trial of some task and agent has run.
+        concurrent: number of parallel trials.
         gigabytes: main memory while they run.
         unknown: the tasks and agents without a measured speed, as ``task agent``.
     """
@@ -138,19 +138,19 @@ def make_plan(
     rerun_damaged: bool = False,
     rerun_changed: bool = False,
 ) -> Plan:
-    """Hold the grid's trials against the files.
+    """Make a plan by comparing the grid's trials with the files.
 
     Args:
         specs: the trials of the grid, all of them.
-        store: where the sweep is, or will be.
-        only: the trials to plan for, as ``select`` reads it; all by default.
-        retry_failed: whether failed trials are to be tried again.
-        rerun_damaged: whether damaged trials that were complete or failed are to be run again; others are.
-            Then every file is read and held against its digest.
-        rerun_changed: whether trials that ran other code than is installed now are to be run again.
+        store: of the sweep; need not exist.
+        only: the selected trials, see ``select``; all by default.
+        retry_failed: whether failed trials are tried again.
+        rerun_damaged: whether damaged trials that were complete or failed are run again; other damaged ones
+            always are. If true, every file is read and its digest checked.
+        rerun_changed: whether trials that ran other code than is installed now are run again.
 
     Raises:
-        RecrlError: ``only`` names what no trial of the grid has.
+        RecrlError: ``only`` matches no trial of the grid.
     """
     wanted = {spec.folder_name for spec in specs}
     trials = []
@@ -167,14 +167,15 @@ def make_plan(
 
 
 def estimate(plan: Plan, *, concurrent: int, speeds: Mapping[str, float] | None = None) -> Estimate:
-    """Time from the speed of the trials that have run so far, memory from what a trial's process takes.
+    """Estimate time from the speed of earlier trials, and memory from that of a trial's process.
 
     A speed is measured in environment steps per CPU second, for each task and agent with their options.
 
     Args:
-        plan: what is to do.
-        concurrent: trials at once, at least 1.
-        speeds: measured ones by ``kind_of``, in environment steps per CPU second, for what has not run yet.
+        plan: the plan.
+        concurrent: number of parallel trials, at least 1.
+        speeds: measured speeds by ``kind_of``, in environment steps per CPU second, for kinds that have not
+            run yet.
     """
     measured = speeds or {}
     steps: defaultdict[str, int] = defaultdict(int)
@@ -204,27 +205,27 @@ def estimate(plan: Plan, *, concurrent: int, speeds: Mapping[str, float] | None 
 
 
 def unmeasured(plan: Plan) -> tuple[TrialSpec, ...]:
-    """One trial to do of each kind of which none has run."""
+    """Return one trial to do of each kind without a finished trial."""
     known = {kind_of(trial.spec) for trial in plan.trials if trial.record.cpu_seconds > 0.0}
     kinds = {kind_of(spec): spec for spec in reversed(plan.to_do)}
     return tuple(spec for kind, spec in reversed(kinds.items()) if kind not in known)
 
 
 def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: int | None = None) -> int:
-    """How many trials fit on so many cores, by default this machine's; at least 1."""
+    """Return how many trials fit on a number of cores, by default this machine's; at least 1."""
     fitting = max(1, int((cores or os.cpu_count() or 1) / cpus_per_trial))
     return min(fitting, max_concurrent or fitting)
 
 
 def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> tuple[TrialSpec, ...]:
-    """The trials that match everything wanted.
+    """Return the trials that match all conditions.
 
     Args:
         specs: the trials of the grid.
         wanted: acceptable labels (or seeds, as text) for some of ``SELECTABLE``.
 
     Raises:
-        RecrlError: a key or a value that no trial of the grid has.
+        RecrlError: no trial of the grid has a given key or value.
     """
     for key, values in wanted.items():
         if key not in SELECTABLE:
@@ -251,7 +252,7 @@ def _planned_action(record: TrialRecord, *, retry_failed: bool, rerun_damaged: b
 
 
 def kind_of(spec: TrialSpec) -> str:
-    """What trials of about equal speed share: the task and the agent, options and width included."""
+    """Return the key of trials with about equal speed: task, agent and number of environments."""
     kind: tuple[Choice | int, ...] = (spec.task, spec.agent, spec.num_envs, spec.rollout_steps)
     return repr(kind)
 

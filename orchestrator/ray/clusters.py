@@ -1,4 +1,4 @@
-"""Start a Ray cluster on this machine, or connect to one that somebody else runs."""
+"""Start a Ray cluster on this machine, or connect to an existing one."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from recrl.orchestrator.ray.services import (
 
 CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
-OBJECT_STORE_BYTES = 80 * 2**20  # Ray wants 75 MiB at least; nothing of ours is that large
+OBJECT_STORE_BYTES = 80 * 2**20  # Ray requires 75 MiB at least; recrl stores nothing of that size
 LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
 
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_AIR_NEW_OUTPUT": "0",  # the new output speaks at verbosity 0, the old one does not
+    "RAY_AIR_NEW_OUTPUT": "0",  # the new output prints at verbosity 0, the old one does not
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
-    "TUNE_DISABLE_SIGINT_HANDLER": "1",  # the stop event is the one way to stop
-    "TUNE_GLOBAL_CHECKPOINT_S": "1e9",  # nobody restores Tune's own state
+    "TUNE_DISABLE_SIGINT_HANDLER": "1",  # the stop event is the only way to stop
+    "TUNE_GLOBAL_CHECKPOINT_S": "1e9",  # Tune's own state is never restored
     "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
     "TUNE_WARN_THRESHOLD_S": "60",
 }
@@ -53,9 +53,9 @@ WORKER = {
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
 }
 
-# Ray's processes look after themselves up to ten times a second. A cluster of our own has one machine, no
-# objects to speak of, and nobody who reads its metrics; none of these settings tells that a process has died.
-# They go into Ray's environment, where a version that does not know one leaves it alone.
+# Ray's processes poll up to ten times a second. Recrl's own cluster has one machine, no large objects and no
+# reader of metrics; none of these settings affects the detection of dead processes. They are set in Ray's
+# environment, where a version that does not know one ignores it.
 SELDOM: Mapping[str, int] = {
     "enable_metrics_collection": 0,
     "gcs_pull_resource_loads_period_milliseconds": 10_000,  # for an autoscaler
@@ -63,7 +63,7 @@ SELDOM: Mapping[str, int] = {
     "local_fs_monitor_interval_ms": 10_000,  # before objects are spilled to disk
     "memory_monitor_refresh_ms": 2_000,
     "object_manager_timer_freq_ms": 1_000,
-    "prestart_worker_first_driver": 0,  # a worker without work wakes a hundred times a second
+    "prestart_worker_first_driver": 0,  # an idle worker wakes a hundred times a second
     "raylet_check_gc_period_milliseconds": 10_000,
 }
 LOOPBACK = "127.0.0.1"
@@ -73,14 +73,14 @@ logger = logging.getLogger("recrl.sweep")
 
 @contextmanager
 def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
-    """A Ray cluster on this machine, for as long as the context lasts, that strangers cannot use.
+    """Start a Ray cluster on this machine until the end of the context, closed to other users.
 
-    Its services listen at the loopback address and want the token, so that neither another machine nor
-    another user of this one can use them. Ray opens its own folder to everybody on the machine: the one
-    around it, which also holds the token, is only this user's.
+    Its services listen at the loopback address and require a token, so that neither other machines nor other
+    users can use them. Ray's own folder is open to all users of the machine. It lies in a folder that only
+    this user can read, with the token.
 
     Args:
-        num_cpus: cores it may use, at least 1; all of the machine's if None.
+        num_cpus: number of cores, at least 1; all of the machine's if None.
 
     Raises:
         ClusterError: Ray does not start.
@@ -94,7 +94,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
         seldom = {f"RAY_{name}": str(value) for name, value in SELDOM.items()}
         with environment(QUIET | WORKER | seldom | {TOKEN_VARIABLE: str(token_path)}):
             for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
-                os.environ.pop(name, None)  # Ray looks at its mode only where it sets it itself
+                os.environ.pop(name, None)  # Ray uses the mode only if it is set before Ray starts
             with (
                 _leaving_no_process(folder),
                 at_loopback(),
@@ -114,20 +114,21 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
 
 @contextmanager
 def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[None]:
-    """A connection to a Ray cluster that somebody else runs.
+    """Connect to an existing Ray cluster.
 
     Args:
-        address: ``auto`` for the one this machine belongs to, or ``host:port``.
+        address: ``auto`` for the cluster of this machine, or ``host:port``.
         ship_package: whether to send recrl itself, without its dependencies, to the nodes.
 
     Raises:
-        ClusterError: there is none, this machine is no node of it, or it does not know our token.
+        ClusterError: there is none, this machine is no node of it, or it refuses our token.
     """
     failure = f"cannot use the Ray cluster at {address}"
-    if "://" in address:  # Ray itself advises against Tune beyond Ray Client
+    if "://" in address:  # Ray itself advises against Tune with Ray Client
         raise ClusterError(
-            f"{failure}: the driver must run on a node of the cluster, not beyond Ray Client; launch there "
-            "with --address auto, or make this machine a node: ray start --address=<host:port> --num-cpus=0"
+            f"{failure}: the driver must run on a node of the cluster, not through Ray Client; "
+            "launch there with --address auto, or make this machine a node: ray start "
+            "--address=<host:port> --num-cpus=0"
         )
     host, _, port = address.rpartition(":")
     if host:  # Ray itself would try for two minutes
@@ -137,8 +138,8 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
             reason = getattr(error, "strerror", None) or error
             raise ClusterError(f"{failure}: {reason}; is it running, and is this host:port?") from error
     hint = (
-        "; is this machine a node of it (ray start --address=<host:port> --num-cpus=0), and does it want a "
-        "token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
+        "; is this machine a node of it (ray start --address=<host:port> --num-cpus=0), and does "
+        "it require a token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
     )
     with scratch_folder(tempfile.gettempdir()) as scratch:
         environment: dict[str, Any] = {"env_vars": WORKER}
@@ -155,7 +156,7 @@ def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
         quiet_driver()
         try:
             _connect(**settings)
-        except SystemExit as error:  # Ray's own answer to a SIGTERM while it starts; nothing runs yet
+        except SystemExit as error:  # Ray's reaction to a SIGTERM during its start; nothing runs yet
             raise KeyboardInterrupt from error
         except Exception as error:
             raise ClusterError(f"{failure}: {first_line(error)}{hint}") from error
@@ -165,13 +166,13 @@ def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
 
 
 def _connect(**settings: Any) -> None:
-    """``ray.init``, tried again where a busy machine took longer than the seconds that Ray allows."""
+    """Call ``ray.init`` again if a busy machine took longer than the time that Ray allows."""
     for tries_left in range(CONNECT_TRIES - 1, -1, -1):
         try:
             with own_signal_handlers(), own_sessions(), fewer_processes():
                 ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
             return
-        except Exception as error:  # that a node is too slow to start, Ray says by a bare Exception
+        except Exception as error:  # Ray raises a bare Exception for a node that starts too slowly
             if tries_left == 0 or "timed out" not in str(error):
                 raise
             logger.warning("Ray did not start in time; it is tried again")
@@ -180,7 +181,7 @@ def _connect(**settings: Any) -> None:
 
 @contextmanager
 def _leaving_no_process(folder: Path) -> Iterator[None]:
-    """End at last what Ray leaves behind of the cluster in a folder: its agents, if its raylet was killed."""
+    """End the processes that Ray leaves behind in a folder: its agents, if its raylet was killed."""
     try:
         yield
     finally:
@@ -189,7 +190,7 @@ def _leaving_no_process(folder: Path) -> Iterator[None]:
 
 @cache
 def _token() -> str:
-    """This process's token for the clusters it starts: Ray reads a process's token only once."""
+    """Return this process's token for the clusters it starts: Ray reads a process's token only once."""
     return secrets.token_hex(32)
 
 
@@ -199,6 +200,6 @@ def _short_folder() -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error, or all of them as one where the first only announces the others."""
+    """Return the first line of an error, or all lines as one if the first only announces the others."""
     first = next(iter(str(error).splitlines()), "")
     return " ".join(str(error).split()) if first.endswith(":") else first

@@ -1,20 +1,22 @@
-"""Trials on Ray: Tune hands them to worker processes on one machine or many, and the files keep the truth.
+"""Trials on Ray: Tune assigns them to worker processes on one or many machines.
 
-Tune is a scheduler that may die. Every run is a fresh Tune experiment over the specs it is given (never
-``Tuner.restore``); a Tune trial is one recrl trial, from wherever its own newest checkpoint stands; and Tune
-learns nothing of it but that it ended.
+Tune is a scheduler that may die. Every run is a new Tune experiment over the given specs (never
+``Tuner.restore``). A Tune trial is one recrl trial, which starts from its own newest checkpoint. Tune is
+informed only of its end; all results are in the files.
 
-What fails, and what happens: a worker or its node dies, and Tune starts the trial again, up to
-``max_failures`` times; a trial's own code raises, and it is FAILED in its files and not tried again; the
-driver dies, and its workers with it; a trial hangs, its heartbeat falls silent, and its process is ended
-(``hang_watchdog``), which is the first case again.
+Failures:
 
-A signal to the launch and to its whole process group (Ctrl-C, ``timeout``) reaches the driver alone: Ray's
-processes have sessions of their own, and serve until the trials are saved.
+- A worker or its node dies: Tune starts the trial again, up to ``max_failures`` times.
+- A trial's code raises: it is FAILED in its files and not tried again.
+- The driver dies: its workers die, too.
+- A trial hangs: its heartbeat stops, and its process is ended (``hang_watchdog``), as in the first case.
 
-Assumes that every node sees the results folder under the same path, or reaches the object store that the
-trials are kept in, and has the same recrl: where the cluster is somebody else's, every node is asked for both
-before the first trial. Leaves out growing with an elastic cluster beyond ``max_concurrent``.
+A signal to the launch and its process group (Ctrl-C, ``timeout``) reaches the driver only. Ray's processes
+have sessions of their own, and run until the trials are saved.
+
+Assumes that every node sees the results folder under the same path, or reaches the object store of the
+trials, and has the same recrl. On an existing cluster every node is checked for both before the first trial.
+Leaves out growing with an elastic cluster beyond ``max_concurrent``.
 """
 
 from __future__ import annotations
@@ -57,21 +59,21 @@ logger = logging.getLogger("recrl.sweep")
 
 @dataclass(frozen=True)
 class RayExecutor:
-    """Runs trials side by side on Ray; an ``Executor``.
+    """``Executor`` that runs trials in parallel on Ray.
 
     Attributes:
-        num_cpus: cores of the cluster that is started on this machine; all of them if None.
+        num_cpus: cores of the cluster that is started on this machine; all if None.
         address: an existing cluster (``auto``, ``host:port``) to use instead.
         ship_package: whether to send recrl itself to that cluster's nodes.
-        cpus_per_trial: cores a trial takes, above 0; may be a fraction.
-        gpus_per_trial: GPUs a trial takes, at least 0; may be a fraction.
-        custom_per_trial: what else a trial takes, by the names that the nodes were given, above 0.
-        max_concurrent: trials at once, at least 1; if None, as many as fit when the run begins.
-        teacher: ``service`` for one actor that teaches the whole sweep, ``inline`` for a teacher in every
-            worker. The results are the same.
-        max_failures: how often a trial whose process died is started again, at least 0.
+        cpus_per_trial: cores per trial, above 0; may be a fraction.
+        gpus_per_trial: GPUs per trial, at least 0; may be a fraction.
+        custom_per_trial: custom resources per trial, by the names given to the nodes, above 0.
+        max_concurrent: largest number of parallel trials, at least 1; if None, as fit at the start.
+        teacher: ``service`` for one actor for the whole sweep, ``inline`` for a teacher in every worker. The
+            results are the same.
+        max_failures: largest number of restarts after the death of a trial's process, at least 0.
         commit_seconds: wall seconds between a trial's checkpoints, above 0.
-        silence_seconds: wall seconds without a heartbeat after which a trial hangs, above 0.
+        silence_seconds: wall seconds without a heartbeat after which a trial counts as hanging, above 0.
     """
 
     num_cpus: int | None = None
@@ -87,10 +89,10 @@ class RayExecutor:
     silence_seconds: float = SILENCE_SECONDS
 
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
-        """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if it is.
+        """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if any.
 
         Raises:
-            ClusterError: Ray cannot be started or reached, lacks what one trial asks for, or has nodes that
+            ClusterError: Ray cannot be started or reached, lacks the resources of a trial, or has nodes that
                 differ from this one.
         """
         if not specs or stop.is_set():
@@ -131,7 +133,7 @@ class RayExecutor:
         }
         with scratch_folder(tempfile.gettempdir()) as scratch, own_signal_handlers():
             self._tuner(parameters, queue, watch, scratch).fit()
-        del service  # Ray ends an actor that nobody holds
+        del service  # Ray ends an actor without a reference
 
     def _tuner(
         self, parameters: dict[str, Any], queue: BasicVariantGenerator, watch: DriverWatch, scratch: Path
@@ -158,11 +160,11 @@ class RayExecutor:
 
     @property
     def _wanted(self) -> Mapping[str, float]:
-        """What one trial takes, by Ray's names."""
+        """Return the resources of one trial, by Ray's names."""
         return {"CPU": self.cpus_per_trial, "GPU": self.gpus_per_trial, **self.custom_per_trial}
 
     def _slots(self) -> int:
-        """How many trials may run at once."""
+        """Return the number of parallel trials."""
         slots = trials_that_fit(self._wanted)
         if self.address:  # an existing cluster may grow
             if not slots:
@@ -179,11 +181,11 @@ class RayExecutor:
 
 
 def room_on_cluster(address: str, resources: Resources) -> int:
-    """How many trials an existing cluster holds at once, at least 0.
+    """Return how many trials an existing cluster can run in parallel, at least 0.
 
     Args:
-        address: as ``existing_cluster`` has it.
-        resources: what a trial takes.
+        address: see ``existing_cluster``.
+        resources: of a trial.
 
     Raises:
         ClusterError: it cannot be reached.
@@ -203,5 +205,5 @@ def _tune_trial_id(trial: Any) -> str:
 
 
 def _amounts(resources: Mapping[str, float]) -> str:
-    """``1 CPU, 0 GPU``."""
+    """Format amounts: ``1 CPU, 0 GPU``."""
     return ", ".join(f"{amount:g} {name}" for name, amount in resources.items())

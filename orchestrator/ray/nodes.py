@@ -1,8 +1,7 @@
-"""The nodes of a Ray cluster: how many trials they hold, and whether those of somebody else's can stand in.
+"""The nodes of a Ray cluster: their capacity, and whether they can run the trials.
 
-A trial's result is the same on every machine only if its code is, and it can be kept only where the results
-folder, or the object store in its place, is seen. Ray itself refuses nodes with another Python or Ray than
-its head's.
+A trial's result is the same on every machine only if the code is, and the node must see the results folder or
+the object store. Ray itself refuses nodes with another Python or Ray than its head's.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ SIGHT = "what keeps it from the results"
 
 
 def trials_that_fit(wanted: Mapping[str, float]) -> int:
-    """How many trials the nodes that are there hold at once.
+    """Return how many trials the present nodes can run in parallel.
 
     Args:
-        wanted: what one trial takes, by Ray's names of resources; at least 0 each.
+        wanted: resources of one trial, by Ray's names; at least 0 each.
     """
     asked = {name: amount for name, amount in wanted.items() if amount > 0.0}
     return sum(
@@ -35,14 +34,14 @@ def trials_that_fit(wanted: Mapping[str, float]) -> int:
 
 
 def check_nodes(probe: str, uri: str = "") -> None:
-    """Hold every node that has cores against this machine, before any trial.
+    """Check every node with cores against this machine, before any trial.
 
     Args:
-        probe: a file that is there, in the sweep's folder; or the key of an object.
-        uri: of the object store that the sweep is kept in, if it is.
+        probe: an existing file in the sweep's folder, or the key of an object.
+        uri: of the sweep's object store, if any.
 
     Raises:
-        ClusterError: one sentence that names every node that differs, and in what.
+        ClusterError: one sentence with every node that differs, and its differences.
     """
     look = _look()
     task = ray.remote(look)
@@ -76,13 +75,13 @@ def check_nodes(probe: str, uri: str = "") -> None:
 
 
 def differences(address: str, here: Mapping[str, str], there: Mapping[str, str], place: str) -> list[str]:
-    """What a node lacks or has otherwise, a sentence each.
+    """Return a sentence for each difference of a node.
 
     Args:
-        address: the node's.
-        here: what this machine has, by name.
-        there: what the node has; under SIGHT what is wrong if it does not see the place.
-        place: that it must see, a folder or the address of an object store.
+        address: of the node.
+        here: versions on this machine, by name.
+        there: versions on the node; under SIGHT the problem if it does not see the place.
+        place: a folder or the address of an object store.
     """
     others = [
         f"{name} {there.get(name) or 'missing'} (here {value})"
@@ -96,7 +95,7 @@ def differences(address: str, here: Mapping[str, str], there: Mapping[str, str],
 
 
 def _nodes() -> list[dict[str, Any]]:
-    """The nodes that are there, as Ray describes them."""
+    """Return the present nodes, as Ray describes them."""
     described: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
     return [node for node in described if node["Alive"]]
 
@@ -106,7 +105,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
-    """What is run on the nodes. A closure is sent by value: they may have another recrl, or none."""
+    """Return the function that runs on the nodes. As a closure it is sent by value: a node may lack recrl."""
 
     def look(distributions: tuple[str, ...], probe: str, uri: str) -> dict[str, str]:
         import importlib  # noqa: PLC0415
@@ -115,7 +114,7 @@ def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
 
         found = {"Python": platform.python_version()}
         for name in distributions:
-            try:  # torch's CPU and CUDA builds of one version differ behind the plus
+            try:  # torch's CPU and CUDA builds of one version differ after the plus
                 found[name] = (importlib.metadata.version(name) or "").partition("+")[0]
             except importlib.metadata.PackageNotFoundError:
                 found[name] = ""
@@ -128,14 +127,14 @@ def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
             if uri:
                 package = importlib.import_module("recrl.orchestrator.remote.object_store")
                 seen = package.ObjectStore(uri).read(probe) is not None
-                found["what keeps it from the results"] = "" if seen else ", but another in its place"
-            else:  # a network file system may remember that a file is absent; opening it asks the server
+                found["what keeps it from the results"] = "" if seen else ", but another file in its place"
+            else:  # a network file system may cache that a file is absent; opening it asks the server
                 with open(probe):
                     found["what keeps it from the results"] = ""
         except OSError:
             shared = ", which must be on a file system that all nodes share"
             found["what keeps it from the results"] = shared
-        except Exception as error:  # of a class that may be missing here
+        except Exception as error:  # an error of a class that may be missing here
             found["what keeps it from the results"] = f" ({error})"
         return found
 

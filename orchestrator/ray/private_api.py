@@ -1,8 +1,8 @@
-"""The private names of Ray that recrl uses, because Ray has no public switch for what they do.
+"""Private names of Ray that recrl uses, because Ray has no public setting for their purpose.
 
-Ray may change them in any release. So ``pyproject.toml`` bounds Ray's version, a missing name is a sentence
-that says which versions to install, and ``tests/orchestrator/test_ray_private_api.py`` says what to do when a
-new Ray is to be allowed.
+Ray may change them in any release. So ``pyproject.toml`` bounds Ray's version, and the error for a missing
+name lists the versions to install. ``tests/orchestrator/test_ray_private_api.py`` describes how to allow a
+new version.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import ray
 
 from recrl.orchestrator.errors import ClusterError
 
-NEWEST = (2, 60)  # Ray that these names were checked with
+NEWEST = (2, 60)  # version of Ray that these names were checked with
 RANGE = "ray[tune]>=2.48,<2.61"
 NAMES = (
     "parameter.RayParams",
@@ -26,18 +26,18 @@ NAMES = (
     "services.ConsolePopen",
     "worker._worker_logs_enabled",
 )
-# Processes that ``ray start`` can leave out and ``ray.init`` cannot: one copies the workers' output to the
-# driver, which does not want it (trials have logs), the other asks for machines where there are none.
+# Processes that ``ray start`` can omit and ``ray.init`` cannot. One copies the workers' output to the driver,
+# which does not need it (trials have logs). The other requests machines from an autoscaler.
 LEFT_OUT: Mapping[str, Any] = {"include_log_monitor": False, "no_monitor": True}
 
 logger = logging.getLogger("recrl.sweep")
 
 
 def require_known_ray() -> None:
-    """Check that Ray has the names used here; warn where it is newer than they were checked with.
+    """Check that Ray has the names used here; warn if it is newer than the checked version.
 
     Raises:
-        ClusterError: it lacks one.
+        ClusterError: a name is missing.
     """
     missing = [name for name in NAMES if not hasattr(*_place(name))]
     if missing:
@@ -46,7 +46,7 @@ def require_known_ray() -> None:
             f"that it was tested with: pip install '{RANGE}'"
         )
     if tuple(map(int, ray.__version__.split(".")[:2])) > NEWEST:
-        logger.warning("Ray %s is newer than recrl was tested with: %s", ray.__version__, RANGE)
+        logger.warning("Ray %s is newer than the tested versions: %s", ray.__version__, RANGE)
 
 
 def quiet_driver() -> None:
@@ -56,9 +56,9 @@ def quiet_driver() -> None:
 
 @contextmanager
 def own_sessions() -> Iterator[None]:
-    """Start Ray's processes in sessions of their own, so that Ctrl-C reaches the driver alone.
+    """Start Ray's processes in sessions of their own, so that Ctrl-C reaches the driver only.
 
-    They still end with this process, however it ends: Ray asks the kernel for that.
+    They still end with this process, because Ray requests that from the kernel.
     """
     popen = getattr(*_place("services.ConsolePopen"))
     with _replaced("services.ConsolePopen", partial(popen, start_new_session=True)):
@@ -67,7 +67,7 @@ def own_sessions() -> Iterator[None]:
 
 @contextmanager
 def fewer_processes() -> Iterator[None]:
-    """Start no process of LEFT_OUT; where a cluster is there already, none is started anyhow."""
+    """Do not start the processes of LEFT_OUT; an existing cluster starts none anyway."""
     whole = getattr(*_place("parameter.RayParams"))
     known = inspect.signature(whole).parameters
     fewer = partial(whole, **{name: value for name, value in LEFT_OUT.items() if name in known})
@@ -77,10 +77,9 @@ def fewer_processes() -> Iterator[None]:
 
 @contextmanager
 def at_loopback() -> Iterator[None]:
-    """Let Ray's services listen at this machine's own address only.
+    """Let Ray's services listen at the loopback address only.
 
-    Where Ray is told such an address it takes the machine's outer one instead, unless it believes that there
-    can be no cluster on this system.
+    Ray replaces a loopback address by the machine's outer one, unless clusters are disabled on the system.
     """
     with _replaced("ray_constants.ENABLE_RAY_CLUSTER", False):
         yield
@@ -88,7 +87,7 @@ def at_loopback() -> Iterator[None]:
 
 @contextmanager
 def _replaced(name: str, value: object) -> Iterator[None]:
-    """Replace a private name of Ray for a while."""
+    """Replace a private name of Ray until the end of the context."""
     module, attribute = _place(name)
     before = getattr(module, attribute)
     setattr(module, attribute, value)

@@ -1,4 +1,4 @@
-"""Keep what Ray and Tune change in this process: its environment and its signal handlers."""
+"""Undo the changes of Ray and Tune to this process: its environment and its signal handlers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def environment(changes: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables for a while; whatever is changed meanwhile is undone, also by Ray."""
+    """Set environment variables until the end of the context; then undo all changes, also Ray's."""
     before = dict(os.environ)
     os.environ.update(changes)
     try:
@@ -23,7 +23,7 @@ def environment(changes: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def own_signal_handlers() -> Iterator[None]:
-    """Undo what Ray and Tune do to this process's signal handlers."""
+    """Undo the changes of Ray and Tune to this process's signal handlers."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -32,5 +32,5 @@ def own_signal_handlers() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if handler is not None:  # None is one that was not installed from Python
+            if handler is not None:  # None for a handler that was not installed from Python
                 signal.signal(number, handler)

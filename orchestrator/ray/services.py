@@ -1,8 +1,8 @@
-"""Whether the services that a Ray cluster hangs on are still there.
+"""Watch the services that a Ray cluster depends on.
 
-Ray itself does not say it: with a dead node service (raylet) Tune waits for ever; with a dead head service
-(GCS) Ray ends the whole process after a minute, in C++. So a thread of this process connects to both now and
-then. A service that takes a connection counts as alive: one that hangs is left to Ray's own checks.
+Ray does not report their death. With a dead node service (raylet) Tune waits without end; with a dead head
+service (GCS) Ray ends the whole process after a minute, in C++. So a thread of this process regularly
+connects to both. A service that accepts a connection counts as alive; Ray itself checks for hanging services.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.exit_codes import ExitCode
 
-LOOK_SECONDS = 3.0  # between two looks
+LOOK_SECONDS = 3.0  # between two checks
 CONNECT_SECONDS = 2.0
-OWN_PATIENCE_SECONDS = 5.0  # nobody starts a service of a cluster of ours again
+OWN_PATIENCE_SECONDS = 5.0  # services of recrl's own cluster are not restarted
 OTHERS_PATIENCE_SECONDS = 40.0  # below the minute after which Ray ends a process without a head service
-LEAVE_SECONDS = 10.0  # that a launch may take to come to its end after that
+LEAVE_SECONDS = 10.0  # time for a launch to finish afterwards
 
 TOKEN_VARIABLE = "RAY_AUTH_TOKEN_PATH"
 TOKEN = "token"  # in the folder of a local cluster
-RAY_FOLDER = "ray"  # beside it
-SERVICES = ("ray::", "raylet", "gcs_server")  # what Ray's processes are called, or begin with
+RAY_FOLDER = "ray"  # in the same folder
+SERVICES = ("ray::", "raylet", "gcs_server")  # names of Ray's processes, or their beginnings
 
 logger = logging.getLogger("recrl.sweep")
 
@@ -44,8 +44,8 @@ class Service:
     """One of Ray's services.
 
     Attributes:
-        name: what people call it.
-        host: the address that it listens at.
+        name: for messages.
+        host: its address.
         port: its port.
     """
 
@@ -54,7 +54,7 @@ class Service:
     port: int
 
     def is_there(self) -> bool:
-        """Whether something takes a connection there."""
+        """Whether it accepts a connection."""
         try:
             socket.create_connection((self.host, self.port), timeout=CONNECT_SECONDS).close()
         except OSError:
@@ -63,23 +63,23 @@ class Service:
 
     @property
     def patience(self) -> float:
-        """For how many seconds it may be away."""
+        """Seconds for which it may be unreachable."""
         return OWN_PATIENCE_SECONDS if self.host.startswith("127.") else OTHERS_PATIENCE_SECONDS
 
     @property
     def obituary(self) -> str:
-        """What is said of its end."""
+        """Describe its end."""
         return (
-            f"Ray's {self.name} at {self.host}:{self.port} has died; nothing that was saved is lost, "
-            "and the same launch goes on"
+            f"Ray's {self.name} at {self.host}:{self.port} has died; nothing that was saved is "
+            "lost, and the same launch continues"
         )
 
 
 class LostServices:
-    """What a launch asks whether its cluster still works.
+    """State of a cluster's services, for the launch.
 
     Attributes:
-        problem: a sentence about the service that is gone, or empty.
+        problem: a sentence about a dead service, or empty.
     """
 
     def __init__(self) -> None:
@@ -87,24 +87,25 @@ class LostServices:
         self._services: tuple[Service, ...] = ()
 
     def check(self) -> None:
-        """Raise if a service is gone.
+        """Raise an error if a service has died.
 
         Raises:
-            ClusterError: it is.
+            ClusterError: a service has died.
         """
         if self.problem:
             raise ClusterError(self.problem)
 
     def any_is_gone(self) -> bool:
-        """Whether a service takes no connection right now."""
+        """Whether a service accepts no connection at the moment."""
         return not all(service.is_there() for service in self._services)
 
     @contextmanager
     def watched(self, cluster: AbstractContextManager[None]) -> Iterator[None]:
-        """Look after a cluster's services for as long as it is used, and see to it that it can be left.
+        """Watch a cluster's services until the end of the context, and make sure that it can be left.
 
-        Without its services Ray may keep a thread of this process for ever. So a launch that has not left the
-        cluster ``LEAVE_SECONDS`` after they died is ended, like one that was killed: the files allow it.
+        Without its services Ray may block a thread of this process without end. So a launch that has not left
+        the cluster ``LEAVE_SECONDS`` after their death is ended, like a killed launch; the files remain
+        valid.
 
         Args:
             cluster: the connection to it.
@@ -132,12 +133,12 @@ class LostServices:
 
 
 def end_processes(folder: Path) -> None:
-    """Kill the processes of a local cluster that are still there: Ray's agents outlive a killed driver.
+    """Kill the remaining processes of a local cluster: Ray's agents outlive a killed driver.
 
-    They are known by the logs that they have open, which lie in the cluster's own folder.
+    They are identified by their open logs, which are in the cluster's own folder.
 
     Args:
-        folder: that folder.
+        folder: the cluster's folder.
     """
     for descriptors in Path("/proc").glob("[0-9]*/fd"):
         number = int(descriptors.parent.name)
@@ -156,7 +157,7 @@ def _is_below(link: Path, folder: Path) -> bool:
 
 
 def _services() -> tuple[Service, ...]:
-    """The head service, and the node service of this machine, of the cluster that this process uses."""
+    """Return the head service, and this machine's node service, of the connected cluster."""
     context = ray.get_runtime_context()
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
     here = next(node for node in nodes if node["NodeID"] == context.get_node_id())

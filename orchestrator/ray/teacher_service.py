@@ -1,7 +1,7 @@
-"""One teacher for a whole sweep: a Ray actor that keeps nothing, and the proxy through which trials ask it.
+"""One teacher for a whole sweep: a stateless Ray actor, and its proxy in the trials.
 
-A teacher is a pure function, so the actor may be killed and restarted, and a question may be asked twice,
-without a trace in any trial. Kept out of ``ray_executor`` because workers import this and not Tune.
+A teacher is a pure function, so a restart of the actor or a repeated call affects no trial. It is separate
+from ``executor``, because workers import this module and not Tune.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LONGEST_PAUSE_SECONDS = 5.0
 
 
 class TeacherService:
-    """Answers for any teacher; which one, and where its trial stands, comes with every question."""
+    """Actor that computes any teacher's step; each call contains the teacher's spec and state."""
 
     def start(self, spec: TeacherSpec) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``."""
@@ -38,26 +38,26 @@ class TeacherService:
 
 
 def start_teacher_service(name: str) -> Any:
-    """Start the service; to be called by the driver, so that no trial's placement group owns it.
+    """Start the service; the driver calls this, so that no trial's placement group owns it.
 
     Args:
-        name: under which ``find_teacher_service`` finds it, anywhere in the cluster.
+        name: for ``find_teacher_service``, anywhere in the cluster.
 
     Returns:
-        The actor's handle; the service lives as long as the driver holds it, and is restarted as often as
-        it dies. It takes no core.
+        The actor's handle. The service lives as long as the driver holds it, and is restarted whenever it
+        dies. It takes no core.
     """
     options = {"name": name, "namespace": NAMESPACE, "num_cpus": 0, "max_restarts": -1}
     return ray.remote(TeacherService).options(**options).remote()
 
 
 def find_teacher_service(name: str) -> Any:
-    """The handle of the service that was started under a name."""
+    """Return the handle of the service with a name."""
     return ray.get_actor(name, namespace=NAMESPACE)
 
 
 class RayTeacher:
-    """A ``Teacher`` whose thinking is done by a ``TeacherService``."""
+    """A ``Teacher`` that calls a ``TeacherService``."""
 
     def __init__(
         self,
@@ -67,13 +67,13 @@ class RayTeacher:
         answer_seconds: float = ANSWER_SECONDS,
         patience_seconds: float = PATIENCE_SECONDS,
     ) -> None:
-        """Make a proxy; asks nothing yet.
+        """Make a proxy, without a call yet.
 
         Args:
             spec: the teacher.
             service: handle of a ``TeacherService`` actor.
-            answer_seconds: how long one answer may take.
-            patience_seconds: how long to go on asking; more than losing the service's node takes.
+            answer_seconds: timeout of one call.
+            patience_seconds: total time of repeated calls; longer than the loss of the service's node takes.
         """
         self._spec = spec
         self._service = service
@@ -81,15 +81,15 @@ class RayTeacher:
         self._patience_seconds = patience_seconds
 
     def start(self) -> tuple[CurriculumStep, TeacherState]:
-        """See ``Teacher.start``; raises TeacherUnavailableError if the service stays away."""
+        """See ``Teacher.start``; raises TeacherUnavailableError if the service does not answer."""
         return self._ask(self._service.start, self._spec)
 
     def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
-        """See ``Teacher.step``; raises TeacherUnavailableError if the service stays away."""
+        """See ``Teacher.step``; raises TeacherUnavailableError if the service does not answer."""
         return self._ask(self._service.step, self._spec, state, report)
 
     def _ask(self, method: Any, *question: Any) -> tuple[CurriculumStep, TeacherState]:
-        """Ask until there is an answer: a pure function may be asked again."""
+        """Repeat a call until it is answered; a pure function can be called again."""
         deadline = time.monotonic() + self._patience_seconds
         pause = 0.1
         while True:
@@ -98,7 +98,7 @@ class RayTeacher:
                     method.remote(*question), timeout=self._answer_seconds
                 )
                 return answer
-            except RayTaskError as error:  # the teacher raised: as if it had done so here
+            except RayTaskError as error:  # an error of the teacher itself: raised here as well
                 raise error.cause from error
             except (RayActorError, GetTimeoutError) as error:
                 if time.monotonic() + pause > deadline:

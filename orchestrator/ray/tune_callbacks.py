@@ -1,4 +1,4 @@
-"""What the driver does beside Tune's scheduling: passes the stop on, and records trials that are given up."""
+"""Tune callbacks of the driver: pass on the stop event, and record trials that Tune gives up."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
-LONGEST_PAUSE_SECONDS = 0.5  # in which nobody asks Ray whether a trial has ended
+LONGEST_PAUSE_SECONDS = 0.5  # in which Ray is not asked whether a trial has ended
 PAUSE_SHARE = 0.01  # of the time since a trial last began or ended
 
 logger = logging.getLogger("recrl.sweep")
 
 
 class DriverWatch(tune.Callback):
-    """What the driver does beside scheduling: passes the stop event on, and records trials given up."""
+    """Callback that passes on the stop event, and records trials that Tune gives up."""
 
     def __init__(
         self,
@@ -59,10 +59,10 @@ class DriverWatch(tune.Callback):
         self.stopped_and_idle = False
 
     def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
-        """Look at the stop event and the heartbeats.
+        """Check the stop event and the heartbeats.
 
-        Tune would call this ten times a second, and each turn of its loop costs a millisecond of a core that
-        trials want. So it waits here while trials are long, and never for the stop event.
+        Tune would call this ten times a second, and each iteration of its loop takes a millisecond of a core.
+        So it waits here while trials are long, but not after the stop event.
         """
         self._stop.wait(pause_seconds(time.monotonic() - self._last_event))
         self._lost.check()
@@ -74,21 +74,21 @@ class DriverWatch(tune.Callback):
             self.stopped_and_idle = all(trial.status != "RUNNING" for trial in trials)
 
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Look again soon: where one trial begins, others may."""
+        """Check again soon: when one trial begins, others may begin as well."""
         self._last_event = time.monotonic()
         self._watchdog.begin(trial)
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Look again soon: the next trial is to begin."""
+        """Check again soon: the next trial will begin."""
         self._last_event = time.monotonic()
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Say that Tune starts a trial again."""
+        """Log that Tune starts a trial again."""
         self._last_event = time.monotonic()
-        logger.warning("%s: its process failed; it goes on from its last checkpoint", spec_of(trial).title)
+        logger.warning("%s: its process failed; it continues from its last checkpoint", spec_of(trial).title)
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Record a trial that Tune gives up; one that only missed its teacher waits to be resumed."""
+        """Record a trial that Tune gives up; if only its teacher was missing, it waits to be resumed."""
         self._last_event = time.monotonic()
         cause, spec = _last_error(trial), spec_of(trial)
         if self._lost.any_is_gone():  # not the trial's fault: it waits
@@ -113,12 +113,12 @@ class DriverWatch(tune.Callback):
             logger.warning("%s", error)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Nothing: Tune pickles its callbacks to restore them, which nobody does, and events cannot be."""
+        """Return an empty state: events cannot be pickled, and the callbacks are never restored."""
         return {}
 
 
 class StopWhenIdle(tune.Stopper):
-    """Ends the experiment once the sweep is stopped and the last running trial has come to its end."""
+    """Stopper that ends the experiment once the sweep is stopped and no trial runs."""
 
     def __init__(self, watch: DriverWatch) -> None:
         self._watch = watch
@@ -133,17 +133,17 @@ class StopWhenIdle(tune.Stopper):
 
 
 def pause_seconds(quiet_seconds: float) -> float:
-    """How long to wait before Ray is asked again whether a trial has ended, in seconds.
+    """Return the time until Ray is asked again whether a trial has ended, in seconds.
 
     Args:
-        quiet_seconds: since a trial last began or ended, at least 0; no trial is kept waiting for more than a
-            hundredth of them.
+        quiet_seconds: since a trial last began or ended, at least 0; a trial waits for at most a hundredth of
+            it.
     """
     return min(PAUSE_SHARE * quiet_seconds, LONGEST_PAUSE_SECONDS)
 
 
 def _last_error(trial: Any) -> BaseException | None:
-    """What a Tune trial failed of, last."""
+    """Return the last error of a Tune trial."""
     path = trial.pickled_error_file
     if path is None:
         return None
@@ -152,11 +152,11 @@ def _last_error(trial: Any) -> BaseException | None:
 
 
 def process_error(cause: BaseException | None, failures: int) -> str:
-    """What is said of a trial whose processes failed, so often that it is not started again.
+    """Describe a trial that is not started again, because its processes failed too often.
 
     Args:
-        cause: what Ray says of the last time, if it does.
-        failures: how often, at least 1.
+        cause: Ray's description of the last failure, if any.
+        failures: number of failures, at least 1.
     """
     times = "once" if failures == 1 else f"{failures} times"
     if isinstance(cause, OutOfMemoryError):
@@ -165,9 +165,9 @@ def process_error(cause: BaseException | None, failures: int) -> str:
         why = "Ray cancelled it"
     elif isinstance(cause, ActorDiedError | ActorUnavailableError | WorkerCrashedError | NodeDiedError):
         why = (
-            "it ended without a word: killed from outside, for want of memory, or by the task's or the "
-            "agent's own code"
+            "it ended without an error: killed from outside, out of memory, or ended by the "
+            "task's or the agent's own code"
         )
     else:
-        why = f"{type(cause).__name__}: {first_line(cause)}" if cause else "nobody says why"
+        why = f"{type(cause).__name__}: {first_line(cause)}" if cause else "the reason is unknown"
     return f"its process failed {times}; the last time: {why}"

@@ -1,7 +1,7 @@
-"""A worker process of Ray Tune: runs one trial after the other.
+"""A worker process of Ray Tune, which runs one trial after the other.
 
-A trial's result depends on its spec alone, and importing torch anew costs as much as a small trial: so a
-process is used again.
+A trial's result depends only on its spec, and importing torch takes as long as a small trial, so processes
+are reused.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from recrl.orchestrator.spec import TrialSpec
 
 
 class TuneTrial(tune.Trainable):
-    """A worker process, as Tune sees it; each of its trials is one long step.
+    """Tune's interface to a worker process; each of its trials is one long step.
 
-    Tune hears of a trial only at its end: a report blocks until the driver has taken it, and whoever wants
-    to know more reads the files.
+    A trial reports to Tune only at its end, because a report blocks until the driver has received it.
+    Progress is in the files.
     """
 
     def setup(self, config: dict[str, Any]) -> None:
-        """Get ready for the first trial."""
+        """Prepare for the first trial."""
         self._take(config)
 
     def reset_config(self, new_config: dict[str, Any]) -> bool:
-        """Get ready for the next trial, in the same process."""
+        """Prepare for the next trial in the same process."""
         self._take(new_config)
         return True
 
@@ -41,8 +41,8 @@ class TuneTrial(tune.Trainable):
         """Run the trial to its end or until the sweep is stopped.
 
         Raises:
-            TeacherUnavailableError: the teacher is gone; Tune tries the trial again.
-            StorageError: the object store was down for too long; the same.
+            TeacherUnavailableError: the teacher does not answer; Tune tries the trial again.
+            StorageError: the object store was down for too long; Tune tries the trial again.
         """
         from recrl.orchestrator.trial.runner import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
@@ -68,7 +68,7 @@ class TuneTrial(tune.Trainable):
 
 
 def _given_gpu() -> AbstractContextManager[Any]:
-    """Agents made meanwhile live on the GPU that Ray gave this worker, if it gave one that can be used."""
+    """Make new agents on the GPU that Ray assigned to this worker, if it is usable."""
     if not ray.get_gpu_ids():
         return nullcontext()
     import torch  # noqa: PLC0415  (the driver does without)
@@ -77,5 +77,5 @@ def _given_gpu() -> AbstractContextManager[Any]:
 
 
 def spec_of(trial: Any) -> TrialSpec:
-    """The recrl trial that a Tune trial is."""
+    """Return the recrl trial of a Tune trial."""
     return TrialSpec.from_json(json.loads(trial.config["spec"]))

@@ -1,1 +1,1 @@
-"""Sweeps whose files are kept in an object store."""
+"""Sweeps in an object store."""

@@ -1,11 +1,11 @@
-"""A trial's commit as one object: its record, the rows that are new, and its checkpoint.
+"""A trial's commit as one object: its record, the new rows, and its checkpoint.
 
     <64 hex digits> <10 digits>        SHA-256 and length of the header
     header                            JSON: the TrialRecord, and the pieces that each file is made of
     spaces, then bytes                the pieces of this commit
 
-A store shows an object whole or not at all, so a commit is there whole or not at all. Rows that earlier
-commits of the attempt sent are named as pieces of their objects, not sent again.
+A store writes objects atomically, so a commit is complete or absent. Rows that earlier commits of the attempt
+sent are referred to as pieces of their objects, not sent again.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ COMMIT = re.compile(r"commit-\d{8}")
 
 @dataclass(frozen=True)
 class Piece:
-    """A run of bytes of a file, in a commit's object.
+    """Consecutive bytes of a file, in a commit's object.
 
     Attributes:
-        commit: name of the object, beside this one.
+        commit: name of the object, in the same folder.
         offset: of its first byte in the object.
         start: of its first byte in the file.
         length: bytes, at least 1.
-        sha256: of them, in hex.
+        sha256: of these bytes, in hex.
     """
 
     commit: str
@@ -50,7 +50,7 @@ class Piece:
 
     @property
     def end(self) -> int:
-        """The byte of the file after its last one."""
+        """End of the piece in the file."""
         return self.start + self.length
 
 
@@ -59,8 +59,8 @@ class Commit:
     """A set of files that belong together.
 
     Attributes:
-        record: where the trial stood.
-        files: the pieces of each file without a gap, by its path in the trial's folder.
+        record: of the trial.
+        files: the contiguous pieces of each file, by its path in the trial's folder.
     """
 
     record: TrialRecord
@@ -68,17 +68,17 @@ class Commit:
 
     @property
     def objects(self) -> frozenset[str]:
-        """The names of the objects that hold its pieces."""
+        """Names of the objects with its pieces."""
         return frozenset(piece.commit for pieces in self.files.values() for piece in pieces)
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON values; ``from_json`` is the inverse."""
+        """Return the commit as JSON values; ``from_json`` is the inverse."""
         files = {name: [asdict(piece) for piece in pieces] for name, pieces in self.files.items()}
         return {"format": FORMAT, "record": self.record.to_json(), "files": files}
 
     @classmethod
     def from_json(cls, value: Any) -> Self:
-        """Return what ``to_json`` wrote.
+        """Return the commit of ``to_json``.
 
         Raises:
             ValueError: it is no commit of this version.
@@ -93,7 +93,7 @@ class Commit:
             raise ValueError(f"no commit: {error}") from error
         for name, pieces in files.items():
             if name not in (*APPENDED, *WHOLE) and not CHECKPOINT.fullmatch(name):
-                raise ValueError(f"a commit names a file that no trial has: {name!r}")
+                raise ValueError(f"a commit names a file that trials do not have: {name!r}")
             if [piece.start for piece in pieces] != [0, *(piece.end for piece in pieces)][:-1]:
                 raise ValueError(f"a commit's pieces of {name} leave a gap")
             if not all(COMMIT.fullmatch(piece.commit) for piece in pieces):
@@ -111,9 +111,9 @@ def pack(
 
     Args:
         name: of the object.
-        record: where the trial stands.
+        record: of the trial.
         kept: the pieces of each file that earlier objects hold; every file has an entry.
-        new: of the files that have new bytes, where these begin in the file, and the bytes.
+        new: for files with new bytes, their offset in the file, and the bytes.
     """
     pieces = {
         file: Piece(name, 0, start, len(data), hashlib.sha256(data).hexdigest())
@@ -136,7 +136,7 @@ def unpack(read: Callable[[int, int], bytes]) -> Commit:
     """Read the header of a commit's object.
 
     Args:
-        read: returns the object's bytes from one position to another, fewer where it is shorter.
+        read: returns the object's bytes from one position to another, fewer if it is shorter.
 
     Raises:
         ValueError: it is not intact, or of another version.

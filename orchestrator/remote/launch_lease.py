@@ -1,10 +1,9 @@
-"""The lease of a launch: one object that says who runs a sweep, and when that one last said so.
+"""The lease of a launch: an object with the launch that runs a sweep, and its last sign of life.
 
-Two launches at once: the first creates ``launch.json``, the second is refused, where the store creates an
-object only once (S3, Google, Azure). That file of a launch that died is free after ``SILENT_SECONDS``, by
-the machines' clocks. Should two launches run all the same, one sees the other's name there within
-``BEAT_SECONDS`` and stops; until then they may do the same work twice, but never damage it: each attempt
-writes below its own name.
+With two launches, the first creates ``launch.json`` and the second is refused, if the store has exclusive
+creation (S3, Google, Azure). The lease of a dead launch is free after ``SILENT_SECONDS``, by the machines'
+clocks. If two launches run nevertheless, one of them sees the other's name within ``BEAT_SECONDS`` and stops.
+Until then they may repeat work, but do no damage: each attempt writes below its own name.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import StorageError, SweepBusyError
 from recrl.orchestrator.remote.object_store import ObjectStore
 
-LOOK_SECONDS = 5.0  # between two looks whether somebody asks to stop
+LOOK_SECONDS = 5.0  # between two checks for a stop request
 BEAT_SECONDS = 15.0  # between two signs of life of a launch
-EMPTY_SECONDS = 1.0  # after which what is being written is there
+EMPTY_SECONDS = 1.0  # time after which a write has become visible
 SILENT_SECONDS = 90.0  # without a sign of life, after which its sweep is free
 
 LAUNCH = "launch.json"
@@ -38,23 +37,23 @@ logger = logging.getLogger("recrl.sweep")
 
 
 class LaunchLease:
-    """Who runs a sweep in an object store."""
+    """Lease on a sweep in an object store."""
 
     def __init__(self, objects: ObjectStore) -> None:
-        """Hold nothing yet.
+        """Prepare the lease without holding it.
 
         Args:
-            objects: what lies below the sweep's folder.
+            objects: of the sweep's folder.
         """
         self._objects = objects
-        self._token = ""  # of the launch that this is, if it is one
+        self._token = ""  # the launch of this process, if any
 
     @contextmanager
     def held(self, stop: threading.Event) -> Iterator[None]:
-        """Be the one launch that runs the sweep; set ``stop`` when somebody asks for it, or has taken over.
+        """Hold the lease; set ``stop`` on a request or when another launch has taken over.
 
         Raises:
-            SweepBusyError: another one is.
+            SweepBusyError: another launch holds it.
             StorageError: the store cannot be read or written.
         """
         own = {
@@ -86,7 +85,7 @@ class LaunchLease:
         return _is_alive(holder) and holder.get("token") != self._token
 
     def request_stop(self) -> None:
-        """Ask the launch that runs the sweep, on whatever machine, to save its trials and end.
+        """Ask the launch that runs the sweep, on any machine, to save its trials and end.
 
         Raises:
             StorageError: the store cannot be written.
@@ -94,7 +93,7 @@ class LaunchLease:
         self._objects.write(STOP_REQUEST, b"stop\n")
 
     def is_held(self) -> bool:
-        """Whether a launch runs the sweep, on whatever machine.
+        """Whether a launch runs the sweep, on any machine.
 
         Raises:
             StorageError: the store cannot be read.
@@ -102,11 +101,11 @@ class LaunchLease:
         return _is_alive(self._holder())
 
     def _take(self, own: dict[str, Any]) -> None:
-        """Create ``launch.json``, in place of that of a dead launch if need be."""
+        """Create ``launch.json``, replacing that of a dead launch."""
         if self._is_created(own):
             return
         holder = self._holder()
-        if not holder:  # somebody is just about to write what it holds, or nobody ever will
+        if not holder:  # its content is about to be written, or never will be
             time.sleep(EMPTY_SECONDS)
             holder = self._holder()
         if holder.get("token") == own["token"]:
@@ -114,21 +113,22 @@ class LaunchLease:
         if _is_alive(holder):
             silent = max(0.0, time.time() - holder["at"])
             raise SweepBusyError(
-                f"{self._objects.uri}: this sweep is already being run by process {holder['pid']} on "
-                f"{holder['host']}, which said so {silent:.0f} seconds ago; wait for it or stop it (if it "
-                f"was killed, the sweep is free after {SILENT_SECONDS:.0f} seconds of silence)"
+                f"{self._objects.uri}: this sweep is already being run by process {holder['pid']} "
+                f"on {holder['host']}, whose last sign of life was {silent:.0f} seconds ago; wait "
+                "for it or stop it (if it was killed, the sweep is free after "
+                f"{SILENT_SECONDS:.0f} seconds of silence)"
             )
         self._objects.delete([LAUNCH])
         if not self._is_created(own):
             raise SweepBusyError(f"{self._objects.uri}: another process has begun to run this sweep just now")
 
     def _is_created(self, own: dict[str, Any]) -> bool:
-        """Create ``launch.json`` and look whether it is ours: not every store can create exclusively."""
+        """Create ``launch.json`` and read it back: not every store can create exclusively."""
         created = self._objects.create(LAUNCH, _beat(own))
         return created and self._holder().get("token") == own["token"]
 
     def _hold(self, own: dict[str, Any], stop: threading.Event, over: threading.Event) -> None:
-        """Go on saying that this launch lives, and listen."""
+        """Write signs of life, and check for requests."""
         spoke_at = time.monotonic()
         while not over.wait(LOOK_SECONDS):
             try:
@@ -137,16 +137,16 @@ class LaunchLease:
                 if time.monotonic() >= spoke_at + BEAT_SECONDS:
                     holder = self._holder()
                     if holder and holder.get("token") != own["token"]:
-                        logger.warning("%s: another launch has taken the sweep over", self._objects.uri)
+                        logger.warning("%s: another launch has taken over the sweep", self._objects.uri)
                         stop.set()
                         return
                     self._objects.write(LAUNCH, _beat(own))
                     spoke_at = time.monotonic()
-            except StorageError as error:  # whoever pulls says it
+            except StorageError as error:  # pulling reports the error
                 logger.debug("%s", error)
 
     def _holder(self) -> dict[str, Any]:
-        """Who runs the sweep, as last said; empty if nobody does."""
+        """Return the holder of the lease; empty if there is none."""
         try:
             value = json.loads(self._objects.read(LAUNCH) or b"{}")
         except ValueError:
@@ -159,22 +159,22 @@ def _beat(own: dict[str, Any]) -> bytes:
 
 
 def _is_alive(holder: dict[str, Any]) -> bool:
-    """Whether a launch that says so runs: it spoke lately, and its process is not known to be dead."""
+    """Whether a recorded launch runs: its sign of life is recent, and it is not known to be dead."""
     try:
         if time.time() - float(holder["at"]) > SILENT_SECONDS:
             return False
         if not _boot() or holder["boot"] != _boot():
             return True
-        os.kill(int(holder["pid"]), 0)  # signal 0 only asks
+        os.kill(int(holder["pid"]), 0)  # signal 0 only checks
     except (KeyError, TypeError, ValueError, ProcessLookupError):
         return False
     except PermissionError:
-        pass  # somebody else's process, so it is there
+        pass  # a process of another user, so it exists
     return True
 
 
 def _boot() -> str:
-    """Where and since when process numbers mean what they mean here; empty where nobody can say."""
+    """Return the scope of process ids: machine, boot and namespace; empty if unknown."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         return f"{boot} {os.readlink('/proc/self/ns/pid')}"

@@ -1,10 +1,10 @@
-"""An object store, as the little that is asked of one: read, write, create, list and delete whole objects.
+"""Object stores: read, write, create, list and delete whole objects.
 
-The only importer of fsspec, and so the one place that knows what S3, Google, Azure and the others are
-called. Assumes what they promise: an object is there whole or not at all, and whoever reads or lists after a
-write sees it. (In a folder behind ``file://`` objects are written beside and renamed.) Leaves out
-credentials: every machine has its own, where its fsspec package looks for them (environment, files, the
-machine's role). None is passed on, stored or printed, and an address that holds one is refused.
+The only module that imports fsspec, which has the protocols of S3, Google, Azure and others. Assumes their
+guarantees: objects are written atomically, and reads and lists see all earlier writes. With ``file://``
+objects are written to a temporary file and renamed. Leaves out credentials: every machine has its own, where
+fsspec finds them (environment, files, role). They are not passed on, stored or printed, and an address that
+contains one is refused.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fsspec.registry import known_implementations
 from recrl.orchestrator.errors import RecrlError, StorageError
 
 EXAMPLE = "s3://bucket/folder"
-FOLDERS = ("file", "local")  # where parents must be made before a file; a bucket must not be
+FOLDERS = ("file", "local")  # schemes where parents must be created before a file; a bucket must not be
 REASON_LENGTH = 200
 
 
@@ -34,10 +34,10 @@ class ObjectStore:
     """
 
     def __init__(self, uri: str) -> None:
-        """Look at nothing yet.
+        """Check the address, without access to the store.
 
         Raises:
-            RecrlError: the address is none, or names no kind of store that this machine has a package for.
+            RecrlError: the address is invalid, or the package for its kind of store is missing.
         """
         self.uri = _checked(uri)
         protocol = self.uri.partition("://")[0]
@@ -49,13 +49,13 @@ class ObjectStore:
         self._root = path.rstrip("/")
 
     def below(self, folder: str) -> ObjectStore:
-        """What lies in a folder of this one, over the same connections."""
+        """Return the store of a folder below, over the same connections."""
         child = copy.copy(self)
         child.uri, child._root = f"{self.uri}/{folder}", self._path(folder)
         return child
 
     def read(self, key: str) -> bytes | None:
-        """An object's bytes, or None if there is none.
+        """Read an object's bytes; None if it does not exist.
 
         Raises:
             StorageError: the store does not answer, or refuses.
@@ -63,7 +63,7 @@ class ObjectStore:
         return self.read_range(key, None, None)
 
     def read_range(self, key: str, start: int | None, end: int | None) -> bytes | None:
-        """An object's bytes from one position to another, fewer if it is shorter; None if there is none.
+        """Read an object's bytes from one position to another, fewer if it is shorter; None if missing.
 
         Raises:
             StorageError: the store does not answer, or refuses.
@@ -73,7 +73,7 @@ class ObjectStore:
         return None
 
     def write(self, key: str, data: bytes) -> None:
-        """Write an object whole, over whatever was there.
+        """Write a whole object, replacing an existing one.
 
         Raises:
             StorageError: the store does not answer, or refuses.
@@ -88,10 +88,10 @@ class ObjectStore:
             self._system.mv(beside, path)
 
     def create(self, key: str, data: bytes) -> bool:
-        """Write an object unless there is one, and say whether there was none.
+        """Create an object unless it exists; return whether it was created.
 
-        That only one of several at the same moment hears yes is the store's promise, not fsspec's: S3, Google
-        and Azure keep it by conditional writes. Where a store has none, this looks first and writes then.
+        That only one of several simultaneous calls succeeds is guaranteed by the store, not by fsspec: S3,
+        Google and Azure have conditional writes. For other stores this checks first and writes then.
 
         Raises:
             StorageError: the store does not answer, or refuses.
@@ -109,20 +109,20 @@ class ObjectStore:
         return True
 
     def keys_in(self, folder: str = "") -> list[str]:
-        """The keys of all objects in a folder and the folders below it, relative to it, in their order.
+        """List the keys of all objects below a folder, relative to it, in order.
 
         Raises:
             StorageError: the store does not answer, or refuses.
         """
         place = self._path(folder).rstrip("/")
         with self._speaking("cannot be listed", unless=FileNotFoundError):
-            self._system.invalidate_cache()  # others write here too
+            self._system.invalidate_cache()  # other processes write here, too
             found = self._system.find(place)
             return sorted(path[len(place) + 1 :] for path in found if path.startswith(f"{place}/"))
         return []
 
     def names(self, kind: Literal["file", "directory"]) -> list[str]:
-        """The names of the objects, or of the folders, right below the address, in their order.
+        """List the names of the objects, or of the folders, directly below the address, in order.
 
         Raises:
             StorageError: the store does not answer, or refuses.
@@ -135,7 +135,7 @@ class ObjectStore:
         return []
 
     def delete(self, keys: Iterable[str]) -> None:
-        """Delete objects; those that are not there any more do not matter.
+        """Delete objects; missing ones are ignored.
 
         Raises:
             StorageError: the store does not answer, or refuses.
@@ -145,16 +145,16 @@ class ObjectStore:
                 self._system.rm_file(self._path(key))
 
     def probe(self) -> None:
-        """Write, read, list and delete a small object, so that what is wrong is known before any work.
+        """Write, read, list and delete a small object, so that problems are known before any work.
 
         Raises:
-            StorageError: any of it fails.
+            StorageError: one of these fails.
         """
         key, data = f"probe-{secrets.token_hex(8)}", secrets.token_bytes(16)
         self.write(key, data)
         try:
             if self.read(key) != data or key not in self.keys_in():
-                raise StorageError(f"{self.uri}: what was written there a moment ago is not there")
+                raise StorageError(f"{self.uri}: an object that was written a moment ago is missing")
         finally:
             self.delete([key])
 
@@ -163,7 +163,7 @@ class ObjectStore:
 
     @contextmanager
     def _speaking(self, what: str, unless: type[Exception] | None = None) -> Iterator[None]:
-        """Turn whatever a package raises into one sentence, but for what ends the body without one."""
+        """Turn a package's errors into one sentence, except those that end the process."""
         try:
             yield
         except RecrlError:
@@ -174,15 +174,15 @@ class ObjectStore:
 
 
 def _checked(uri: str) -> str:
-    """The address, if it is one."""
+    """Return the address, if it is valid."""
     protocol, separator, path = uri.partition("://")
     if not protocol or not separator or not path.strip("/") or "::" in uri:
         raise RecrlError(f"the storage must be an address such as {EXAMPLE}, got {uri!r}")
-    if re.match(r"[^/@]*:[^@]*@", path) or "?" in uri:  # there are slashes in Amazon's secrets
+    if re.match(r"[^/@]*:[^@]*@", path) or "?" in uri:  # Amazon's secrets may contain slashes
         hidden = re.sub(r"(://)[^@]*@|\?.*", r"\1", uri)
         raise RecrlError(
-            f"{hidden}: credentials do not belong into the address; give them as {protocol}:// wants "
-            "them, in the environment or its own files, on every machine"
+            f"{hidden}: credentials do not belong into the address; provide them as {protocol}:// "
+            "requires, in the environment or its own files, on every machine"
         )
     return uri.rstrip("/")
 
@@ -191,7 +191,7 @@ def _require_package(uri: str, protocol: str) -> None:
     """Load the package for a kind of store.
 
     Raises:
-        RecrlError: there is no such kind, or no such package.
+        RecrlError: there is no such kind, or its package is missing.
     """
     try:
         fsspec.get_filesystem_class(protocol)
@@ -206,13 +206,13 @@ def _require_package(uri: str, protocol: str) -> None:
 
 
 def _package(protocol: str) -> str:
-    """The package that a kind of store is in, empty if that is fsspec itself."""
+    """Return the package for a kind of store; empty if it is fsspec itself."""
     package: str = known_implementations[protocol]["class"].partition(".")[0]
     return "" if package == "fsspec" else package
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of an error, without what an address has behind a question mark: a signature, maybe."""
+    """Return the first line of an error, without queries in addresses, which may contain signatures."""
     text = next(iter(str(error).splitlines()), "")
     text = re.sub(r"\?[^\s'\")]*", "", re.sub(r"(://)[^\s@]*@", r"\1", text))
     return f"{type(error).__name__}: {text[:REASON_LENGTH]}" if text else type(error).__name__

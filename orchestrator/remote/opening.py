@@ -1,4 +1,4 @@
-"""Choose where a sweep is kept. fsspec is imported only where an object store is used."""
+"""Choose the storage of a sweep. fsspec is imported only if an object store is used."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from recrl.orchestrator.places import SweepPlace
 
 
 def sweep_place(store: SweepStore, given: str | None = None) -> SweepPlace:
-    """Return where a sweep is kept: as given, as its folder remembers, or in its folder.
+    """Return a sweep's place: the given address, the address stored in its folder, or the folder.
 
     Args:
         store: the sweep's folder on this machine.
         given: the address of an object store, or None.
 
     Raises:
-        RecrlError: the address is none, needs a package that is not installed, or cannot be read.
+        RecrlError: the address is invalid, needs a package that is not installed, or cannot be read.
     """
     if not given and not store.storage_path.exists():
         return SweepPlace(store)

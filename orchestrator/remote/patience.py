@@ -9,20 +9,20 @@ from collections.abc import Callable
 
 from recrl.orchestrator.errors import StorageError
 
-FIRST_PAUSE_SECONDS = 1.0  # before what failed is tried again; doubled each time
+FIRST_PAUSE_SECONDS = 1.0  # before the first repetition; doubled each time
 LONGEST_PAUSE_SECONDS = 60.0
 PATIENCE_SECONDS = 900.0  # for a store that is down when a trial begins or has ended
-STOPPING_SECONDS = 60.0  # the same, once the sweep is to stop
+STOPPING_SECONDS = 60.0  # the same, once the sweep is stopping
 
 logger = logging.getLogger("recrl.trial")
 
 
 def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
-    """Do what needs the store, again and again while that is down, with growing pauses.
+    """Repeat an action while the store is down, with growing pauses.
 
     Args:
-        act: what to do; may be done more than once.
-        should_stop: once true, for ``STOPPING_SECONDS`` more.
+        act: the action; may be repeated.
+        should_stop: once true, only for ``STOPPING_SECONDS`` more.
 
     Raises:
         StorageError: it was down for ``PATIENCE_SECONDS``.

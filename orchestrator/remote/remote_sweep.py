@@ -1,15 +1,15 @@
-"""A sweep that is kept in an object store, as seen from the machine that launches or looks at it.
+"""A sweep in an object store, as seen from a machine that launches or reads it.
 
     <address>/<sweep>/
         sweep.json, grid.yaml, trials.jsonl     as in a sweep's folder
         trials/                                 see ``remote_trial``
-        launch.json                             who runs the sweep, see ``launch_lease``
-        stop.request                            there while somebody asks that one to stop
-        stop-<run>                              tells the workers of one run to go on, or to stop
+        launch.json                             the launch that runs the sweep, see ``launch_lease``
+        stop.request                            exists while that launch is asked to stop
+        stop-<run>                              stop signal for the workers of one run
 
-The sweep's folder on this machine is a copy of it: plan, status, figures and MLflow read the copy as they
-read any sweep's folder. It may be deleted at any time; MLflow's default database, figures, evaluations and
-videos are in it alone.
+The sweep's folder on this machine is a copy, which plan, status, figures and MLflow read like any sweep's
+folder. It may be deleted at any time, but MLflow's default database, figures, evaluations and videos are only
+there.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from recrl.orchestrator.remote.stop_object import StopObject
 from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
-PULL_SECONDS = 10.0  # between two looks at the trials that run
+PULL_SECONDS = 10.0  # between two reads of the running trials
 PULLS_AT_ONCE = 8
 
 STORAGE_FORMAT = 2
@@ -53,15 +53,15 @@ class RemoteSweep(SweepPlace):
     Attributes:
         uri: the address of all sweeps there.
         store: the sweep's folder on this machine, a copy.
-        objects: what lies below the sweep's folder in the object store.
-        lease: who runs the sweep.
+        objects: of the sweep's folder in the object store.
+        lease: of the launch that runs the sweep.
     """
 
     def __init__(self, uri: str, store: SweepStore) -> None:
-        """Check the address; the store is not asked yet.
+        """Check the address, without access to the store.
 
         Raises:
-            RecrlError: the address is none, or needs a package that is not installed.
+            RecrlError: the address is invalid, or needs a package that is not installed.
         """
         super().__init__(store)
         root = ObjectStore(uri)
@@ -77,7 +77,7 @@ class RemoteSweep(SweepPlace):
         return self.objects.uri
 
     def prepare(self) -> None:
-        """Try the object store, and make the folder the copy of this sweep.
+        """Test the object store, and make the folder the copy of this sweep.
 
         Raises:
             RecrlError: the store cannot be used, or the folder is not its copy.
@@ -86,22 +86,23 @@ class RemoteSweep(SweepPlace):
         self.mark()
 
     def require_reruns(self) -> None:
-        """Refuse to run trials again.
+        """Raise an error: trials in an object store cannot be run again.
 
         Raises:
             RecrlError: always.
         """
         raise RecrlError(
-            f"{self.uri}: trials of a sweep that is kept there are not run again: give the sweep another "
-            "name; if only its folder here is damaged, delete that, and it is fetched again"
+            f"{self.uri}: trials of a sweep in an object store are not run again: give the sweep "
+            "another name; if only its folder here is damaged, delete that, and it is fetched "
+            "again"
         )
 
     def held(self, stop: threading.Event) -> AbstractContextManager[None]:
-        """See ``SweepPlace`` and ``LaunchLease.held``."""
+        """Hold the sweep as the only launch on all machines; see ``LaunchLease.held``."""
         return self.lease.held(stop)
 
     def request_stop(self) -> Callable[[], bool]:
-        """See ``SweepPlace``; the launch may run on another machine."""
+        """Ask the launch that runs the sweep, on any machine, to save its trials and end."""
         if self.store.is_locked() or not self.lease.is_held():
             return super().request_stop()
         self.lease.request_stop()
@@ -111,7 +112,7 @@ class RemoteSweep(SweepPlace):
         """Make the folder the copy of this sweep.
 
         Raises:
-            RecrlError: it is a sweep of its own, or the copy of another.
+            RecrlError: it is a sweep itself, or the copy of another.
         """
         store, known = self.store, remembered_uri(self.store)
         if known is None and (store.info_path.exists() or store.trials_folder.exists()):
@@ -129,7 +130,7 @@ class RemoteSweep(SweepPlace):
             write_sealed(store.storage_path, {"name": store.name, "uri": self.uri}, version=STORAGE_FORMAT)
 
     def trial(self, name: str) -> RemoteTrial:
-        """Return the trial of a folder's name; it need not be there yet."""
+        """Return the trial of a folder's name; it need not exist yet."""
         return RemoteTrial(self.objects.below(f"trials/{name}"), name)
 
     def working_copy(
@@ -139,7 +140,7 @@ class RemoteSweep(SweepPlace):
         return working_copy(self.trial(spec.folder_name), spec, should_stop)
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:
-        """See ``SweepPlace`` and ``StopObject.open``."""
+        """Return the stop signal of a new run; see ``StopObject.open``."""
         return StopObject.open(self.objects)
 
     def stop_sign_at(self, place: str) -> StopSign:
@@ -147,13 +148,13 @@ class RemoteSweep(SweepPlace):
         return StopObject(self.objects, place)
 
     def refresh(self, *, checkpoints: bool = False) -> None:
-        """Bring the folder up to date, or say that it is not.
+        """Bring the folder up to date, or log that it is not.
 
         Raises:
             StorageError: the store cannot be read, and the folder is empty.
         """
         if self.store.is_locked():
-            return  # the launch that runs here does it all the time
+            return  # the launch on this machine does it regularly
         try:
             if self.objects.read("sweep.json") is not None:
                 self.mark()
@@ -161,13 +162,13 @@ class RemoteSweep(SweepPlace):
         except StorageError as error:
             if not self.store.info_path.exists():
                 raise
-            logger.warning("%s; what follows is as of the last look", error)
+            logger.warning("%s; the following is from the last update of the copy", error)
 
     def pull(self, *, checkpoints: bool = False) -> None:
         """Bring the folder up to date.
 
         Args:
-            checkpoints: whether to bring those of trials that still run; those of finished ones come always.
+            checkpoints: whether to include those of running trials; those of finished ones always are.
 
         Raises:
             StorageError: the store cannot be read.
@@ -207,31 +208,31 @@ class RemoteSweep(SweepPlace):
             self.trial(spec.folder_name).download(self.store.trial(spec), checkpoints=False)
 
     def is_out_of_touch(self, silence_seconds: float) -> bool:
-        """Return whether the folder is so old that a silence of so many seconds in it says nothing.
+        """Return whether the folder is too old to conclude from a silence of this many seconds.
 
-        A third of them: after that long an outage, nodes may pause as long before they speak again. One look
-        at a thousand running trials takes longer than the pause between two.
+        The bound is a third of the silence: after an outage of that length, nodes may pause as long before
+        they write again. Reading a thousand running trials takes longer than the pause between two reads.
         """
         return time.monotonic() - self._in_touch_at > max(3.0 * PULL_SECONDS, silence_seconds / 3.0)
 
     @contextmanager
     def kept_up_to_date(self, stop: threading.Event, *, every: float = PULL_SECONDS) -> Iterator[None]:
-        """Pull the trials again and again, from a thread beside the body, and once more after it.
+        """Pull the trials regularly in a background thread during the body, and once more after it.
 
         Args:
-            stop: once set, a store that is down is not waited for long.
-            every: seconds between two times; more while the store is down.
+            stop: once set, the wait for a store that is down is short.
+            every: seconds between two pulls; more while the store is down.
 
         Raises:
             StorageError: the store cannot be read at the end.
         """
-        follow = partial(repeatedly, self._pull_trials, every=every, hint="the trials go on")
+        follow = partial(repeatedly, self._pull_trials, every=every, hint="the trials continue")
         with beside(follow, name="local copy"):
             yield
         patiently(self._pull_trials, stop.is_set)
 
     def publish(self) -> None:
-        """Send what the folder says of the sweep itself.
+        """Send the sweep's own files.
 
         Raises:
             StorageError: the store cannot be written.
@@ -240,13 +241,13 @@ class RemoteSweep(SweepPlace):
             self.objects.write(path.name, path.read_bytes())
 
     def settle(self, specs: Sequence[TrialSpec]) -> None:
-        """Send what only this machine knows of trials: that their process died without a word.
+        """Send the status of trials whose processes died, which only this machine knows.
 
-        Nothing is sent once another launch has taken the sweep over: its attempts may be at work on them.
+        Nothing is sent once another launch has taken over the sweep: its attempts may be running.
 
         Args:
-            specs: the trials; the folder says by ``TrialStore.set_status`` how they ended, and nobody works
-                on them now.
+            specs: the trials; none of them runs, and the folder has their status from
+                ``TrialStore.set_status``.
 
         Raises:
             StorageError: the store cannot be read or written.
@@ -265,7 +266,7 @@ class RemoteSweep(SweepPlace):
         remote = self.trial(spec.folder_name)
         remote.download(trial, checkpoints=True)
         if trial.record() != record:
-            return  # it said itself how it ended
+            return  # its own process has recorded its end
         upload = Upload(remote, trial)
         writer = trial.begin(spec)
         writer.close(record.status, error=record.error)
@@ -276,17 +277,17 @@ class RemoteSweep(SweepPlace):
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Be the only process and thread that writes the copy."""
+        """Hold the lock of the copy, as the only process and thread that writes it."""
         self.store.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.store.folder / ".pull"):
             yield
 
 
 def remembered_uri(store: SweepStore) -> str | None:
-    """Return the address that a folder is a copy of, None if it is none.
+    """Return the address of which a folder is a copy; None if it is no copy.
 
     Raises:
-        StorageError: the file that says it is damaged.
+        StorageError: the file with the address is damaged.
     """
     try:
         kept = read_sealed(store.storage_path, version=STORAGE_FORMAT)
@@ -296,26 +297,26 @@ def remembered_uri(store: SweepStore) -> str | None:
         return None
     except StorageError as error:
         raise type(error)(
-            f"{store.name}: {error}, so that nobody knows where the sweep is kept; delete it and give "
+            f"{store.name}: {error}, so that the sweep's address is unknown; delete it and give "
             "--storage URI again"
         ) from error
     return str(kept["uri"])
 
 
 def sweeps_at(uri: str) -> list[str]:
-    """Return the names of the sweeps that are kept at an address.
+    """Return the names of the sweeps at an address.
 
     Raises:
-        RecrlError: the address is none, or the store cannot be read.
+        RecrlError: the address is invalid, or the store cannot be read.
     """
     root = ObjectStore(uri)
     return [name for name in root.names("directory") if root.read(f"{name}/sweep.json") is not None]
 
 
 def _is_new(keys: list[str], before: list[str] | None) -> bool:
-    """Return whether a trial of these keys may have changed since it had those before.
+    """Return whether a trial with these keys may have changed since an earlier list of keys.
 
-    An attempt at work changes its sign of life in place; all else has a key of its own.
+    A running attempt changes its sign of life in place; every other change adds a key.
     """
     return keys != before or any(key.endswith(f"/{ALIVE}") for key in keys)
 

@@ -1,18 +1,18 @@
-"""A trial that is kept in an object store: what is there, and its way into a folder.
+"""A trial in an object store: its objects, and their download to a folder.
 
     <address>/<sweep>/trials/<trial>/<attempt>-<token>/
         commit-<number>     record, new rows and checkpoint: see ``commit``
         alive.json          while the attempt works: its record, every few seconds
 
-A trial works in a folder of the machine that it runs on, as any trial does; ``upload`` sends each commit.
-Rules. Readers believe of a commit only what its lengths and sums confirm: what was cut short is not there.
-Every attempt writes below its own name and depends on no other, so what a node writes that comes back from
-the dead damages nobody, and is not read: only the newest attempt with a commit is. An attempt begins with the
-newest commit of those before it, which gives the bytes of a trial that never moved, and says so by a commit
-of its own; then it clears away the others. An attempt that finds a newer one ends itself.
+A trial runs in a folder of its machine, like any trial; ``upload`` sends each commit. Rules. Readers check
+the lengths and digests of a commit; a truncated commit is ignored. Every attempt writes below its own name
+and depends on no other. So late writes of a node that was lost do no damage and are not read: only the newest
+attempt with a commit is. An attempt starts from the newest commit of earlier ones, so that the results are
+those of a trial that never moved. It makes a commit of its own, then deletes the others. An attempt that
+finds a newer one ends.
 
-A store that is down stops no trial: what could not be sent is sent later, and a trial is complete when its
-last commit is there.
+Trials continue while a store is down. Unsent commits are sent later, and a trial is complete when its last
+commit is in the store.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from recrl.orchestrator.remote.commit import APPENDED, CHECKPOINT, COMMIT, Commi
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.spec import TrialState
 
-LOOKS = 3  # for a newer commit, before one that is not intact is called damaged
+LOOKS = 3  # wait for a newer commit, before a damaged one is reported
 
 ALIVE = "alive.json"
 PULLED = ".pulled.json"
@@ -48,7 +48,7 @@ class RemoteTrial:
     """One trial in an object store.
 
     Attributes:
-        objects: what lies below the trial's folder.
+        objects: of the trial's folder.
         name: ``TrialSpec.folder_name``.
     """
 
@@ -57,7 +57,7 @@ class RemoteTrial:
         self.name = name
 
     def take_up(self, trial: TrialStore) -> None:
-        """Bring what the newest commit names into an empty folder, for another attempt.
+        """Download the newest commit to an empty folder, for another attempt.
 
         Raises:
             StorageError: the store cannot be read.
@@ -66,22 +66,22 @@ class RemoteTrial:
         commit = self._pull(trial, keys, checkpoints=True)
         record = commit.record if commit else TrialRecord()
         begun = [int(attempt.partition("-")[0]) for attempt in attempts_in(keys)]
-        # the next attempt is to be the newest, also where one before it never came to a commit
+        # the next attempt must be the newest, even if an earlier one made no commit
         record = replace(record, attempt=max([record.attempt, *begun]))
         if record.attempt:
             trial.folder.mkdir(parents=True, exist_ok=True)
             trial.write_record(record)
 
     def download(self, trial: TrialStore, keys: Sequence[str] | None = None, *, checkpoints: bool) -> None:
-        """Make a folder show the newest commit, and how far the trial has come since.
+        """Bring a folder up to the newest commit, and to the trial's progress since.
 
-        What was said here of a running attempt from outside (``TrialStore.set_status``) stands until that one
-        says itself how it ended, or a newer one begins.
+        A status that this machine set for a running attempt (``TrialStore.set_status``) remains until the
+        attempt records its own end, or a newer one begins.
 
         Args:
-            trial: the folder; only this ever writes there, but for ``set_status``.
-            keys: what there is below the trial's folder, if that is known.
-            checkpoints: whether to bring the checkpoint of a trial that still runs.
+            trial: the folder; only this method and ``set_status`` write there.
+            keys: of the objects in the trial's folder, if known.
+            checkpoints: whether to include the checkpoint of a running trial.
 
         Raises:
             StorageError: the store cannot be read.
@@ -107,10 +107,10 @@ class RemoteTrial:
                 trial.write_record(record)
 
     def _pull(self, trial: TrialStore, keys: Sequence[str], *, checkpoints: bool) -> Commit | None:
-        """Bring the files of the newest intact commit; None if there is none.
+        """Download the files of the newest intact commit; None if there is none.
 
-        One that is not intact may have been cleared away meanwhile, because there is a newer one: only
-        where that is not so, it is passed over for the one before it.
+        A commit that is not intact may just have been deleted in favour of a newer one. Only if that is not
+        the case, the previous commit is used.
         """
         for tries_left in range(LOOKS - 1, -1, -1):
             commits = _commits(keys)
@@ -119,14 +119,14 @@ class RemoteTrial:
                     return self._pull_commit(trial, key, checkpoints=checkpoints)
                 except ValueError as error:
                     if tries_left == 0:
-                        logger.warning("%s/%s: passed over: %s", self.objects.uri, key, error)
+                        logger.warning("%s/%s: skipped: %s", self.objects.uri, key, error)
             if not commits:
                 return None
             keys = self.objects.keys_in()
         return None
 
     def _pull_commit(self, trial: TrialStore, key: str, *, checkpoints: bool) -> Commit:
-        """Bring the files of one commit, all or none; ValueError if it is not intact."""
+        """Download the files of one commit, all or none; ValueError if it is not intact."""
         before, attempt = _Pulled.of(trial), key.partition("/")[0]
         commit = before.commit if before.key == key else unpack(partial(self._read, key))
         have = before.commit.files if before.key.startswith(f"{attempt}/") else {}
@@ -167,11 +167,11 @@ class RemoteTrial:
 
 @dataclass(frozen=True)
 class _Pulled:
-    """What was last brought into a folder.
+    """The commit that was last downloaded to a folder.
 
     Attributes:
         key: of the commit; empty if there was none.
-        commit: itself.
+        commit: the commit.
     """
 
     key: str
@@ -179,7 +179,7 @@ class _Pulled:
 
     @classmethod
     def of(cls, trial: TrialStore) -> Self:
-        """Return what the folder remembers."""
+        """Read it from the folder."""
         try:
             value = json.loads((trial.folder / PULLED).read_text())
             return cls(value["key"], Commit.from_json(value["commit"]))
@@ -187,7 +187,7 @@ class _Pulled:
             return cls("", Commit(TrialRecord(), {}))
 
     def write(self, trial: TrialStore) -> None:
-        """Remember it."""
+        """Store it in the folder."""
         trial.folder.mkdir(parents=True, exist_ok=True)
         write_json(trial.folder / PULLED, {"key": self.key, "commit": self.commit.to_json()})
 
@@ -195,13 +195,13 @@ class _Pulled:
 def _missing(
     trial: TrialStore, file: str, pieces: tuple[Piece, ...], have: tuple[Piece, ...] | None
 ) -> list[Piece] | None:
-    """Return the pieces of a file that a folder lacks; None if it lacks nothing.
+    """Return the pieces of a file that are missing in a folder; None if it is complete.
 
     Args:
         trial: the folder.
         file: its path in the folder.
-        pieces: of which it is to be made.
-        have: of which it is made, as the same attempt left it; None if it is not of that attempt.
+        pieces: of the complete file.
+        have: the present pieces of the same attempt; None if the file is of another attempt.
     """
     size = size_of(trial, file)
     is_there = size >= _length(pieces) and (trial.folder / file).exists()
@@ -213,7 +213,7 @@ def _missing(
 
 
 def _same(some: Sequence[Piece], others: Sequence[Piece]) -> bool:
-    """Return whether pieces, wherever they are kept, are the same bytes."""
+    """Return whether two lists of pieces, possibly in different objects, are the same bytes."""
 
     def content(pieces: Sequence[Piece]) -> list[tuple[int, str]]:
         return [(piece.start, piece.sha256) for piece in pieces]
@@ -232,7 +232,7 @@ def attempts_in(keys: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _commits(keys: Sequence[str]) -> list[str]:
-    """Return the keys of all commits, those of the newest attempt first, and its newest first."""
+    """Return the keys of all commits: the newest attempt first, and its newest commit first."""
     found = [
         f"{attempt}/{name}"
         for attempt, names in attempts_in(keys).items()
@@ -242,25 +242,25 @@ def _commits(keys: Sequence[str]) -> list[str]:
 
 
 def attempt_of(record: TrialRecord) -> str:
-    """Return the name of the attempt that a record is of."""
+    """Return the name of a record's attempt."""
     return f"{record.attempt:06d}-{record.token}"
 
 
 def _with_life(record: TrialRecord, sign: bytes | None) -> TrialRecord:
-    """What a sign of life adds to the record of the last commit: all but which bytes are there."""
+    """Return the record of the last commit with the newer sign of life, except for committed extents."""
     try:
         alive = TrialRecord.from_json(json.loads(sign or b"null"))
     except (ValueError, KeyError, TypeError):
-        return record  # it was cleared away, or cut short: there will be another
+        return record  # it was deleted or truncated: a newer one will follow
     if alive.token == record.token and alive.heartbeat < record.heartbeat:
         return record
     return replace(alive, committed=record.committed, digests=record.digests, checkpoint=record.checkpoint)
 
 
 def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
-    """Put bytes into a file: behind those that are there, or in place of the whole file."""
+    """Append bytes to a file, or replace the whole file."""
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-        raise StorageError(f"{trial.folder}: what is kept of it names a file outside it: {name!r}")
+        raise StorageError(f"{trial.folder}: its object names a file outside it: {name!r}")
     path = trial.folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     if start == 0:
@@ -276,6 +276,6 @@ def _length(pieces: Sequence[Piece]) -> int:
 
 
 def size_of(trial: TrialStore, name: str) -> int:
-    """Return the size of a file in a trial's folder, 0 if it is not there."""
+    """Return the size of a file in a trial's folder, 0 if it is missing."""
     path = trial.folder / name
     return path.stat().st_size if path.exists() else 0

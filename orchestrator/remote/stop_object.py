@@ -1,4 +1,4 @@
-"""An object by which one run of a sweep tells its workers to save and stop."""
+"""An object by which one run of a sweep signals its workers to save and stop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ logger = logging.getLogger("recrl.sweep")
 
 
 class StopObject(StopSign):
-    """A stop sign in the object store; its place is the object's key, below the sweep."""
+    """Stop signal in the object store; its place is the object's key, relative to the sweep's address."""
 
     question_seconds = 5.0
 
@@ -27,7 +27,7 @@ class StopObject(StopSign):
     @classmethod
     @contextmanager
     def open(cls, objects: ObjectStore) -> Iterator[StopObject]:
-        """That of a new run; whatever may be left of earlier runs is told to stop.
+        """Make the stop object of a new run; workers of earlier runs are stopped.
 
         Raises:
             StorageError: the store cannot be written.
@@ -44,7 +44,7 @@ class StopObject(StopSign):
                 logger.warning("%s", error)
 
     def set(self) -> None:
-        """Tell the workers to stop; tried again by whoever calls again."""
+        """Signal the workers to stop; after an error the caller calls again."""
         if self._answer:
             return
         try:
@@ -54,7 +54,7 @@ class StopObject(StopSign):
             logger.debug("%s", error)
 
     def _says_stop(self) -> bool:
-        """Look at the object; no answer is none."""
+        """Read the object; no answer means no."""
         try:
             return self._objects.read(self.place) != b"go on\n"
         except StorageError as error:

@@ -1,4 +1,4 @@
-"""Send the commits of an attempt at a trial to the object store in which the trial is kept."""
+"""Upload the commits of an attempt at a trial to the object store."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from recrl.orchestrator.remote.patience import patiently
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial, attempt_of, attempts_in, size_of
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
-LOOK_SECONDS = 0.5  # between two looks at the trial's folder
+LOOK_SECONDS = 0.5  # between two checks of the trial's folder
 ALIVE_SECONDS = 15.0  # between two signs of life
-KEPT_COMMITS = 2  # a reader may still be at the one before the last
+KEPT_COMMITS = 2  # a reader may still use the last but one
 
 ROWS = ("episodes.csv", "updates.csv", "events.jsonl")
 
@@ -35,14 +35,14 @@ logger = logging.getLogger("recrl.trial")
 
 
 class Upload:
-    """An attempt's way from the folder in which it works to the store."""
+    """Upload of an attempt from its folder to the store."""
 
     def __init__(self, remote: RemoteTrial, trial: TrialStore) -> None:
-        """Begin with whatever attempt takes the trial next (``TrialStore.begin``).
+        """Prepare the upload of the next attempt (``TrialStore.begin``).
 
         Args:
-            remote: where to.
-            trial: where from; as ``RemoteTrial.take_up`` left it.
+            remote: the target.
+            trial: the source, after ``RemoteTrial.take_up``.
         """
         self._remote = remote
         self._trial = trial
@@ -54,7 +54,7 @@ class Upload:
         self._spoke_at = float("-inf")
 
     def follow(self) -> None:
-        """Send what is new, if anything is, and now and then a sign of life.
+        """Send new commits, if any, and regularly a sign of life.
 
         Raises:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
@@ -69,7 +69,7 @@ class Upload:
             self.push()
 
     def finish(self) -> None:
-        """Send the rest, after the attempt's end.
+        """Send the remaining commits, after the attempt's end.
 
         Raises:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
@@ -78,21 +78,21 @@ class Upload:
         record = self._trial.stated()
         if not record.token or record.token == self._before:
             return
-        self._speak(replace(record, heartbeat=time.time()))  # to send much takes long
+        self._speak(replace(record, heartbeat=time.time()))  # uploads may take long
         self.push()
         self._remote.objects.delete([f"{attempt_of(record)}/{ALIVE}"])
 
     def push(self) -> None:
-        """Send a commit: a set of files as of this moment.
+        """Send a commit of the present files.
 
         Raises:
-            StorageError: the store cannot be written; the commit before stands.
+            StorageError: the store cannot be written; the previous commit is intact.
             LostLeaseError: a newer attempt runs the trial.
         """
         record, kept, new = self._capture()
         attempt = attempt_of(record)
         others = self._other_attempts(attempt)
-        self._number += 1  # also if this fails: a reader may have it, and looks at no name a second time
+        self._number += 1  # also if this fails: a reader may have it, so names are not reused
         name = f"commit-{self._number:08d}"
         commit, data = pack(name, record, kept, new)
         self._written.add(name)
@@ -102,20 +102,20 @@ class Upload:
         self._clear(attempt, others)
 
     def revoke(self) -> None:
-        """Take the trial's lease back, so that its attempt ends."""
+        """Revoke the trial's lease, so that its attempt ends."""
         self._trial.set_status(TrialState.WAITING)
 
     def _speak(self, record: TrialRecord) -> None:
-        """Claim the trial, and say that it lives. That it is over only a commit may say."""
+        """Send a sign of life. Only a commit may record the end."""
         said = replace(record, status=TrialState.RUNNING)
         self._remote.objects.write(f"{attempt_of(record)}/{ALIVE}", _json(said.to_json()))
         self._spoke_at = time.monotonic()
 
     def _capture(self) -> tuple[TrialRecord, dict[str, tuple[Piece, ...]], dict[str, tuple[int, bytes]]]:
-        """Return the record, the pieces that were sent before, and what is new, while nobody commits.
+        """Return the record, the sent pieces and the new bytes; the caller holds the trial's lock.
 
-        The rows are those of the newest checkpoint: of a commit that a full disk broke off, the record may
-        not know yet.
+        The rows are those of the newest checkpoint: if a full disk interrupted a commit, the record may be
+        older.
         """
         with self._trial.locked():
             record = self._trial.stated()
@@ -143,13 +143,13 @@ class Upload:
                 new[name] = (start, file.read(end - start))
 
     def _kept(self, name: str, length: int) -> tuple[tuple[Piece, ...], int]:
-        """Return the pieces of a row file that are not sent again, and where what is sent begins.
+        """Return the kept pieces of a row file, and the offset of the bytes to send.
 
-        A new piece takes in those before it that are no longer than it: n commits leave about log2(n)
-        pieces, and each byte is sent about log2(n) times at most.
+        A new piece includes earlier ones that are not longer. So n commits leave about log2(n) pieces, and
+        each byte is sent at most about log2(n) times.
         """
         pieces = list(self._commits[-1][1].files.get(name, ())) if self._commits else []
-        if pieces and pieces[-1].end > length:  # cut back: not what was sent
+        if pieces and pieces[-1].end > length:  # truncated: not the sent bytes
             pieces.clear()
         start = pieces[-1].end if pieces else 0
         if start < length:
@@ -165,7 +165,7 @@ class Upload:
         return [f"{other}/{name}" for other, names in others.items() if other != attempt for name in names]
 
     def _clear(self, attempt: str, others: Sequence[str]) -> None:
-        """Delete what none of the last commits needs, and the attempts before this one."""
+        """Delete objects that the last commits do not need, and earlier attempts."""
         spare = self._written.difference(*({name, *commit.objects} for name, commit in self._commits))
         self._remote.objects.delete([*(f"{attempt}/{name}" for name in sorted(spare, reverse=True)), *others])
         self._written -= spare
@@ -175,18 +175,18 @@ class Upload:
 def working_copy(
     remote: RemoteTrial, spec: TrialSpec, should_stop: Callable[[], bool]
 ) -> Iterator[TrialStore]:
-    """A folder on this machine for one attempt at a trial that is kept in an object store.
+    """Yield a folder on this machine for one attempt at a trial in an object store.
 
-    It holds what the attempts before left. What the body commits there is sent meanwhile, what is left at the
-    end: this returns when all of it is there.
+    It contains the files of earlier attempts. Commits of the body are uploaded meanwhile, the remaining ones
+    at the end.
 
     Args:
-        remote: where the trial is kept.
+        remote: the trial in the store.
         spec: the trial.
-        should_stop: once true, a store that is down is waited for no longer than ``STOPPING_SECONDS``.
+        should_stop: once true, the wait for a store that is down is at most ``STOPPING_SECONDS``.
 
     Raises:
-        StorageError: the store is down, and was for ``PATIENCE_SECONDS``; its last commit stands.
+        StorageError: the store was down for ``PATIENCE_SECONDS``; its last commit is intact.
     """
     with scratch_folder(tempfile.gettempdir()) as folder:
         trial = TrialStore(folder / spec.folder_name)
@@ -195,14 +195,14 @@ def working_copy(
         try:
             with beside(partial(_follow, upload), name="upload"):
                 yield trial
-        except Exception:  # but not a KeyboardInterrupt: that means at once
+        except Exception:  # but not a KeyboardInterrupt, which ends at once
             _finish(upload, should_stop)
             raise
         _finish(upload, should_stop)
 
 
 def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:
-    """Send what is left, unless a newer attempt has made it worthless."""
+    """Send the remaining commits, unless there is a newer attempt."""
     try:
         patiently(upload.finish, should_stop)
     except LostLeaseError as error:
@@ -210,8 +210,8 @@ def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:
 
 
 def _follow(upload: Upload, over: threading.Event) -> None:
-    """Send what is committed, until it is over."""
-    hint = "the trial goes on, this is tried again"
+    """Send commits until the end."""
+    hint = "the trial continues, and the upload is tried again"
     try:
         patience.repeatedly(upload.follow, over, every=LOOK_SECONDS, hint=hint)
     except LostLeaseError as error:
@@ -220,12 +220,12 @@ def _follow(upload: Upload, over: threading.Event) -> None:
 
 
 def _commit_of(record: TrialRecord) -> tuple[Any, ...]:
-    """What differs between two records only if there was a commit, a beginning or an end between them."""
+    """Return the fields of a record that change only with a commit, a beginning or an end."""
     return (record.token, record.status, record.error, record.cpu_seconds, *sorted(record.committed.items()))
 
 
 def _newest_checkpoint(trial: TrialStore) -> tuple[list[str], dict[str, Extent]]:
-    """The newest intact checkpoint, as a path in the trial's folder, if there is one; what rows it has."""
+    """Return the newest intact checkpoint, as a path in the trial's folder, if any, and its rows' extents."""
     for path in trial.checkpoints():
         try:
             tree = trial.load_checkpoint(path)

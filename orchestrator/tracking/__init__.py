@@ -1,1 +1,1 @@
-"""MLflow: what of a sweep is shown there, and how it is kept up to date."""
+"""The sweep in MLflow."""

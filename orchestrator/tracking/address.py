@@ -13,11 +13,11 @@ SQLITE = "sqlite:///"
 
 
 def tracking_uri(store: SweepStore, given: str | None) -> str:
-    """Return where MLflow keeps the sweep: a database in the sweep's folder unless the user names a place.
+    """Return the sweep's MLflow address: the given one, or a database in the sweep's folder.
 
     Args:
         store: the sweep.
-        given: a server's address or a database's, as MLflow takes them, or None.
+        given: a server's address or a database's, as for MLflow, or None.
 
     Raises:
         TrackingError: MLflow has no such kind of store.
@@ -26,7 +26,7 @@ def tracking_uri(store: SweepStore, given: str | None) -> str:
 
 
 def checked_uri(given: str) -> str:
-    """Return the address, made absolute, if MLflow takes it.
+    """Return the absolute address, if MLflow accepts it.
 
     Raises:
         TrackingError: MLflow has no such kind of store.
@@ -34,18 +34,20 @@ def checked_uri(given: str) -> str:
     if not given.isprintable() or " " in given:
         raise TrackingError("the tracking address must hold no spaces and no control characters")
     scheme, separator, rest = given.partition("://")
-    if scheme != "sqlite" and re.search("[/?#].*@", rest):  # others would take a part of it for a host
+    if scheme != "sqlite" and re.search(
+        "[/?#].*@", rest
+    ):  # other programs would take a part of it for a host
         raise TrackingError(
-            "the tracking address must have no @ behind its host; in a password write %2F for /, %3F for ?, "
-            "%23 for # and %40 for @"
+            "the tracking address must have no @ after its host; in a password write %2F for /, "
+            "%3F for ?, %23 for # and %40 for @"
         )
     if scheme == "sqlite" and rest.startswith("/") and len(rest) > 1:
         return f"{SQLITE}{Path(rest.removeprefix('/')).absolute()}"
     if separator and rest and scheme.partition("+")[0] in ("http", "https", "postgresql", "mysql", "mssql"):
         return given
     raise TrackingError(
-        "the tracking address must be http(s)://host:port, sqlite:///file.db or another database that MLflow "
-        f"takes (postgresql, mysql, mssql), got {redacted(given)!r}"
+        "the tracking address must be http(s)://host:port, sqlite:///file.db or another database "
+        f"of MLflow (postgresql, mysql, mssql), got {redacted(given)!r}"
     )
 
 

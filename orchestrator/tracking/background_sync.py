@@ -1,8 +1,7 @@
-"""The process that keeps MLflow up to date while a sweep runs, so that nobody else waits for MLflow.
+"""The process that keeps MLflow up to date while a sweep runs, so that training never waits for MLflow.
 
-It reads the sweep's files and nothing else. It ends when its standard input closes: because it was told to
-stop, or because its parent died. Either way it makes a last pass, so that what a killed launch leaves in
-MLflow is true as well.
+It reads only the sweep's files. It ends when its standard input closes: after a stop request, or because its
+parent died. In both cases it makes a last pass, so that MLflow is correct also after a killed launch.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker
 from recrl.orchestrator.tracking.positions import sync_folder
 
-POLITENESS = 10  # added to the process's nice value: about a tenth of a core that a trial also wants
-LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is away
+POLITENESS = 10  # added to the process's nice value: about a tenth of a core next to a trial
+LONGEST_WAIT_SECONDS = 60.0  # between two passes while MLflow is unreachable
 ORPHAN_SECONDS = 15.0  # trials outlive a killed launch by some seconds; the last pass waits for them
 
 
@@ -37,7 +36,7 @@ class BackgroundSync:
     process: subprocess.Popen[bytes]
 
     def stop(self, timeout: float) -> bool:
-        """Ask for a last pass and wait for it; whatever it does not manage, the next ``sync`` does.
+        """Request a last pass and wait for it; the next ``sync`` copies the rest.
 
         Args:
             timeout: seconds, at least 0; then the process is killed.
@@ -61,7 +60,7 @@ def start_sync(store: SweepStore, uri: str, *, interval_seconds: float) -> Backg
     Args:
         store: the sweep.
         uri: of ``tracking_uri``.
-        interval_seconds: between two passes, above 0; longer while MLflow is away.
+        interval_seconds: between two passes, above 0; longer while MLflow is unreachable.
     """
     folder = sync_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
@@ -74,13 +73,13 @@ def start_sync(store: SweepStore, uri: str, *, interval_seconds: float) -> Backg
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,
-            start_new_session=True,  # Ctrl-C is for the launch, which then says when to stop
+            start_new_session=True,  # Ctrl-C is for the launch, which then stops this process
         )
     return BackgroundSync(process)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Mirror a sweep until standard input closes; the process of ``start_sync``."""
+    """Copy a sweep to MLflow until standard input closes; the process of ``start_sync``."""
     parser = argparse.ArgumentParser(
         prog="python -m recrl.orchestrator.tracking.background_sync", description=main.__doc__
     )
@@ -92,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.nice(POLITENESS)
     store = SweepStore(arguments.folder.parent, arguments.folder.name)
     tracker = Tracker(store, os.environ["MLFLOW_TRACKING_URI"], write_in_own_process)
-    wait = 0.0  # a launch that had nothing to do is over already: one pass is enough
+    wait = 0.0  # a launch with nothing to do is already over: one pass is enough
     while not _is_over(arguments.parent, wait):
         report = _pass(tracker, live=True)
         longer = min(2 * max(wait, arguments.interval), LONGEST_WAIT_SECONDS)
@@ -116,7 +115,7 @@ def _any_runs(store: SweepStore) -> bool:
 
 
 def _is_over(parent: int, seconds: float) -> bool:
-    """Wait; whether standard input was closed or the parent died meanwhile."""
+    """Wait; return whether standard input was closed or the parent died meanwhile."""
     readable, _, _ = select.select([sys.stdin], [], [], seconds)
     return bool(readable) or os.getppid() != parent
 

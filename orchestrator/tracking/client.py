@@ -1,4 +1,4 @@
-"""Connections to MLflow. MLflow takes seconds to import, so it is imported where it is first needed."""
+"""Connections to MLflow. It takes seconds to import, so it is imported at the first use."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from recrl.orchestrator.tracking.address import SQLITE, sqlite_path
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
-EXPERIMENTS = "recrl/"  # what the names of the experiments of sweeps begin with
+EXPERIMENTS = "recrl/"  # prefix of the experiments of sweeps
 SQLITE_HEAD = b"SQLite format 3\0"
 
-# Read by mlflow when it is imported. A lost server must cost seconds, not MLflow's own four minutes; the
-# next pass tries again. A user's own settings stand.
+# Read by mlflow at its import. A lost server must delay a pass by seconds, not by MLflow's own four minutes;
+# the next pass tries again. A user's own settings have priority.
 ENVIRONMENT = {
     "DO_NOT_TRACK": "true",
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -31,14 +31,14 @@ ENVIRONMENT = {
 
 
 def connect(uri: str, *, environment: Mapping[str, str] = ENVIRONMENT) -> MlflowClient:
-    """Return a client of a store that exists, or whose sqlite file has just been made.
+    """Return a client of a store; a missing sqlite file is created.
 
     Args:
         uri: of ``address.tracking_uri``.
-        environment: settings of MLflow that the user's own environment may override.
+        environment: settings of MLflow; the user's own environment has priority.
 
     Raises:
-        Exception: whatever mlflow raises if the store cannot be used.
+        Exception: raised by mlflow if the store cannot be used.
     """
     for key, value in environment.items():
         os.environ.setdefault(key, value)
@@ -49,15 +49,15 @@ def connect(uri: str, *, environment: Mapping[str, str] = ENVIRONMENT) -> Mlflow
         if not path.exists():
             _make_database(path)
         elif not _is_sqlite(path):
-            raise TrackingError(f"{path}: not a sqlite database; delete it to have it made anew")
+            raise TrackingError(f"{path}: not a sqlite database; delete it, and it is created anew")
     return MlflowClient(uri)
 
 
 def _make_database(path: Path) -> None:
-    """Make MLflow's tables in a file beside, then rename it.
+    """Create MLflow's tables in a temporary file, then rename it.
 
-    MLflow makes them by fifty migrations, not in one transaction: killed in their midst they would leave half
-    a database for ever.
+    MLflow creates them by fifty migrations, not in one transaction: a kill in between would leave an unusable
+    database.
     """
     from mlflow.tracking import MlflowClient  # noqa: PLC0415
 
@@ -74,7 +74,7 @@ def _is_sqlite(path: Path) -> bool:
 
 
 def is_away(error: Exception) -> bool:
-    """Return whether asking MLflow about another trial would fail in the same way."""
+    """Return whether a request to MLflow about another trial would fail in the same way."""
     from mlflow.exceptions import MlflowException  # noqa: PLC0415
 
     about_the_trial = ("INVALID_PARAMETER_VALUE", "BAD_REQUEST", "RESOURCE_DOES_NOT_EXIST")

@@ -1,7 +1,7 @@
-"""The sweep's export file among the artifacts of its parent run: what others read a sweep from.
+"""The sweep's export file among the artifacts of its parent run, for reading a sweep from MLflow.
 
-The file is what ``recrl-sweep export`` writes (``recrl.analysis.data.export``). This package does not import
-the analysis: whoever syncs hands in a function that writes the file.
+The file is that of ``recrl-sweep export`` (``recrl.analysis.data.export``). This package does not import the
+analysis: the caller passes a function that writes the file.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from recrl.orchestrator.tracking.runs import SweepRuns
 
 FOLDER = "export"
 FILE_NAME = "sweep.zip"
-UPLOADED_TAG = "recrl.export_uploaded"  # of the parent run: the sweep's state as of when, in UTC
-INTERVAL_SECONDS = 600.0  # between two uploads while the sweep runs, at least
-REST = 100.0  # times as long as the last upload took
+UPLOADED_TAG = "recrl.export_uploaded"  # tag of the parent run: time of the exported state, in UTC
+INTERVAL_SECONDS = 600.0  # least time between two uploads while the sweep runs
+REST = 100.0  # multiple of the time of the last upload
 
 now = time.monotonic
 ExportWriter = Callable[[SweepStore, Path], object]
 
 
 class ExportUpload:
-    """Uploads the export file at the end of a sweep, and now and then before."""
+    """Upload of the export file at the end of a sweep, and at intervals before."""
 
     def __init__(self, store: SweepStore, runs: SweepRuns, write: ExportWriter, folder: Path) -> None:
-        """Wait one interval before the first upload of a sweep that runs.
+        """Prepare uploads; the first one of a running sweep is after one interval.
 
         Args:
             store: the sweep.
             runs: its runs.
             write: writes the export file of a sweep.
-            folder: where the file lies until it is sent.
+            folder: for the file until it is sent.
         """
         self._store = store
         self._runs = runs
@@ -52,7 +52,7 @@ class ExportUpload:
     def bring_up_to_date(
         self, parent: Position, records: dict[str, TrialRecord], *, live: bool
     ) -> tuple[Position, str]:
-        """Upload the file if the sweep changed and, while a launch runs, the time has come.
+        """Upload the file if the sweep changed and, while a launch runs, the interval is over.
 
         Args:
             parent: position of the parent run.
@@ -60,7 +60,7 @@ class ExportUpload:
             live: whether a launch runs.
 
         Returns:
-            The new position, and why the file could not be uploaded, or nothing.
+            The new position, and the reason why the file could not be uploaded, or empty.
         """
         mark = _mark(records)
         if not records or parent.shown.get("export") == mark or (live and now() < self._due):
@@ -68,7 +68,7 @@ class ExportUpload:
         began = now()
         try:
             self._upload()
-        except Exception as error:  # a server may take small files only; the runs are shown all the same
+        except Exception as error:  # a server may accept small files only; the runs are shown nevertheless
             return parent, next(iter(str(error).splitlines()), type(error).__name__)
         finally:
             ended = now()
@@ -86,7 +86,7 @@ class ExportUpload:
 
 
 def write_in_own_process(store: SweepStore, path: Path) -> None:
-    """Write a sweep's export file in a process of its own, so that this one needs no pandas and stays small.
+    """Write a sweep's export file in a separate process, so that this one does not import pandas.
 
     Raises:
         TrackingError: the file could not be written.
@@ -101,12 +101,12 @@ def write_in_own_process(store: SweepStore, path: Path) -> None:
         check=False,
     )
     if done.returncode:
-        lines: Sequence[str] = done.stderr.strip().splitlines() or ["it says nothing"]
+        lines: Sequence[str] = done.stderr.strip().splitlines() or ["it prints no reason"]
         raise TrackingError(f"recrl-sweep export failed: {lines[-1]}")
 
 
 def _mark(records: dict[str, TrialRecord]) -> str:
-    """Return what changes whenever a trial begins, commits or ends."""
+    """Return the values that change whenever a trial begins, commits or ends."""
     known = [
         (name, str(record.status), record.attempt, sorted(record.committed.items()))
         for name, record in sorted(records.items())

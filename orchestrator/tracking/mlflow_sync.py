@@ -1,9 +1,9 @@
-"""Show a sweep in MLflow: a one-way copy of its files, which nobody waits for.
+"""Copy a sweep's files to MLflow, one-way, without delaying any trial.
 
-No trial's process imports mlflow: ``background_sync`` makes one pass after the other in a process of its own.
-A sweep's name has one experiment (``recrl/<name>``). The sweep has one parent run (a note; figures and the
-export file as artifacts; no metrics, so that no chart shows it), and each trial has one child run. What a run
-shows is in ``points``. Run states are true:
+No trial's process imports mlflow: ``background_sync`` makes the passes in a separate process. A sweep's name
+has one experiment (``recrl/<name>``). The sweep has one parent run with a note, and with figures and the
+export file as artifacts. It has no metrics, so that it is in no chart. Each trial has one child run, whose
+content is in ``points``. States of runs:
 
     the trial's files say                                       the run is
     waiting, never started                                      not there; the parent's note counts it
@@ -13,8 +13,8 @@ shows is in ``points``. Run states are true:
     complete                                                    FINISHED
     failed                                                      FAILED, with the tag ``recrl.error``
 
-Why nothing is lost and nothing is there twice: see ``positions`` and ``trial_sync``. Whoever wants the data
-back reads the export file (``read``): MLflow's points are for its charts.
+``positions`` and ``trial_sync`` explain why no point is lost or duplicated. To get the data back, read the
+export file (``read``): MLflow's points are only for its charts.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from recrl.orchestrator.tracking.trial_sync import TrialSync
 
 @dataclass(frozen=True)
 class SyncReport:
-    """What one pass did.
+    """Report of one pass.
 
     Attributes:
         trials: trials that have begun.
-        behind: those of them that MLflow does not show as their files are.
+        behind: begun trials that are not up to date in MLflow.
         points: points sent.
-        problem: one line saying what kept MLflow from being up to date, or empty.
-        remark: one line saying why the export file could not be uploaded, or empty.
+        problem: one line on why MLflow is not up to date, or empty.
+        remark: one line on why the export file could not be uploaded, or empty.
         finished_at: when the pass ended, seconds since 1970.
         experiment_id: the sweep's experiment, or empty if MLflow could not be reached.
     """
@@ -62,29 +62,29 @@ class SyncReport:
 
     @property
     def is_up_to_date(self) -> bool:
-        """Whether MLflow showed all there was to show."""
+        """Whether MLflow is up to date."""
         return not self.problem and not self.behind
 
 
 def sync(
     store: SweepStore, uri: str, *, rebuild: bool = False, write_export: ExportWriter | None = None
 ) -> SyncReport:
-    """Bring MLflow up to date with the sweep's files, once; does nothing where nothing is new.
+    """Bring MLflow up to date with the sweep's files, once; do nothing if there is nothing new.
 
     Args:
         store: the sweep.
         uri: of ``address.tracking_uri``.
-        rebuild: delete what MLflow has of the sweep and send everything anew.
+        rebuild: delete the sweep's runs in MLflow and send everything again.
         write_export: writes the sweep's export file, for its upload; None to upload none.
 
     Returns:
-        What was done, or why it could not be: nothing is raised when MLflow is away.
+        The report of the pass; nothing is raised if MLflow is unreachable.
     """
     return Tracker(store, uri, write_export).bring_up_to_date(live=False, rebuild=rebuild)
 
 
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:
-    """Return the report of the last pass that ended, in whatever process; None if there was none."""
+    """Return the report of the last finished pass of any process; None if there was none."""
     try:
         return SyncReport(**json.loads((sync_folder(store, uri) / "report.json").read_text()))
     except (OSError, ValueError, TypeError):
@@ -92,7 +92,7 @@ def last_report(store: SweepStore, uri: str) -> SyncReport | None:
 
 
 class Tracker:
-    """What one process knows of MLflow between its passes over a sweep."""
+    """State of one process between its passes over a sweep."""
 
     def __init__(self, store: SweepStore, uri: str, write_export: ExportWriter | None = None) -> None:
         self.store = store
@@ -101,18 +101,18 @@ class Tracker:
         self._view: _View | None = None
 
     def bring_up_to_date(self, *, live: bool, rebuild: bool = False) -> SyncReport:
-        """Make one pass; whatever MLflow raises ends up in the report.
+        """Make one pass; errors of MLflow are in the report.
 
         Args:
-            live: whether a launch runs that will resume what waits.
-            rebuild: delete what MLflow has of the sweep first.
+            live: whether a launch runs that will resume waiting trials.
+            rebuild: first delete the sweep's runs in MLflow.
         """
         trials = [trial for trial in self.store.trials() if _has_begun(trial.record())]
         points: list[int] = []  # of each trial that is shown
         problems: list[str] = []
         remark = ""
         with exclusive(self.store, self.uri):
-            view, self._view = self._view, None  # to be made anew should anything go wrong
+            view, self._view = self._view, None  # made anew after any error
             try:
                 view = view or _View(self.store, self.uri, self._write_export, rebuild=rebuild)
                 for trial in trials:
@@ -136,7 +136,7 @@ class Tracker:
 
 
 class _View:
-    """MLflow's side of a sweep, in memory between the passes of one process."""
+    """The sweep's runs, in memory between the passes of one process."""
 
     def __init__(
         self, store: SweepStore, uri: str, write_export: ExportWriter | None, *, rebuild: bool
@@ -152,7 +152,7 @@ class _View:
 
 @contextmanager
 def _kept(problems: list[str], trial: TrialStore) -> Iterator[None]:
-    """Keep why MLflow refuses a trial: that does not stop the others."""
+    """Record why MLflow refuses a trial; this does not stop the others."""
     try:
         yield
     except Exception as error:
@@ -162,5 +162,5 @@ def _kept(problems: list[str], trial: TrialStore) -> Iterator[None]:
 
 
 def _has_begun(record: TrialRecord) -> bool:
-    """Return whether there is, or was, something to show."""
+    """Return whether there is, or was, a trial to show."""
     return record.attempt > 0 or record.status is TrialState.DAMAGED

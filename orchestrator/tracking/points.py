@@ -1,22 +1,22 @@
-"""What MLflow shows of a sweep, as pure functions of the trials' files; nothing here knows MLflow.
+"""Content of MLflow's runs, as pure functions of the trials' files; independent of MLflow.
 
-Metrics are drawn against environment steps and sorted into the UI's chart sections by their first word:
+Metrics are over environment steps; the part before the slash is the UI's chart section:
 
     train/return, train/cost_0            means over the episodes of an update, training phase
-    train/episodes                        how many those are
+    train/episodes                        their number
     deploy/return, deploy/cost_0, ...     the same, deployment phase
-    curriculum/limit_0, curriculum/noise  what the teacher set; curriculum/temperature if it has one
-    agent/<name>                        what the agent reported: kl, entropy, multiplier_0, ...
+    curriculum/limit_0, curriculum/noise  output of the curriculum; also curriculum/temperature, if any
+    agent/<name>                          metrics of the agent: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
     summary/deploy_return, ..._cost_0     mean over the episodes of the deployment phase; once, at the end
-    evaluation/<policy>_return, ..._cost_0    mean over a frozen policy's episodes; once, at the end
+    evaluation/<policy>_return, ..._cost_0    mean over the final evaluation's episodes; once, at the end
 
-MLflow stores an infinite value as 1.8e308 and draws it: so a value that is not finite (a limit that
-constrains nothing, the mean of no episodes) is left out, and the chart has no point there.
+MLflow stores an infinite value as 1.8e308 and draws it. So values that are not finite (an infinite limit, the
+mean of no episodes) are left out, and the chart has no point there.
 
-A trial of many updates is thinned to about ``POINTS_PER_METRIC`` points a metric, because the database costs
-CPU that training wants. Which updates are shown depends on their number alone, never on when the mirror
-looked: a view rebuilt from the files equals one that grew with them.
+A trial of many updates is thinned to about ``POINTS_PER_METRIC`` points per metric, because the database
+takes CPU time from training. The selection depends only on the number of updates, not on the times of passes.
+So a rebuild from the files gives the same points.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from recrl.orchestrator.files.trial_tables import UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec
 
 POINTS_PER_METRIC = 100
-MAX_PARAMS = 100  # of a request
+MAX_PARAMS = 100  # in one request
 MAX_NOTE = 7_500  # characters; MLflow takes 8,000 in a tag
 
 VIEW = "recrl"  # key of the prepared chart view
 
-# The UI's own state, in its own words (MLflow 3.17; undocumented, so a link without it must do as well).
+# The UI's own state, in its own words (MLflow 3.17; undocumented, so a link without it must work as well).
 VIEW_STATE = {
     "runsHiddenMode": "SHOW_ALL",
     "selectedColumns": [
@@ -92,8 +92,8 @@ class Point:
     Attributes:
         key: the metric's name.
         value: finite.
-        milliseconds: wall time of the update, since 1970; read from its row, so that a point that is sent
-            again is the same point.
+        milliseconds: wall time of the update, since 1970, from its row, so that a repeated point is
+            identical.
         step: environment steps.
     """
 
@@ -104,14 +104,14 @@ class Point:
 
 
 def rows_after(data: bytes, offset: int) -> Iterator[tuple[int, Row]]:
-    """The rows of a CSV file behind a byte.
+    """Yield the rows of a CSV file after an offset.
 
     Args:
-        data: the file's committed bytes; whole lines, the first one names the columns.
+        data: the file's committed bytes; whole lines, the first one with the columns.
         offset: end of a row, or 0 for all rows.
 
     Yields:
-        The byte behind the row, and the row.
+        The offset after the row, and the row.
     """
     header, _, _ = data.partition(b"\n")
     columns = header.decode().split(",")
@@ -122,15 +122,15 @@ def rows_after(data: bytes, offset: int) -> Iterator[tuple[int, Row]]:
 
 
 def thinned(rows: Iterable[tuple[int, Row]], num_updates: int) -> Iterator[tuple[int, Row]]:
-    """The rows to show: the first, the last, and every n-th between.
+    """Select rows: the first, the last, and every n-th between.
 
     Args:
-        rows: rows of ``updates.csv`` and the byte behind each; none before a shown row is left out.
+        rows: rows of ``updates.csv`` with the offset after each; no row before a selected one is missing.
         num_updates: updates of the whole trial, at least 1.
 
     Yields:
-        The shown rows, with their byte; ``noise`` is the largest since the row shown before, so that a short
-        burst of noise is seen.
+        The selected rows, with their offsets; ``noise`` is the largest since the previous selected row, so
+        that short noise is visible.
     """
     stride = -(-num_updates // POINTS_PER_METRIC)
     noise = 0.0
@@ -143,7 +143,7 @@ def thinned(rows: Iterable[tuple[int, Row]], num_updates: int) -> Iterator[tuple
 
 
 def points(row: Row, spec: TrialSpec) -> list[Point]:
-    """The points of one row of ``updates.csv``."""
+    """Return the points of one row of ``updates.csv``."""
     section = "train" if row["phase"] == Phase.TRAINING else "deploy"
     values = {
         f"{section}/return": float(row["episode_return"]),
@@ -164,7 +164,7 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
 
 
 def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row) -> list[Point]:
-    """The points of a complete trial's summary and evaluations, at its last step.
+    """Return the points of a complete trial's summary and evaluations, at its last step.
 
     Args:
         updates: ``TrialStore.updates()``.
@@ -185,7 +185,7 @@ def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row)
 
 
 def params(spec: TrialSpec) -> dict[str, str]:
-    """Few and flat: what the UI's table is sorted, filtered and grouped by."""
+    """Return a trial's params for the UI's table: few and flat, for sorting, filtering and grouping."""
     choices = {"task": spec.task, "agent": spec.agent, "method": spec.method}
     flat = {name: choice.label for name, choice in choices.items()} | {
         "seed": str(spec.seed),
@@ -205,10 +205,10 @@ def params(spec: TrialSpec) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Summary:
-    """What the note on a sweep says of one complete trial.
+    """Entry of a sweep's note for one complete trial.
 
     Attributes:
-        group: task, agent and method, as people call them.
+        group: labels of task, agent and method.
         values: ``summary/...`` by name.
     """
 
@@ -217,17 +217,17 @@ class Summary:
 
 
 def charts_page(experiment_id: str) -> str:
-    """The UI's page of the sweep's charts, seeds averaged, as it stands behind the ``#`` of its address."""
+    """Return the address of the sweep's charts, averaged over seeds, after the ``#`` of the UI's address."""
     page = f"/experiments/{experiment_id}/runs?viewStateShareKey={VIEW}"
     return f"{page}&compareRunsMode=CHART&workflowType=machine_learning"
 
 
 def note(name: str, counts: Mapping[str, int], complete: Sequence[Summary], *, charts: str) -> str:
-    """The sweep's description in Markdown: how far it is, and a line for every group that has an end.
+    """Return the sweep's note in Markdown: its progress, and a row for each group with complete trials.
 
     Args:
         name: the sweep.
-        counts: trials by what they are: complete, running, ...
+        counts: number of trials by status: complete, running, ...
         complete: one for each complete trial.
         charts: address of the page of charts.
     """
@@ -264,7 +264,7 @@ def _points(values: Mapping[str, float], row: Row) -> list[Point]:
 
 
 def _safe(name: str) -> str:
-    """A name with only the characters that MLflow takes."""
+    """Return a name with only the characters that MLflow accepts."""
     return re.sub(r"[^A-Za-z0-9_. -]", "_", name)[:200]
 
 

@@ -1,8 +1,8 @@
-"""How much of a sweep MLflow has been told, kept in files of the sweep's folder.
+"""How far a sweep has been sent to MLflow, recorded in files of the sweep's folder.
 
-A position is written after MLflow's reply. A process that is killed between the two sends the same points
-again, with the timestamps of their rows, and MLflow keeps one of each. If a position is lost or damaged,
-everything is sent again.
+A position is written after MLflow's reply. After a kill between the two, the same points are sent again with
+the timestamps of their rows, and MLflow keeps one of each. If a position is lost or damaged, everything is
+sent again.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 
 @dataclass(frozen=True)
 class Position:
-    """How much of a trial, or of the sweep itself, has been sent.
+    """How far a trial, or the sweep itself, has been sent.
 
     Attributes:
-        run_id: the run that shows it.
-        offset: the byte of ``updates.csv`` behind the last row sent.
-        last_row: that row; if the file says otherwise, it was cut back and written anew.
-        shown: what the run shows besides points: status, attempt, error and so on.
+        run_id: its run.
+        offset: in ``updates.csv``, after the last row sent.
+        last_row: that row; if the file differs, it was truncated and written again.
+        shown: content of the run besides points: status, attempt, error and so on.
         artifacts: name, size and time of the files sent.
-        summary: the means that a complete trial ended with.
+        summary: the final means of a complete trial.
     """
 
     run_id: str
@@ -41,16 +41,16 @@ class Position:
     summary: Mapping[str, float] = field(default_factory=dict)
 
     def fits(self, data: bytes) -> bool:
-        """Return whether the committed rows still are those that were sent."""
+        """Return whether the committed rows are still the sent ones."""
         return data[self.offset - len(self.last_row) : self.offset] == self.last_row.encode()
 
     def write(self, path: Path) -> None:
-        """Write it as JSON; ``read_position`` is the inverse."""
+        """Write the position as JSON; ``read_position`` is the inverse."""
         write_json(path, asdict(self))
 
 
 def read_position(path: Path) -> Position | None:
-    """Return the position in a file; None if there is none, or none that makes sense."""
+    """Return the position in a file; None if it is missing or invalid."""
     try:
         position = Position(**json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
@@ -61,13 +61,13 @@ def read_position(path: Path) -> Position | None:
 
 
 def sync_folder(store: SweepStore, uri: str) -> Path:
-    """Return the folder of the positions for one MLflow store; the address itself may hold a password."""
+    """Return the folder of the positions for one MLflow store; its name does not contain the address."""
     return store.sync_folder / hashlib.sha256(uri.encode()).hexdigest()[:10]
 
 
 @contextmanager
 def exclusive(store: SweepStore, uri: str) -> Iterator[None]:
-    """Wait until no other process sends this sweep to this store; two would make every run twice."""
+    """Hold the lock for sending this sweep to this store; two processes would make every run twice."""
     folder = sync_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder / "lock"):
@@ -75,6 +75,6 @@ def exclusive(store: SweepStore, uri: str) -> Iterator[None]:
 
 
 def file_mark(path: Path) -> str:
-    """Return what tells a file from what it was before."""
+    """Return a value that changes when the file does."""
     stat = path.stat()
     return f"{path.name} {stat.st_size} {stat.st_mtime_ns}"

@@ -1,4 +1,4 @@
-"""Fetch a sweep's export file from MLflow, for figures where MLflow is all that is left."""
+"""Fetch a sweep's export file from MLflow, for figures without the sweep's folder."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
 MAX_BYTES = 512 * 2**20
-TIMEOUT_SECONDS = 120  # for a server to answer
+TIMEOUT_SECONDS = 120  # timeout of a server
 EXPORT = f"{FOLDER}/{FILE_NAME}"
 
 
 @dataclass(frozen=True)
 class Download:
-    """An export file that was fetched.
+    """A fetched export file.
 
     Attributes:
         path: of the file.
-        note: one sentence on what the file does not hold.
+        note: one sentence on what is missing in the file.
     """
 
     path: Path
@@ -39,11 +39,11 @@ class Download:
 
 @contextmanager
 def downloaded_export(uri: str, name: str | None) -> Iterator[Download]:
-    """Fetch the export file of the newest sweep of a name into a folder that lasts as long as the context.
+    """Fetch the export file of the newest sweep of a name to a folder that exists during the context.
 
     Args:
         uri: of ``address.checked_uri``.
-        name: of the sweep; None for the only one.
+        name: of the sweep; None if there is only one.
 
     Raises:
         TrackingError: MLflow cannot be reached, shows no such sweep, or has no export file of it.
@@ -53,7 +53,7 @@ def downloaded_export(uri: str, name: str | None) -> Iterator[Download]:
             download = _download(uri, name, Path(folder))
         except RecrlError:
             raise
-        except Exception as error:  # MLflow lets through what its database or its server raises
+        except Exception as error:  # MLflow passes on the errors of its database or its server
             raise TrackingError(f"MLflow at {redacted(uri)} cannot be read: {one_line(error)}") from error
         yield download
 
@@ -82,7 +82,7 @@ def _parent(client: MlflowClient, uri: str, name: str | None) -> Run:
     """Return the newest parent run of a sweep.
 
     Raises:
-        TrackingError: MLflow shows no such sweep, or several that could be meant.
+        TrackingError: MLflow has no such sweep, or several.
     """
     found = client.search_experiments(filter_string=f"name LIKE '{EXPERIMENTS}%'")
     names = {it.name.removeprefix(EXPERIMENTS): str(it.experiment_id) for it in found}

@@ -1,4 +1,4 @@
-"""What MLflow calls the state of a trial and of a sweep, and the tags that say more."""
+"""MLflow's states for trials and sweeps, and additional tags."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ MAX_ERROR = 5_000  # characters of a failed trial's error
 
 
 def mlflow_status(record: TrialRecord, *, live: bool) -> str:
-    """Return what MLflow calls the state of a trial that has begun.
+    """Return MLflow's state of a trial that has begun.
 
     Args:
         record: of the trial; ``attempt`` is at least 1.
-        live: whether a launch runs that will resume what waits.
+        live: whether a launch runs that will resume waiting trials.
     """
     match display_status(record, now=time.time()):
         case DisplayStatus.COMPLETE:
@@ -32,7 +32,7 @@ def mlflow_status(record: TrialRecord, *, live: bool) -> str:
 
 
 def sweep_status(counts: Mapping[DisplayStatus, int], *, live: bool) -> str:
-    """Return what MLflow calls the state of a sweep with so many trials of each status."""
+    """Return MLflow's state of a sweep with these numbers of trials by status."""
     if live or counts[DisplayStatus.RUNNING]:
         return "RUNNING"
     if counts[DisplayStatus.FAILED]:
@@ -42,7 +42,7 @@ def sweep_status(counts: Mapping[DisplayStatus, int], *, live: bool) -> str:
 
 
 def state_tags(record: TrialRecord) -> dict[str, str]:
-    """Return the tags of a trial's run that change while it works; empty ones are left out."""
+    """Return the changing tags of a trial's run; empty ones are left out."""
     tags = {
         "recrl.status": str(record.status),
         "recrl.attempt": str(record.attempt),

@@ -30,17 +30,17 @@ class SweepRuns:
         client: MLflow's.
         experiment_id: the experiment of all sweeps of this name.
         parent_id: the sweep's own run.
-        parent_is_new: whether that was just made.
-        without_params: runs that were just made, or whose maker died before it sent their params.
+        parent_is_new: whether this run was just made.
+        without_params: runs that still need their params.
     """
 
     def __init__(self, store: SweepStore, uri: str, *, rebuild: bool = False) -> None:
-        """Find the runs, and make the experiment and the parent run if they are missing.
+        """Find the runs; create the experiment and the parent run if they are missing.
 
         Args:
             store: the sweep.
             uri: of ``address.tracking_uri``.
-            rebuild: delete the runs that are there first.
+            rebuild: first delete existing runs.
         """
         self.client = connect(uri)
         self.without_params: set[str] = set()
@@ -48,7 +48,7 @@ class SweepRuns:
         self._uri = uri
         self._tags = {"recrl.sweep": store.name, "recrl.sweep_id": _sweep_id(store)}
         self.experiment_id = self._find_experiment()
-        self._artifacts: dict[str, str] = {}  # place of each run's files
+        self._artifacts: dict[str, str] = {}  # artifact location of each run
         self._of_trials = self._find_runs()
         if rebuild:
             for run_id in self._of_trials.values():
@@ -57,7 +57,7 @@ class SweepRuns:
         found = self._of_trials.pop("", None)
         self.parent_is_new = found is None
         self.parent_id = found or self._create_parent()
-        if found is None:  # somebody may have deleted the parent alone
+        if found is None:  # a user may have deleted the parent only
             for run_id in self._of_trials.values():
                 self.client.set_tag(run_id, "mlflow.parentRunId", self.parent_id)
 
@@ -66,7 +66,7 @@ class SweepRuns:
         return self._of_trials.get(trial_id)
 
     def create(self, trial: TrialStore, record: TrialRecord) -> str:
-        """Make the run of a trial, and return its id."""
+        """Create the run of a trial, and return its id."""
         spec = trial.spec
         tags = {
             **self._tags,
@@ -81,14 +81,14 @@ class SweepRuns:
         return run_id
 
     def delete(self, run_id: str) -> None:
-        """Delete a run; ``mlflow gc`` removes it for good."""
+        """Delete a run; ``mlflow gc`` removes it permanently."""
         self.client.delete_run(run_id)
 
     def set_status(self, run_id: str, status: str, end: float) -> None:
         """Set a run's status.
 
-        A run that goes on after an end keeps its old end time until the next end: MLflow's client cannot
-        clear it.
+        A run that continues after an end keeps the old end time until the next end, because MLflow's client
+        cannot clear it.
         """
         if status in ("RUNNING", "SCHEDULED"):
             self.client.update_run(run_id, status=status)
@@ -96,12 +96,12 @@ class SweepRuns:
             self.client.set_terminated(run_id, status, end_time=_milliseconds(end))
 
     def send_files(self, position: Position, paths: Sequence[Path], folder: str | None = None) -> Position:
-        """Upload those files that exist, are not empty and were not sent as they are now."""
+        """Upload files that exist, are not empty and have changed since their last upload."""
         from mlflow.store.artifact.artifact_repository_registry import (  # noqa: PLC0415
             get_artifact_repository,
         )
 
-        # client.log_artifact would ask for the whole run first, to know this place
+        # client.log_artifact would first request the whole run, to find this location
         repository: Any = get_artifact_repository(self._artifacts[position.run_id], self._uri)
         sent = list(position.artifacts)
         for path in paths:
@@ -120,7 +120,8 @@ class SweepRuns:
         }
         experiment = self.client.get_experiment_by_name(name)
         if experiment is None:
-            # A server knows where it keeps artifacts; a bare database would take the current folder.
+            # A server knows its artifact location; for a bare database the default would be the current
+            # folder.
             place = None if is_server(self._uri) else self._store.mlflow_artifacts.as_uri()
             return str(self.client.create_experiment(name, artifact_location=place, tags=tags))
         if experiment.lifecycle_stage != "active":
@@ -131,7 +132,7 @@ class SweepRuns:
         return str(experiment.experiment_id)
 
     def _find_runs(self) -> dict[str, str]:
-        """Return run by trial id, the parent by the empty id; the oldest where there are several."""
+        """Return runs by trial id, the parent by the empty id; the oldest if there are several."""
         found: dict[str, str] = {}
         for run in sorted(self._own_runs(), key=lambda run: run.info.start_time or 0):
             run_id = str(run.info.run_id)
@@ -140,7 +141,7 @@ class SweepRuns:
         return found
 
     def _own_runs(self) -> list[Run]:
-        """Return the runs of this sweep, page by page."""
+        """Yield the runs of this sweep, page by page."""
         query = f"tags.`recrl.sweep_id` = '{self._tags['recrl.sweep_id']}'"
         runs: list[Run] = []
         token: str | None = None

@@ -1,4 +1,4 @@
-"""Bring the sweep's parent run up to date: its note, its status, the grid, the figures, the export file."""
+"""Update the sweep's parent run: its note, its status, the grid, the figures, the export file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from recrl.orchestrator.tracking.runs import SweepRuns
 
 
 class SweepSync:
-    """Sends what is known of the whole sweep to its parent run."""
+    """Sync of a sweep's own data to its parent run."""
 
     def __init__(
         self,
@@ -29,7 +29,7 @@ class SweepSync:
         summary: Callable[[TrialStore], Summary | None],
         write_export: ExportWriter | None,
     ) -> None:
-        """Go on from the position of an earlier process.
+        """Continue from the position of an earlier process.
 
         Args:
             store: the sweep.
@@ -51,7 +51,7 @@ class SweepSync:
         """Bring the parent run up to date.
 
         Returns:
-            Why the export file could not be uploaded, or nothing.
+            The reason why the export file could not be uploaded, or empty.
         """
         records = self._records()
         position = self._show_state(self._position, records, live=live)
@@ -85,7 +85,7 @@ class SweepSync:
         return replace(position, shown={**position.shown, "note": text, "status": status})
 
     def _records(self) -> dict[str, TrialRecord]:
-        """Return the records of all trials by folder name, also of those that were never started."""
+        """Return the records of all trials by folder name, also of trials that were never started."""
         records = {trial.folder.name: trial.record() for trial in self._store.trials()}
         waiting = {spec.folder_name: TrialRecord() for spec in self._store.specs()}
         return {**waiting, **records}

@@ -1,7 +1,7 @@
-"""Bring the MLflow runs of trials up to date with the trials' files.
+"""Update the MLflow runs of trials from the trials' files.
 
-Only committed rows are sent. Should a trial's file have been cut back behind its position (its newest
-checkpoint was damaged), MLflow holds points that no longer exist: the run is deleted and made anew.
+Only committed rows are sent. If a trial's file was truncated to before its position (its newest checkpoint
+was damaged), MLflow has points that no longer exist. Then the run is deleted and created again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class TrialSync:
-    """Sends trials to their runs; remembers between passes what was sent."""
+    """Sync of trials to their runs; it keeps the sent positions between passes."""
 
     def __init__(self, store: SweepStore, uri: str, runs: SweepRuns) -> None:
         self._runs = runs
@@ -44,10 +44,10 @@ class TrialSync:
         self._positions: dict[str, Position] = {}
 
     def show(self, trial: TrialStore, *, live: bool) -> int:
-        """Bring the trial's run up to date; return the number of points sent.
+        """Update the trial's run; return the number of points sent.
 
         Raises:
-            DamagedError: a file of the trial is not what was committed.
+            DamagedError: a file of the trial differs from its commit.
         """
         record = trial.record()
         if record.status is TrialState.DAMAGED:
@@ -58,7 +58,7 @@ class TrialSync:
             return 0
         data = _committed_rows(trial, record)
         if data is None:
-            return 0  # the file is being cut back at this moment; the next pass sees the result
+            return 0  # the file is just being truncated; the next pass sees the result
         if not position.fits(data):
             self._runs.delete(position.run_id)
             position = Position(self._runs.create(trial, record))
@@ -72,7 +72,7 @@ class TrialSync:
         return len(new_points)
 
     def summary(self, trial: TrialStore) -> Summary | None:
-        """Return the means that a complete trial ended with, None before its end."""
+        """Return the final means of a complete trial, None before its end."""
         position = self._positions.get(trial.folder.name)
         if position is None or not position.summary:
             return None
@@ -84,7 +84,7 @@ class TrialSync:
     ) -> Position:
         """Send points, params, tags and files.
 
-        In as few requests as MLflow allows: each costs the server, or this process, about 10 ms.
+        This uses as few requests as possible: each takes the server, or this process, about 10 ms.
         """
         from mlflow.entities import Metric, Param, RunTag  # noqa: PLC0415
 
@@ -96,7 +96,7 @@ class TrialSync:
             position = self._runs.send_files(position, _result_files(trial, record))
             for path in _added_afterwards(trial):
                 position = self._runs.send_files(position, [path], path.parent.name)
-        except OSError:  # where there is no room for files there may be some for the curves
+        except OSError:  # points may fit even if there is no room for files
             client.log_batch(run_id, metrics=metrics, params=told)
             raise
         tags = [RunTag(key, value) for key, value in state_tags(record).items()]
@@ -107,7 +107,7 @@ class TrialSync:
         return position
 
     def _position(self, trial: TrialStore, record: TrialRecord) -> Position:
-        """Return how far the trial has been sent, as far as MLflow still has the run."""
+        """Return the position of the trial, if MLflow still has the run."""
         name = trial.folder.name
         if name not in self._positions:
             position = read_position(self._path(trial))
@@ -128,7 +128,7 @@ class TrialSync:
 
 
 def _shown(trial: TrialStore, record: TrialRecord, *, live: bool) -> dict[str, Any]:
-    """Return what the run is to show; as long as it does not change, nothing is sent."""
+    """Return the content of the run besides points; nothing is sent while it does not change."""
     return {
         "status": mlflow_status(record, live=live),
         "attempt": record.attempt,
@@ -139,10 +139,10 @@ def _shown(trial: TrialStore, record: TrialRecord, *, live: bool) -> dict[str, A
 
 
 def _committed_rows(trial: TrialStore, record: TrialRecord) -> bytes | None:
-    """Return the committed bytes of ``updates.csv``, None while it is shorter.
+    """Return the committed bytes of ``updates.csv``; None while it is shorter.
 
     Raises:
-        DamagedError: they are not what was committed.
+        DamagedError: they differ from the commit.
     """
     extent = record.extents.get(trial.updates_path.name, Extent())
     data = b""
@@ -159,7 +159,7 @@ def _committed_rows(trial: TrialStore, record: TrialRecord) -> bytes | None:
 def _points_to_send(
     trial: TrialStore, data: bytes, position: Position, *, is_finished: bool
 ) -> tuple[list[Point], Position]:
-    """Return the points behind a position, those of a finished trial's end, and the position behind them."""
+    """Return the points after a position, those of a finished trial's end, and the new position."""
     if is_finished:
         trial.require_whole()
     found, position = _new_points(trial, data, position)
@@ -184,7 +184,7 @@ def _last_row(data: bytes, position: Position) -> Row:
 
 
 def _result_files(trial: TrialStore, record: TrialRecord) -> list[Path]:
-    """Return the trial's small files, and at its end what it learnt."""
+    """Return the trial's small files, and at its end its policy."""
     paths = [trial.spec_path, trial.provenance_path]
     if record.status is TrialState.COMPLETE:
         paths += [trial.evaluation_path, trial.events_path, trial.policy_path, *trial.checkpoints()[:1]]
@@ -194,6 +194,6 @@ def _result_files(trial: TrialStore, record: TrialRecord) -> list[Path]:
 
 
 def _added_afterwards(trial: TrialStore) -> list[Path]:
-    """Return what was measured and filmed of the final policy, for artifacts in folders of these names."""
+    """Return evaluations and videos of the final policy, for artifacts in folders of these names."""
     folders = (trial.evaluations_folder, trial.videos_folder)
     return [path for folder in folders for path in sorted(folder.glob("update-*"))]

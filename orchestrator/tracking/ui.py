@@ -1,4 +1,4 @@
-"""MLflow's own pages about a sweep, served to this machine only."""
+"""MLflow's UI for a sweep, served on this machine only."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ SETTINGS = ("DO_NOT_TRACK=true", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER
 
 
 def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
-    """The command that serves a database's pages on this machine only, in one process."""
+    """Return the command of an MLflow server for a database, on this machine only, with one process."""
     stores = ["--artifacts-destination", str(store.mlflow_artifacts)]
-    if "@" not in uri and "?" not in uri:  # else it goes in the environment, which other users cannot see
+    if (
+        "@" not in uri and "?" not in uri
+    ):  # otherwise it is an environment variable, which other users cannot see
         stores += ["--backend-store-uri", uri]
     address = ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     return ["env", *SETTINGS, sys.executable, "-m", "mlflow", "server", *stores, *address]
 
 
 def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
-    """The page of the sweep's charts; seeds are averaged where there are several."""
+    """Return the address of the sweep's charts; several seeds are averaged."""
     address = uri.rstrip("/") if is_server(uri) else f"http://127.0.0.1:{port}"
     report = last_report(store, uri)
     if report is None or not report.experiment_id:
@@ -45,7 +47,7 @@ class UI:
 
     Attributes:
         url: the page to open.
-        process: the server, or None if it was there already.
+        process: the server, or None if it was running already.
     """
 
     url: str
@@ -59,7 +61,7 @@ class UI:
 
 
 def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 120.0) -> UI:
-    """Start MLflow's server on this machine's own address and wait until it answers.
+    """Start MLflow's server at the loopback address and wait until it answers.
 
     Args:
         store: the sweep.
@@ -94,6 +96,6 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 1
 
 
 def _answers(port: int) -> bool:
-    """Whether a program takes connections on a port of this machine's own address."""
+    """Whether a program accepts connections on a port of the loopback address."""
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0

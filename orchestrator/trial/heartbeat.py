@@ -1,8 +1,8 @@
-"""The sign of life of a running trial: a thread that speaks for it as long as it works.
+"""Heartbeat of a running trial: a thread that writes signs of life while the trial computes.
 
-A trial works if the thread that runs it uses the processor. So an update of an hour, or a long evaluation,
-is heard all the time, while a trial that waits for what never comes, or whose process is stopped, falls
-silent. What cannot be told is a loop without end from a long computation.
+A trial computes if its thread uses processor time. So the heartbeat continues during an update of an hour, or
+a long evaluation. It stops when a trial waits without end or its process is stopped. An infinite loop cannot
+be distinguished from a long computation.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from functools import partial
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import LostLeaseError, StorageError
 
-LEAST_WORK_SECONDS = 1e-3  # CPU time between two beats; what only looks for signals uses less
+LEAST_WORK_SECONDS = 1e-3  # least CPU time between two beats; checking for signals uses less
 
 logger = logging.getLogger("recrl.trial")
 
 
 class Heartbeat:
-    """Beats for one thread while that one works.
+    """Run a heartbeat for the thread that enters this context, while that thread computes.
 
     Args:
-        beat: says that the trial lives; may raise LostLeaseError.
+        beat: writes a sign of life; may raise LostLeaseError.
         seconds: between two beats, above 0.
     """
 
@@ -41,7 +41,7 @@ class Heartbeat:
         return beside(partial(self._run, clock), name="heartbeat")
 
     def check(self) -> None:
-        """Raise LostLeaseError if a beat met it: another attempt runs the trial."""
+        """Raise LostLeaseError if a beat did: another attempt runs the trial."""
         if self._lost is not None:
             raise self._lost
 
@@ -57,5 +57,5 @@ class Heartbeat:
             except LostLeaseError as error:
                 self._lost = error
                 return
-            except StorageError as error:  # the next commit will meet it too, and end the trial
+            except StorageError as error:  # the next commit will raise it as well, and end the trial
                 logger.warning("%s", error)

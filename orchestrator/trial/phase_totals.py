@@ -1,4 +1,4 @@
-"""What a trial's episodes come to in each phase: the few numbers that stand for 500,000 rows."""
+"""Totals of a trial's episodes by phase: a few numbers instead of up to 500,000 rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recrl.environments.cmdp import Phase
 
 
 def phase_totals(episodes: pd.DataFrame, deploy_limits: Sequence[float]) -> list[dict[str, Any]]:
-    """The sums over a trial's episodes, a row a phase that has any.
+    """Sum over a trial's episodes, one row per phase with episodes.
 
     Args:
         episodes: ``TrialStore.episodes()``.

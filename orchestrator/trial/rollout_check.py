@@ -1,4 +1,4 @@
-"""A look at what a task returned, once an update: so the task is named and not the agent."""
+"""Check a task's output once per update, so that errors name the task and not the agent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Numbers = npt.NDArray[np.floating]
 
 
 class TaskOutputError(RecrlError):
-    """An environment returned what is no observation, reward or cost."""
+    """An environment returned an invalid observation, reward or cost."""
 
 
 def check_rollout(rollout: Rollout, task: str) -> None:
@@ -23,7 +23,7 @@ def check_rollout(rollout: Rollout, task: str) -> None:
         task: the task's label, for the message.
 
     Raises:
-        TaskOutputError: they are not; the message says what was returned and where.
+        TaskOutputError: they are not; the message has the value and its place.
     """
     per_step: dict[str, Numbers] = {
         "an observation": rollout.observations,
@@ -42,7 +42,7 @@ def check_rollout(rollout: Rollout, task: str) -> None:
 
 
 def _are_finite(values: Numbers) -> bool:
-    """Whether all are; the sum of finite numbers is finite unless they are huge, and quicker to look at."""
+    """Whether all are; the sum of finite numbers is finite unless they are huge, and faster to check."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum(dtype=np.float64))) or bool(np.isfinite(values).all())
 

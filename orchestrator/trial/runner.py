@@ -1,4 +1,4 @@
-"""Run a trial in this process: take it over, keep its sign of life and its log, and record how it ended."""
+"""Run a trial in this process: take it over, write heartbeat and log, and record its end."""
 
 from __future__ import annotations
 
@@ -44,27 +44,27 @@ def run_trial(
     should_stop: Callable[[], bool],
     commit_seconds: float = COMMIT_SECONDS,
 ) -> TrialState:
-    """Run a trial to its end, or until ``should_stop``, from wherever its files say it stands.
+    """Run a trial to its end, or until ``should_stop``, from its newest checkpoint.
 
     Args:
         spec: the trial.
         writer: the lease on its folder (``TrialStore.begin``).
-        teacher: who sets the limits; inline or a proxy of a remote one.
-        should_stop: asked after every update; once true, the trial is saved and left waiting.
+        teacher: sets the limits; inline, or a proxy of a remote teacher.
+        should_stop: called after every update; once true, the trial is saved and left waiting.
         commit_seconds: wall seconds between checkpoints; has no influence on results.
 
     Returns:
         COMPLETE, or WAITING if it was stopped.
 
     Raises:
-        LostLeaseError: another attempt took the trial over.
-        StorageError: the disk is full or gone; the last commit stands.
-        Exception: whatever the task, the agent or the teacher raised, with a note of where; the last
-            commit stands.
+        LostLeaseError: another attempt took over the trial.
+        StorageError: the disk is full or gone; the last commit is intact.
+        Exception: raised by the task, the agent or the teacher, with a note on the update; the last commit is
+            intact.
     """
     life = _Life(writer)
     heartbeat = Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS)
-    with heartbeat.beating():  # to get ready may take minutes
+    with heartbeat.beating():  # preparation may take minutes
         trial = life.of(Trial(spec, writer, teacher))
         committed = time.monotonic()
         while not trial.learned and not should_stop():
@@ -88,7 +88,7 @@ def run_trial(
 
 
 class _Life:
-    """What a trial's heartbeat says: how far it is, and how fast over its last updates, however long."""
+    """Content of a trial's heartbeat: its progress, and its speed over the last updates."""
 
     def __init__(self, writer: TrialWriter) -> None:
         self._writer = writer
@@ -96,13 +96,13 @@ class _Life:
         self._speed = 0.0
 
     def of(self, trial: Trial) -> Trial:
-        """The trial, now that it is made; until then the heartbeat says where it stood before."""
+        """Set the trial once it is made; before, the heartbeat has its recorded progress."""
         self._steps, self._since = trial.env_steps, time.monotonic()
         self._trial = trial
         return trial
 
     def beat(self) -> None:
-        """Say it."""
+        """Write it."""
         if self._trial is None:
             before = self._writer.record
             self._writer.heartbeat(
@@ -118,7 +118,7 @@ class _Life:
 
 @contextmanager
 def _located(where: str, writer: TrialWriter) -> Iterator[None]:
-    """Note on whatever is raised where that was, and what is left of the trial."""
+    """Add a note to any error: the update, and the last checkpoint."""
     try:
         yield
     except USERS_ERRORS as error:
@@ -138,23 +138,23 @@ def run_recorded(
     teacher: Teacher | None = None,
     commit_seconds: float = COMMIT_SECONDS,
 ) -> TrialState:
-    """``run_trial``, with everything about the run recorded in the trial's folder.
+    """Call ``run_trial``, and record the run in the trial's folder.
 
-    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``, and nothing is
-    raised here: one trial's failure must not stop the others. A full disk is no failure of the trial's own:
-    it waits, and the same launch goes on from its last commit once there is room.
+    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``. Nothing is raised
+    here, so that a failure does not stop other trials. With a full disk the trial waits instead, and the same
+    launch continues from its last commit once there is room.
 
     Returns:
-        How the trial stands now.
+        The new status of the trial.
 
     Raises:
-        TeacherUnavailableError: the teacher's process is gone; the trial waits to be resumed.
+        TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
     """
-    torch.set_num_threads(1)  # equal bytes on any machine, and trials on other cores are left alone
+    torch.set_num_threads(1)  # equal bytes on all machines, and no load on other trials' cores
     provenance = {
         **collect_provenance(),
         "code": code_of(spec),
-    }  # waits for git, in silence: so before the trial begins
+    }  # waits for git without a heartbeat, so before the trial begins
     try:
         writer = store.begin(spec)
     except StorageError as error:
@@ -179,7 +179,7 @@ def run_recorded(
             logger.error("%s", error)
             return _close(writer, TrialState.WAITING, error=str(error))
         except USERS_ERRORS as error:
-            logger.exception("failed; the files go to update %d", writer.record.update)
+            logger.exception("failed; its files end at update %d", writer.record.update)
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")
             return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))
@@ -187,7 +187,7 @@ def run_recorded(
 
 
 def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:
-    """End an attempt that broke off; what keeps its files from saying so must not hide why it did."""
+    """End an attempt after an error; a failure to record it must not hide the error."""
     try:
         writer.close(status, error=error, traceback=traceback)
     except (LostLeaseError, StorageError) as also:
@@ -197,7 +197,7 @@ def _close(writer: TrialWriter, status: TrialState, *, error: str = "", tracebac
 
 @contextmanager
 def _log_to(store: TrialStore) -> Iterator[None]:
-    """Send the log of this process's trial to its folder."""
+    """Write the log of this process's trial to its folder."""
     handler = _Log(store.log_path, encoding="utf-8", delay=True)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     root = logging.getLogger("recrl")
@@ -214,9 +214,9 @@ def _log_to(store: TrialStore) -> Iterator[None]:
 
 
 class _Log(logging.FileHandler):
-    """A log that loses lines rather than end a trial: on a full disk nothing is said about the log.
+    """A log file that loses lines, for example on a full disk, instead of ending a trial.
 
-    A link in its place is not followed: it might lead to another file of the user's.
+    A link is not followed: it might lead to another file of the user.
     """
 
     def _open(self) -> TextIOWrapper:
@@ -224,7 +224,7 @@ class _Log(logging.FileHandler):
         return open(os.open(self.baseFilename, flags, 0o644), "a", encoding=self.encoding)
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as text, without secrets and control characters."""
+        """Return the record as text, without secrets and control characters."""
         return shown(super().format(record))
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -1,13 +1,12 @@
-"""Trials looked at afterwards: the policy of a checkpoint, evaluated and filmed.
+"""Evaluate and film the policy in a trial's newest checkpoint.
 
-Reads a trial's newest intact checkpoint, of a complete trial or of one that still runs, and changes nothing
-that the trial wrote; what is found goes into two folders of their own beside it:
+The trial may be complete or running, and its own files do not change. Results are in two separate folders:
 
-    evaluations/update-<update>__seed-<seed>.csv                a row an episode, as in evaluation.csv
+    evaluations/update-<update>__seed-<seed>.csv                one row per episode, as in evaluation.csv
     videos/update-<update>__seed-<seed>__<policy>.gif           one episode
 
-``seed-own`` stands for the seed of the trial's own evaluation: with it and the trial's number of episodes, a
-complete trial's ``evaluation.csv`` comes out again.
+``seed-own`` is the seed of the trial's own evaluation. With it and the trial's number of episodes, the result
+equals a complete trial's ``evaluation.csv``.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows
 from recrl.orchestrator.trial.videos import VideoFormat, captioned, stride, write_video
 
-DEFAULT_PICTURES_PER_SECOND = 10.0
+DEFAULT_FRAMES_PER_SECOND = 10.0
 
 
 class NoCheckpointError(RecrlError):
-    """The trial has left no intact checkpoint yet."""
+    """The trial has no intact checkpoint yet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +45,11 @@ class SavedTrial:
 
     Attributes:
         store: the trial's folder.
-        spec: what the trial is.
-        policy: the final policy as it was after these updates.
-        cmdp: what its task fixes.
-        update: policy updates it has learnt for.
-        env_steps: environment steps it has learnt from.
+        spec: of the trial.
+        policy: the final policy after these updates.
+        cmdp: the task's CMDP.
+        update: number of its policy updates.
+        env_steps: number of its environment steps.
     """
 
     store: TrialStore
@@ -62,7 +61,7 @@ class SavedTrial:
 
     @classmethod
     def load(cls, store: TrialStore) -> SavedTrial:
-        """The trial as its files have it.
+        """Load the policy from a trial's files.
 
         Raises:
             NoCheckpointError: there is no intact checkpoint.
@@ -83,18 +82,18 @@ class SavedTrial:
             raise RecrlError(f"{spec.title}: {error}; if you trust it, add --trust") from error
         except USERS_ERRORS as error:
             raise RecrlError(
-                f"{spec.title}: its checkpoint cannot be used with the task and the agent as they are "
-                f"installed: {described(error)}"
+                f"{spec.title}: its checkpoint cannot be used with the installed task and agent: "
+                f"{described(error)}"
             ) from error
 
     def evaluate(
         self, policies: Sequence[FrozenPolicy], *, num_episodes: int, seed: int | None
     ) -> tuple[pd.DataFrame, Path]:
-        """Run the policy for whole episodes; a row each, and the file that holds them.
+        """Evaluate the policy for whole episodes; return one row per episode, and the file with them.
 
         Args:
-            policies: how it chooses; at least one.
-            num_episodes: of each, at least 1.
+            policies: stochastic, deterministic or both; at least one.
+            num_episodes: for each, at least 1.
             seed: of the environments and the policy, at least 0; None for the trial's own.
         """
         try:
@@ -109,10 +108,10 @@ class SavedTrial:
         return pd.DataFrame(rows), path
 
     def film(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:
-        """Film one episode, with its return and costs below the pictures.
+        """Film one episode, with its return and costs below the frames.
 
         Args:
-            policy: how it chooses.
+            policy: stochastic or deterministic.
             video_format: GIF or MP4.
             seed: of the environment and the policy, at least 0; None for the trial's own.
 
@@ -120,7 +119,7 @@ class SavedTrial:
             The video.
 
         Raises:
-            RecrlError: the task has no pictures, or this machine cannot draw or encode them.
+            RecrlError: the task cannot be rendered, or this machine cannot render or encode it.
         """
         path = self.video_path(policy, video_format, seed=seed)
         try:
@@ -129,8 +128,8 @@ class SavedTrial:
             raise RecrlError(f"{self.spec.title}: {error}") from error
         except USERS_ERRORS as error:
             raise RecrlError(f"{self.spec.title}: cannot be drawn: {described(error)}") from error
-        speed = float(environment.metadata.get("render_fps") or DEFAULT_PICTURES_PER_SECOND)
-        every = stride(video_format, pictures_per_second=speed, longest=self.cmdp.horizon)
+        speed = float(environment.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND)
+        every = stride(video_format, frames_per_second=speed, longest=self.cmdp.horizon)
         shots = film(
             self.policy,
             environment,
@@ -140,8 +139,8 @@ class SavedTrial:
             every=every,
         )
         try:
-            pictures = (captioned(shot.picture, self._caption(shot)) for shot in shots)
-            write_video(path, pictures, pictures_per_second=speed / every)
+            frames = (captioned(shot.frame, self._caption(shot)) for shot in shots)
+            write_video(path, frames, frames_per_second=speed / every)
         except RuntimeError as error:  # no graphics library
             raise RecrlError(f"{self.spec.title}: cannot be drawn: {error}") from error
         finally:
@@ -149,7 +148,7 @@ class SavedTrial:
         return path
 
     def video_path(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:
-        """Where ``film`` puts its video."""
+        """Return the path of the video of ``film``."""
         return self.store.videos_folder / f"{self._file_name(seed)}__{policy}.{video_format}"
 
     def _file_name(self, seed: int | None) -> str:
@@ -169,10 +168,9 @@ class SavedTrial:
 
 
 def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
-    """What an evaluation says, a row a policy, as finished text.
+    """Summarise an evaluation as text, one row per policy.
 
-    Means are given with their standard errors; ``within`` is the share of the episodes in which no cost
-    exceeded its d_d.
+    Means have standard errors; ``within`` is the fraction of the episodes in which no cost exceeded its d_d.
     """
     costs = [f"cost_{i}" for i in range(saved.cmdp.num_costs)]
     limits = saved.spec.deploy_limits.array
@@ -198,7 +196,7 @@ def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
 
 
 def _mean_text(column: pd.Series[float]) -> str:
-    """``9.50 ± 0.02``, the mean and its standard error; the mean alone of a single value."""
+    """Format the mean and its standard error, ``9.50 ± 0.02``; the mean alone for a single value."""
     values = column.to_numpy(np.float64)
     if len(values) < 2:
         return f"{values.mean():.2f}"

@@ -1,4 +1,4 @@
-"""How fast a trial learns on this machine, measured by running a little of it."""
+"""Measure the speed of a trial on this machine by running a short part of it."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ MEASURED_SECONDS = 1.0
 def measured_speed(spec: TrialSpec, *, seconds: float = MEASURED_SECONDS) -> float:
     """Return a trial's environment steps per CPU second, collecting and learning together.
 
-    It runs in a folder that is deleted afterwards. The first update does not count, as it compiles and fills
-    caches, unless it alone takes the whole time.
+    It runs in a temporary folder. The first update does not count, because it compiles and fills caches,
+    unless it takes the whole time.
 
     Args:
         spec: the trial.
-        seconds: of CPU time that the measurement takes, about; at least one update.
+        seconds: approximate CPU time of the measurement; at least one update.
 
     Raises:
-        RecrlError: the task or the agent raised something.
+        RecrlError: the task or the agent raised an error.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,14 +1,14 @@
-"""One trial, as a pure program: an agent learns a task under a teacher's limits, and leaves files.
+"""One trial: an agent learns a task under a curriculum's limits, and the results go to files.
 
-Knows neither Ray nor MLflow: an executor runs it, a mirror shows it. All of a trial's state (agent,
-optimisers, multipliers, teacher, environments, generators, counters, partial episodes) is in one tree, so a
-trial killed anywhere and resumed gives the bytes of one that never stopped.
+Independent of Ray and MLflow. All of a trial's state (agent, optimisers, multipliers, teacher, environments,
+generators, counters, partial episodes) is in one tree. So a trial that was killed and resumed gives the same
+bytes as an uninterrupted one.
 
-The walk of an update: collect T x B environment steps; append the episodes that finished;
-``agent.update(rollout, episode costs, step)`` under the curriculum's step, then ``teacher.step(state,
-report)`` for the next one. When the budget B is spent the phase is deployment, the limits are d_d, the noise
-is 0 and the teacher is not asked any more; the agent goes on learning. At the end the policy is frozen and
-evaluated.
+The steps of an update: collect T x B environment steps; append the finished episodes; call
+``agent.update(rollout, episode costs, step)`` with the curriculum's step, then ``teacher.step(state,
+report)`` for the next one. After the budget B the phase is deployment: the limits are d_d, the noise is 0,
+and the teacher is not called any more. The agent continues learning. At the end the final policy is evaluated
+without learning.
 """
 
 from __future__ import annotations
@@ -39,22 +39,23 @@ from recrl.orchestrator.trial.rollout_check import check_rollout
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherState, checked_answer
 
 LOGGED_UPDATES = 50
-"""Of a trial, about so many are logged."""
+"""Approximate number of log lines of a trial."""
 HARD_LANDING = 0.1
-"""By what share of d_d (of 1, where d_d is less) the last training limit may exceed it without an event."""
+"""Fraction of d_d (of 1, if d_d is smaller) by which the last training limit may exceed d_d without an event.
+"""
 
 logger = logging.getLogger("recrl.trial")
 
 
 @dataclass(frozen=True)
 class TrialSeeds:
-    """The independent sources of a trial's randomness, all from its one seed.
+    """Independent seeds of a trial's randomness, all derived from its seed.
 
     Attributes:
-        environment: of the environments it learns in.
+        environment: of the training environments.
         agent: of the agent's initial parameters.
-        exploration: of the actions it takes while it learns.
-        evaluation: of the frozen policy's environments and actions.
+        exploration: of the actions in training.
+        evaluation: of the evaluation's environments and actions.
     """
 
     environment: np.random.SeedSequence
@@ -64,7 +65,7 @@ class TrialSeeds:
 
     @classmethod
     def of(cls, spec: TrialSpec) -> Self:
-        """The sources of a trial; the same seed gives the same under every task, agent and method."""
+        """Return the seeds of a trial; they depend only on its seed, not on task, agent or method."""
         return cls(*np.random.SeedSequence(spec.seed).spawn(4))
 
 
@@ -72,13 +73,13 @@ class Trial:
     """A trial in memory, advanced one policy update at a time.
 
     Attributes:
-        spec: what the trial is.
+        spec: of the trial.
         update: policy updates done.
         env_steps: environment steps taken, over all environments.
     """
 
     def __init__(self, spec: TrialSpec, writer: TrialWriter, teacher: Teacher) -> None:
-        """Start the trial, or continue it exactly where its newest intact checkpoint was taken."""
+        """Start the trial, or continue it exactly from its newest intact checkpoint."""
         self.spec = spec
         self._writer = writer
         self._teacher = teacher
@@ -106,11 +107,11 @@ class Trial:
 
     @property
     def learned(self) -> bool:
-        """Whether every update is done; what is left is the evaluation."""
+        """Whether all updates are done; only the evaluation remains."""
         return self.update >= self.spec.num_updates
 
     def advance(self) -> None:
-        """Do one policy update: collect, record, learn, ask the teacher."""
+        """Do one policy update: collect, record, learn, call the teacher."""
         phase, step = self.phase, self._step
         clock = time.process_time()
         rollout, finished = self._collector.collect(self._agent, self._generator)
@@ -152,10 +153,10 @@ class Trial:
         )
 
     def evaluate(self) -> None:
-        """Freeze the policy; write its evaluations, stochastic and deterministic, and its table.
+        """Evaluate the final policy, stochastic and deterministic; write the results and its table.
 
-        Environments and generators are fresh and seeded from the trial's seed: nothing of training is
-        touched, and every method of a seed is evaluated on the same environment stream.
+        Environments and generators are new and seeded from the trial's seed. The state of training does not
+        change, and all methods of a seed are evaluated on the same environment stream.
         """
         spec, policy = self.spec, final_policy(self._agent)
         rows = evaluation_rows(
@@ -173,7 +174,7 @@ class Trial:
     def _number(
         self, finished: Sequence[FinishedEpisode], phase: Phase, step: CurriculumStep
     ) -> tuple[EpisodeStats, ...]:
-        """The finished episodes of a rollout, with their place in the trial."""
+        """Return the finished episodes of a rollout, with their index and step in the trial."""
         episodes = tuple(
             EpisodeStats(
                 index=self._episodes + offset,
@@ -191,7 +192,7 @@ class Trial:
         return episodes
 
     def _next_step(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
-        """Ask the teacher, or enter deployment; add the policy noise that the next step asks for."""
+        """Call the teacher, or enter deployment; add the policy noise of the next step."""
         if self.phase is Phase.DEPLOYMENT:
             self._warn_of_hard_landing()
             self._step = self._step.in_deployment(self.spec.deploy_limits)
@@ -218,7 +219,7 @@ class Trial:
         return checked_answer(answer, self.spec.method.label, self._cmdp.num_costs)
 
     def _warn_of_hard_landing(self) -> None:
-        """Record an event if much of the way from d_t to d_d is left when deployment begins."""
+        """Record an event if deployment begins with limits far below the last training limits."""
         before, after = self._step.limits, self.spec.deploy_limits
         start = self._step.start_limits or self.spec.train_limits
         if any(
@@ -228,7 +229,7 @@ class Trial:
             self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
 
     def _told(self, row: Mapping[str, Any]) -> str:
-        """Return and costs of an update as a line for the log."""
+        """Format return and costs of an update as a log line."""
         head = f"update {self.update} of {self.spec.num_updates}, {row['phase']}:"
         if not row["episodes"]:
             return f"{head} no episode ended"
@@ -239,7 +240,7 @@ class Trial:
         return f"{head} return {row['episode_return']:.2f}, {', '.join(costs)}"
 
     def _own_metrics(self, metrics: Mapping[str, float], row: Mapping[str, Any]) -> Mapping[str, float]:
-        """The agent's metrics, none of which may be called like a column of every trial."""
+        """Return the agent's metrics; their names must differ from the columns of all trials."""
         if taken := sorted(metrics.keys() & row.keys()):
             raise RowError(
                 f"agent {self.spec.agent.label}: its metrics must have other names than the columns that "
@@ -286,12 +287,12 @@ def evaluation_rows(
     num_episodes: int,
     seed: np.random.SeedSequence,
 ) -> list[dict[str, Any]]:
-    """Evaluate a frozen policy on fresh environments of a trial; a row of ``evaluation.csv`` an episode.
+    """Evaluate a policy on new environments of a trial; return one row of ``evaluation.csv`` per episode.
 
     Args:
         actor: chooses the actions.
         spec: the trial.
-        policies: how it chooses; each is evaluated on the same environment stream.
+        policies: stochastic, deterministic or both, each evaluated on the same environment stream.
         num_episodes: of each, at least 0.
         seed: of the environments and of the policy's randomness.
     """
@@ -313,9 +314,9 @@ def evaluation_rows(
 
 
 def policy_table(policy: FinalPolicy, environments: CMDPVectorEnv) -> list[dict[str, float]]:
-    """pi(a | s), a row a state, ``action_j`` the probability of action j.
+    """Return pi(a | s), one row per state, ``action_j`` the probability of action j.
 
-    Empty where there is no such table: the task is not finite, or the policy does not tell.
+    It is empty if the task is not finite, or the policy has no action probabilities.
     """
     if not isinstance(environments, FiniteVectorEnv) or not isinstance(policy, DiscretePolicy):
         return []
@@ -324,10 +325,10 @@ def policy_table(policy: FinalPolicy, environments: CMDPVectorEnv) -> list[dict[
 
 
 def _temperature(step: CurriculumStep) -> dict[str, float]:
-    """The column of the entropy coefficient; none where the curriculum never rewards entropy."""
+    """Return the column of the entropy coefficient; empty if the curriculum never rewards entropy."""
     return {} if step.entropy_coefficient is None else {"temperature": step.entropy_coefficient}
 
 
 def _mean(values: Sequence[float] | Floats) -> float:
-    """The mean, or NaN of nothing."""
+    """Return the mean, or NaN of nothing."""
     return float(np.mean(values)) if len(values) else float("nan")

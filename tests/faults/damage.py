@@ -83,7 +83,7 @@ SUMMARIES = (
     "about ",
     "time unknown",
     "nothing to do",
-    "launch goes on",
+    "launch continues damaged",
     "its files: ",
 )
 

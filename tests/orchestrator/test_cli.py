@@ -166,7 +166,7 @@ def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
     assert main(["launch", "grid.yaml", *INLINE[:-1]]) == ExitCode.OK
     out = capsys.readouterr().out
     assert (
-        "Figures    not all are drawn (KeyError: 'river'), by a mistake in recrl\n"
+        "Figures    not all are drawn (KeyError: 'river'), because of a bug in recrl\n"
         "           for its traceback: recrl-sweep figures small\n"
         "Results    runs/small\n"
     ) in out
@@ -252,7 +252,7 @@ def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureF
     assert main(["status"]) == ExitCode.WRONG_INPUT
     assert main(["status", "smal"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.splitlines() == [
-        "recrl-sweep: runs: holds 2 sweeps; say which one: large, small",
+        "recrl-sweep: runs: holds 2 sweeps; give one: large, small",
         "recrl-sweep: runs: holds no sweep 'smal'; did you mean 'small'? (there: large, small)",
     ]
 
@@ -286,7 +286,7 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
         out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (ExitCode.STOPPED, "")
     assert out.splitlines()[-1] == (
-        "Stopped; nothing is lost. Go on with: recrl-sweep launch grid.yaml "
+        "Stopped; nothing is lost. Continue with: recrl-sweep launch grid.yaml "
         "--executor inline --no-mlflow --no-figures"
     )
     store = SweepStore(folder / "runs", "small")
@@ -311,7 +311,7 @@ def test_stop_ends_a_launch_from_another_terminal(folder: Path, capsys: pytest.C
         assert process.stdout.readline() == "small: 2 trials: 2 new\n"
         assert main(["stop", "small"]) == ExitCode.OK
         first, last = capsys.readouterr().out.splitlines()
-        assert first == "small: its trials save where they are"
+        assert first == "small: its trials save their state"
         assert last.startswith("small: 0 of 2 complete, 0 running, ")
         assert "Stopped; nothing is lost." in process.communicate(timeout=60)[0]
     assert process.returncode == ExitCode.STOPPED
@@ -344,7 +344,7 @@ def test_logs_are_found_by_id_title_or_folder(folder: Path, capsys: pytest.Captu
         ([], "small: no trials are running; status names them"),
         (
             ["two-state"],
-            "small: 2 trials on disk begin with 'two-state'; say which one, by its id or title: ",
+            "small: 2 trials on disk begin with 'two-state'; give one, by its id or title: ",
         ),
     ],
 )
@@ -380,7 +380,7 @@ def test_a_disk_that_takes_nothing_is_a_sentence(folder: Path, capsys: pytest.Ca
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert code == ExitCode.CANNOT_RUN
-    assert capsys.readouterr().err.endswith("File too large; what was saved stays\n")
+    assert capsys.readouterr().err.endswith("File too large; saved results are kept\n")
 
 
 @pytest.mark.parametrize(

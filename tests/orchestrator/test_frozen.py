@@ -121,7 +121,7 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(complete: TrialStore) -> N
     changed = TrialStore(complete.folder.parent / other.folder_name)
     changed.begin(other).commit(tree["trial"], update=5, env_steps=200)
     with pytest.raises(
-        RecrlError, match=r"^two-state ppo-lag none seed 5: its checkpoint cannot be used with the task and "
+        RecrlError, match=r"^two-state ppo-lag none seed 5: its checkpoint cannot be used with the installed "
     ):
         SavedTrial.load(changed)
 
@@ -158,7 +158,7 @@ def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
     assert [shot.step for shot in shots] == list(range(episode.length + 1))
     assert shots[-1].episode_return == pytest.approx(episode.episode_return)
     assert tuple(shots[-1].costs) == episode.costs
-    assert shots[0].picture.shape == (288, 288, 3)
+    assert shots[0].frame.shape == (288, 288, 3)
     drawn = make_drawn("rivergrid-1a", options=options)
     seldom = film(saved.policy, drawn, FrozenPolicy.DETERMINISTIC, num_costs=1, seed=seed, every=5)
     assert [shot.step for shot in seldom] == sorted({*range(0, episode.length + 1, 5), episode.length})
@@ -169,12 +169,12 @@ def test_a_video_has_a_picture_a_step(crossing: TrialStore) -> None:
     path = SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=3)
     assert path == crossing.videos_folder / "update-00000009__seed-3__stochastic.gif"
     with Image.open(path) as video:
-        assert 2 <= video.n_frames <= 13  # type: ignore[attr-defined]  # pictures without a change are one
+        assert 2 <= video.n_frames <= 13  # type: ignore[attr-defined]  # frames without a change are one
         assert video.size == (288, 312)
     assert contents(crossing) == before
 
 
-def test_a_task_without_pictures_is_a_sentence(complete: TrialStore) -> None:
+def test_a_task_without_rendering_is_a_sentence(complete: TrialStore) -> None:
     with pytest.raises(
         RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state cannot be rendered"
     ):
@@ -190,9 +190,9 @@ def test_a_drawn_task_is_the_task(name: str) -> None:
     assert np.shape(observation) == first.shape[1:]
     info = drawn.step(drawn.action_space.sample())[4]
     assert np.size(info["cost"]) == environments.cmdp.num_costs
-    picture = drawn.render()
-    assert isinstance(picture, np.ndarray)
-    assert picture.dtype == np.uint8
+    frame = drawn.render()
+    assert isinstance(frame, np.ndarray)
+    assert frame.dtype == np.uint8
     drawn.close()
 
 

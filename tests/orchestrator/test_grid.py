@@ -231,7 +231,7 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
             "exclude: [{method: linaer}]\nrun:",
             "grid.yaml:6: exclude.0.method: this grid has no method 'linaer'; did you mean 'linear'?",
         ),
-        ("run:", "exclude: [{agent: ppo-lag}]\nrun:", "grid.yaml:6: exclude: leaves no trial at all"),
+        ("run:", "exclude: [{agent: ppo-lag}]\nrun:", "grid.yaml:6: exclude: leaves no trial"),
         (
             "run:",
             "exclude: [{}]\nrun:",

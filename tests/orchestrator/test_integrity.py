@@ -38,8 +38,8 @@ seeds: 1
 run: {total_steps: 120, deploy_fraction: 0.5, num_envs: 2, rollout_steps: 10, evaluation_episodes: 2}
 """
 INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
-RERUN = "launch --rerun-damaged runs the trial again and moves what is damaged aside"
-GOES_ON = "the next launch goes on from what is whole and moves what is damaged aside"
+RERUN = "launch --rerun-damaged runs the trial again and moves the damaged files aside"
+GOES_ON = "the next launch continues from the intact files and moves the damaged ones aside"
 SPECS = parse_grid(GRID.encode(), source="grid.yaml").trials()
 
 
@@ -154,7 +154,7 @@ def test_a_flipped_byte_in_a_complete_trial_is_found_by_its_digest(
     assert capsys.readouterr().out.splitlines() == [
         f"{trial.spec.title}: episodes.csv is not what was committed: its checksum differs",
         "small: 2 trials checked, 1 wrong file",
-        "launch goes on with damaged trials from what is whole; complete ones: --rerun-damaged",
+        "launch continues damaged trials from their intact files; complete ones: --rerun-damaged",
     ]
 
 
@@ -184,7 +184,7 @@ def test_a_damaged_complete_trial_is_run_again_only_when_asked(
     out = capsys.readouterr().out
     assert "small: 2 trials: 1 complete, 1 damaged\nnothing to do\n" in out
     assert out.splitlines()[-1] == (
-        "1 damaged trial left alone; what is damaged is moved aside and run again with: recrl-sweep launch "
+        "1 damaged trial left alone; to move the damaged files aside and run again: recrl-sweep launch "
         "grid.yaml --executor inline --no-mlflow --no-figures --rerun-damaged"
     )
     assert trial.episodes_path.read_bytes() == damaged
@@ -384,7 +384,7 @@ def test_a_local_copys_address_that_is_damaged_is_a_sentence(
     assert main(["status"]) == ExitCode.CANNOT_RUN
     assert capsys.readouterr().err == (
         "recrl-sweep: small: storage.json has format None, of another version of recrl, and this one reads "
-        "format 2, so that nobody knows where the sweep is kept; delete it and give --storage URI again\n"
+        "format 2, so that the sweep's address is unknown; delete it and give --storage URI again\n"
     )
 
 
@@ -505,7 +505,7 @@ def test_episodes_must_all_have_the_same_costs(tmp_path: Path) -> None:
     writer = SweepStore(tmp_path, "sweep").trial(SPECS[0]).begin(SPECS[0])
     writer.append_episode(episode(1.0))
     with pytest.raises(
-        RowError, match=r"^task two-state: an episode has 2 costs and 2 limits, those before it had"
+        RowError, match=r"^task two-state: an episode has 2 costs and 2 limits, earlier ones had"
     ):
         writer.append_episode(episode(1.0, 2.0))
 

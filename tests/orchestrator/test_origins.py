@@ -95,7 +95,7 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert main(["status", "--brief"]) == ExitCode.OK
     assert SENTENCE in capsys.readouterr().out.splitlines()
     assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
-    assert f"{SENTENCE}; here their policies met the present code" in capsys.readouterr().out.splitlines()
+    assert f"{SENTENCE}; these evaluations use the installed code" in capsys.readouterr().out.splitlines()
     assert SENTENCE.removeprefix("warning: ") in report.missing(sweep_data.load(store))
 
     assert main(["launch", "grid.yaml", *INLINE, "--rerun-changed"]) == ExitCode.OK

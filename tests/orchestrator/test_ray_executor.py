@@ -114,8 +114,8 @@ def test_equal_bytes_in_reused_workers_and_failures_stop_nobody(
     crashed = store.trial(CRASHING).record()
     assert crashed.status is TrialState.FAILED
     assert crashed.error == (
-        "its process failed once; the last time: it ended without a word: killed from outside, for want of "
-        "memory, or by the task's or the agent's own code"
+        "its process failed once; the last time: it ended without an error: killed from outside, "
+        "out of memory, or ended by the task's or the agent's own code"
     )
     assert [path.name for path in store.folder.iterdir()] == ["trials"]
     assert capfd.readouterr().out == ""
@@ -296,7 +296,7 @@ def test_nodes_are_asked_before_any_trial(tmp_path: Path) -> None:
     ):
         check_nodes("/nowhere/probe")
     with pytest.raises(
-        ClusterError, match=r": \S+ does not see memory://bucket, but another in its place; give "
+        ClusterError, match=r": \S+ does not see memory://bucket, but another file in its place; give "
     ):
         check_nodes("probe", "memory://bucket")
 

@@ -80,7 +80,7 @@ def test_ray_client_is_refused() -> None:
         pytest.raises(
             ClusterError,
             match=r"^cannot use the Ray cluster at ray://head:10001: the driver must run on a node of the "
-            r"cluster, not beyond Ray Client; launch there with --address auto, or make this machine a ",
+            r"cluster, not through Ray Client; launch there with --address auto, or make this machine a ",
         ),
         existing_cluster("ray://head:10001"),
     ):

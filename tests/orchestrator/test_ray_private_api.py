@@ -59,7 +59,7 @@ def test_a_newer_ray_is_used_with_a_warning(
     assert caplog.messages == []
     monkeypatch.setattr(ray, "__version__", "2.61.0")
     private_api.require_known_ray()
-    assert caplog.messages == ["Ray 2.61.0 is newer than recrl was tested with: ray[tune]>=2.48,<2.61"]
+    assert caplog.messages == ["Ray 2.61.0 is newer than the tested versions: ray[tune]>=2.48,<2.61"]
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
     os.kill(victim, signal.SIGKILL)
     _, errors = driver.communicate(timeout=100.0)
     assert driver.returncode == 4
-    expected = r"[0-9]+ has died; nothing that was saved is lost, and the same launch goes on\n"
+    expected = r"[0-9]+ has died; nothing that was saved is lost, and the same launch continues\n"
     assert re.fullmatch("(recrl-sweep: )?" + re.escape(said) + expected, errors)
     assert not store.is_locked()
     end = time.monotonic() + 30.0

@@ -148,7 +148,7 @@ def test_a_damaged_local_copy_says_that_it_is_one(tmp_path: Path, local: SweepSt
 
 def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
     here = machine(tmp_path, "here")
-    with pytest.raises(RecrlError, match="trials of a sweep that is kept there are not run again: "):
+    with pytest.raises(RecrlError, match="trials of a sweep in an object store are not run again: "):
         settings = LaunchSettings(grid(), here.storage, InlineExecutor(), rerun_damaged=True)
         launch(settings, stop=threading.Event())
     assert not here.store.folder.exists()
@@ -445,4 +445,4 @@ def test_memory_is_for_one_process(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "grid.yaml").write_text(GRID)
     assert main(["launch", "grid.yaml", "--storage", "memory://bucket"]) == ExitCode.WRONG_INPUT
-    assert "is one process's memory, which others do not see" in capsys.readouterr().err
+    assert "is memory of a single process" in capsys.readouterr().err

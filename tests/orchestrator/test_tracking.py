@@ -536,7 +536,7 @@ def test_what_was_missed_is_sent_when_mlflow_is_back(
     store.mlflow_database.write_text("not a database")
     report = sync(store, uri)
     assert report.problem == (
-        f"TrackingError: {store.mlflow_database}: not a sqlite database; delete it to have it made anew"
+        f"TrackingError: {store.mlflow_database}: not a sqlite database; delete it, and it is created anew"
     )
     database.replace(store.mlflow_database)
     assert sync(store, uri).is_up_to_date
