@@ -118,7 +118,7 @@ class FinalPolicy(Policy, Protocol):
 
 @runtime_checkable
 class Averaging(Protocol):
-    """An agent whose final policy is another than the one that collects experience; agents may be it."""
+    """An agent whose final policy differs from its behaviour policy; optional for agents."""
 
     def final_policy(self) -> FinalPolicy:
         """Return the policy that would be deployed now."""

@@ -131,8 +131,9 @@ class Encoder:
         """Return what an encoding is computed from at present.
 
         Returns:
-            lidar (indices of the lidar numbers, [L]), rates (ranges over length scales, [S, L]), normalise
-            (which numbers are standardised, [n]), and mean and spread of all numbers, [n], or [0] if none is.
+            lidar, the indices of the lidar numbers, [L]; rates, the ranges over the length scales, [S, L];
+            normalise, which numbers are standardised, [n]. If any is: mean and spread of all numbers, [n];
+            else [0].
         """
         mean, spread = self._moments.mean_and_spread if self._moments else (np.empty(0), np.empty(0))
         rates = np.array(self._rates, np.float32).reshape(len(self._rates), len(self._lidar))

@@ -95,9 +95,9 @@ class ActorCriticConfig(BaseModel):
     )
     normalise_observations: Literal["unbounded", "all", "none"] = Field(
         default="unbounded",
-        description="Observation numbers that are standardised by their running mean and standard deviation: "
-        "unbounded, those without finite bounds if the task does not declare what they are (ours); all; or "
-        "none (paper).",
+        description="Which observation numbers are standardised by their running mean and standard "
+        "deviation: all; none (paper); or unbounded, numbers without finite bounds (ours). If the task "
+        "declares its components, unbounded is none.",
     )
     discount: Share = Field(default=0.99, description="Discount gamma of the critics, per step (paper).")
     reward_trace_decay: Share = Field(
@@ -153,9 +153,8 @@ class ActorCriticConfig(BaseModel):
     )
     policy_average: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
         default=0.9,
-        description="The final policy, which is evaluated and exported, is an exponential moving average of "
-        "the policies after each update: the share of it that an update keeps (ours); 0 for the last policy "
-        "(paper). Training is the same.",
+        description="Decay of the exponential moving average over the policies after each update. The "
+        "average is the final policy, for evaluation and export (ours). 0: the last policy (paper).",
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",

@@ -96,7 +96,7 @@ class SweepPlace:
         """Bring one trial in the folder up to date."""
 
     def is_out_of_touch(self, silence_seconds: float) -> bool:
-        """Return whether the folder is so old that a silence of so many seconds in it says nothing."""
+        """Return whether the folder is too old to conclude from a silence of this many seconds."""
         return False
 
     def working_copy(
@@ -106,7 +106,7 @@ class SweepPlace:
         return nullcontext(self.store.trial(spec))
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:
-        """Return the stop sign of a new run; workers of earlier runs are told to stop."""
+        """Return the stop signal of a new run; workers of earlier runs are stopped."""
         return StopFile.open(self.store.folder)
 
     def stop_sign_at(self, place: str) -> StopSign:

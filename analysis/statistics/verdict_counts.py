@@ -27,12 +27,12 @@ def verdicts(rows: pd.DataFrame, compared: pd.DataFrame, flags: pd.DataFrame) ->
         flags: of ``validity.curriculum_flags``.
 
     Returns:
-        GROUP, seeds, solved, feasible (the solved ones included), infeasible, worst_excess (the largest cost
-        above its limit among the infeasible seeds, or NaN), worst_share (the same divided by that limit),
-        episode_return and cost_i (means over seeds, with standard errors _se; NaN for one seed),
-        deploy_limit_i, optimal_return, exact (whether every seed is), episodes (of a seed),
-        deployment_return and deployment_cost_i (likewise, with _se), no_curriculum and hard_landing (seeds
-        that have the flag), return_difference with _low and _high (NaN without a baseline).
+        GROUP, seeds, solved, feasible (the solved ones included), infeasible; worst_excess (the largest cost
+        above its limit among the infeasible seeds, or NaN); worst_share (the same divided by that limit);
+        episode_return and cost_i (means over seeds, with standard errors _se; NaN for one seed);
+        deploy_limit_i, optimal_return, exact (whether every seed is), episodes (of a seed);
+        deployment_return and deployment_cost_i (likewise, with _se); no_curriculum and hard_landing (seeds
+        that have the flag); return_difference with _low and _high (NaN without a baseline).
     """
     final = rows[rows["measure"] == FINAL.value]
     deployed = rows[rows["measure"] == Measure.DEPLOYMENT.value]

@@ -120,7 +120,7 @@ def kept(compiler: Any, function: Any) -> Any:
 def salted(function: Any) -> Any:
     """The same function to Numba, but that machine code kept for it is found under ``source_digest`` only.
 
-    Numba compares what a function's free variables hold, so the digest becomes one that nobody reads.
+    Numba compares what a function's free variables hold, so the digest becomes an unused free variable.
     """
     code = function.__code__
     found = types.FunctionType(

@@ -20,8 +20,8 @@ from recrl.orchestrator.cli import argument_types as types
 VIDEOS = ("gif", "mp4")
 TEMPLATES = ("demo", "safety-gym", "velocity", "own-task")
 DEFAULT_ROOT = Path("runs")
-KINDS = ("tasks", "agents", "curricula", "methods")  # methods: as in a grid
-SWEEP_HELP = "a sweep's name, folder or grid file; may be left out where there is only one"
+KINDS = ("tasks", "agents", "curricula", "methods")  # methods: the key in a grid
+SWEEP_HELP = "a sweep's name, folder or grid file; optional if there is only one"
 
 # Settings that several commands have.
 _GRID: Mapping[str, Any] = {
@@ -120,7 +120,7 @@ class PlaceRequest(Request):
     storage: str | None = by_flag(
         metavar="URI",
         help="keep the sweep in an object store (s3://bucket/folder, gs://, abfs://...) that all nodes "
-        "reach; its folder under --root is then a mirror, and remembers the address",
+        "reach; its folder under --root is then a local copy that stores the address",
     )
 
 
@@ -135,16 +135,17 @@ class GridRequest(PlaceRequest):
     )
     rerun_damaged: bool = by_flag(
         action="store_true",
-        help="run damaged trials again that were complete or had failed; others are by themselves",
+        help="run damaged trials again that were complete or had failed; other damaged trials are repaired "
+        "anyway",
     )
     rerun_changed: bool = by_flag(
         action="store_true",
-        help="run trials again that ran other code than is installed now; what they left is kept aside",
+        help="run trials again that ran other code than is installed now; their old files are kept aside",
     )
     max_concurrent: int | None = by_flag(
         type=types.at_least_one,
         metavar="N",
-        help="trials at once, at most; by default as many as fit (or as the grid says)",
+        help="largest number of parallel trials; by default as fit (or the grid's)",
     )
     address: str | None = by_flag()
 
@@ -163,7 +164,7 @@ class LaunchRequest(GridRequest):
     executor: str = by_flag(
         choices=("ray", "inline"),
         default="ray",
-        help="ray: side by side on all cores or a cluster (default); inline: one after the other in this "
+        help="ray: in parallel on all cores or a cluster (default); inline: one after the other in this "
         "process, for debuggers",
     )
     ship_package: bool = by_flag(
@@ -171,7 +172,7 @@ class LaunchRequest(GridRequest):
         help="with --address: send recrl itself, without its dependencies, to the cluster's nodes",
     )
     mlflow: bool = by_flag(
-        "--no-mlflow", action="store_false", help="send nothing to MLflow; 'sync' can do it later"
+        "--no-mlflow", action="store_false", help="do not log to MLflow; 'sync' can do it later"
     )
     figures: bool = by_flag("--no-figures", action="store_false", help="draw no figures at the end")
 
@@ -183,15 +184,15 @@ class PlanRequest(GridRequest):
     address: str | None = by_flag(
         group="room",
         metavar="HOST:PORT",
-        help="estimate for this Ray cluster, which is asked; by default for this machine",
+        help="estimate for this Ray cluster, which must run; by default for this machine",
     )
     cores: int | None = by_flag(
-        group="room", type=types.at_least_one, metavar="N", help="estimate for so many cores"
+        group="room", type=types.at_least_one, metavar="N", help="estimate for this number of cores"
     )
-    check: bool = by_flag(action="store_true", help="end with 5 if a launch would have something to do")
+    check: bool = by_flag(action="store_true", help="exit with code 5 if a launch would have something to do")
     measure: bool = by_flag(
         action="store_true",
-        help="run about a second of each task and agent that has not run yet, to estimate the time",
+        help="run about a second of each task and agent without a known speed, to estimate the time",
     )
     trust: bool = by_flag(**_TRUST)
 
@@ -213,7 +214,7 @@ class SweepRequest(PlaceRequest):
 
 @dataclass(frozen=True)
 class StatusRequest(SweepRequest):
-    """Say how far a sweep is, from its files alone."""
+    """Show the progress of a sweep, from its files."""
 
     brief: bool = by_flag(action="store_true", help="one line, without the table of trials")
 
@@ -233,18 +234,18 @@ class LogsRequest(SweepRequest):
     trial: tuple[str, ...] = by_place(
         nargs="*",
         metavar="TRIAL",
-        help="the beginning of its id, title or folder, as status shows them; default: the one that runs",
+        help="the beginning of its id, title or folder, as status shows them; default: the running trial",
     )
     follow: bool = by_flag(
         action="store_true",
-        help="wait until the trial starts, and for more lines as long as it runs",
+        help="wait until the trial starts, and show new lines as long as it runs",
     )
     folder: bool = by_flag(action="store_true", help="print the trial's folder instead")
 
 
 @dataclass(frozen=True)
 class EvaluateRequest(SweepRequest):
-    """Evaluate the policies of trials without learning; film them on demand."""
+    """Evaluate the policies of trials without learning; optionally film them."""
 
     trial: tuple[str, ...] = by_place(
         nargs="*",
@@ -256,21 +257,22 @@ class EvaluateRequest(SweepRequest):
     episodes: int | None = by_flag(
         type=types.at_least_one,
         metavar="N",
-        help="of each policy; by default as many as the trial itself evaluates at its end",
+        help="for each policy; by default the number of the trial's own evaluation",
     )
     seed: int | None = by_flag(
         type=types.at_least_zero,
         metavar="S",
-        help="of the episodes; by default that of the trial's own evaluation, which then comes out again",
+        help="for the episodes; by default that of the trial's own evaluation, whose results are then equal",
     )
     policy: str = by_flag(
         choices=("stochastic", "deterministic", "both"),
         default="both",
-        help="act as in training, by the most likely action, or one after the other (default)",
+        help="stochastic as in training, deterministic, or both one after the other (default)",
     )
     video: str | None = by_flag(
         choices=VIDEOS,
-        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; MLflow gets it",
+        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; it is also "
+        "logged to MLflow",
     )
     tracking_uri: str | None = by_flag(**_TRACKING)
 
@@ -284,17 +286,17 @@ class SourceRequest(SweepRequest):
     )
     tracking_uri: str | None = by_flag(
         metavar="URI",
-        help="read MLflow alone, no files: a server (http://host:port) or database (sqlite:///file.db)",
+        help="read MLflow instead of files: a server (http://host:port) or database (sqlite:///file.db)",
     )
 
 
 @dataclass(frozen=True)
 class FiguresRequest(SourceRequest):
-    """Draw the figures, tables and report of what is there so far."""
+    """Draw the figures, tables and report of the present results."""
 
     trust: bool = by_flag(**_TRUST)
     to: Path | None = by_flag(
-        type=types.folder, metavar="FOLDER", help="where to; by default the sweep's figures folder"
+        type=types.folder, metavar="FOLDER", help="the output folder; by default the sweep's figures folder"
     )
     band: str = by_flag(
         choices=("mean", "iqm"),
@@ -304,7 +306,7 @@ class FiguresRequest(SourceRequest):
     )
     sketch: bool = by_flag(
         action="store_true",
-        help="only learning curves, limits and tables, no PDF: quick, as launch does while it runs",
+        help="only learning curves, limits and tables, no PDF: fast, as during a launch",
     )
 
 
@@ -325,9 +327,9 @@ class MergeRequest(Request):
         type=types.path_of,
         nargs="+",
         metavar="FILE.zip",
-        help="the first gives the name; of a trial that several have, the one that got furthest is taken",
+        help="the first gives the name; if several have a trial, the furthest is used",
     )
-    to: Path = by_flag(type=types.zip_file, metavar="FILE.zip", required=True, help="what to write")
+    to: Path = by_flag(type=types.zip_file, metavar="FILE.zip", required=True, help="the output file")
 
 
 @dataclass(frozen=True)
@@ -338,11 +340,11 @@ class BoundRequest(SourceRequest):
     budget: float | None = by_flag(
         type=types.cost,
         metavar="COST",
-        help="cost above the deployment limit that all training episodes may have together: find the largest "
+        help="allowed cost above the deployment limit of all training episodes together: find the largest "
         "training limit d_t",
     )
     cost: int = by_flag(
-        type=types.at_least_one, default=1, metavar="I", help="which of the costs (default: the first)"
+        type=types.at_least_one, default=1, metavar="I", help="index of the cost (default: 1)"
     )
 
 
@@ -358,7 +360,7 @@ class ReplayRequest(SweepRequest):
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="its options where they differ from the sweep's, window=8",
+        help="its options that differ from the sweep's, window=8",
     )
     only: tuple[str, ...] = by_flag(**_ONLY)
 
@@ -373,7 +375,7 @@ class UIRequest(SweepRequest):
 
 @dataclass(frozen=True)
 class SyncRequest(SweepRequest):
-    """Bring MLflow up to the files, for example after it was unreachable."""
+    """Bring MLflow up to date with the files, for example after it was unreachable."""
 
     tracking_uri: str | None = by_flag(**_TRACKING)
     rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
@@ -393,7 +395,7 @@ class InitRequest(Request):
         choices=TEMPLATES,
         default=TEMPLATES[0],
         help="demo: RiverGrid in a few minutes (default); safety-gym and velocity: MuJoCo tasks; "
-        "own-task: an environment of your own, with a small Python file that holds one",
+        "own-task: your own environment, with a small example in Python",
     )
 
 

@@ -34,7 +34,7 @@ def locked(path: Path) -> Iterator[None]:
     """Hold a lock alone; waits for it.
 
     Raises:
-        StorageError: it is a link, a folder or no file at all.
+        StorageError: it is a link, a folder or another special file.
     """
     with open_lock(path) as file:
         fcntl.flock(file, fcntl.LOCK_EX)

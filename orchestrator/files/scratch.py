@@ -59,7 +59,7 @@ def dead_folders(parent: str) -> Iterator[Path]:
         with suppress(OSError), lock_path.open("r+") as lock:
             if os.fstat(lock.fileno()).st_uid == os.getuid():
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails where its process lives
-                if os.fstat(lock.fileno()).st_nlink:  # nobody else was quicker
+                if os.fstat(lock.fileno()).st_nlink:  # no other process was faster
                     yield lock_path.parent
 
 

@@ -19,7 +19,7 @@ class TrialFolder(TrialTables):
     """What a trial's writers need beside the readers' methods."""
 
     def write_record(self, record: TrialRecord) -> None:
-        """Write ``state.json``; whoever does it holds ``locked``."""
+        """Write ``state.json``; the caller holds ``locked``."""
         value = {"trial_id": self.trial_id, **record.to_json()}
         write_sealed(self.state_path, value, version=RECORD_FORMAT)
 
