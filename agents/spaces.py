@@ -35,7 +35,7 @@ def observation_size(space: gymnasium.Space[Any]) -> int:
 def unbounded_numbers(space: gymnasium.Space[Any]) -> npt.NDArray[np.bool_]:
     """Return which components of an observation row have an infinite bound, [n].
 
-    >>> unbounded_numbers(Box(np.array([0.0, -np.inf]), np.array([1.0, np.inf]))).tolist()
+    >>> unbounded_numbers(Box(np.float32([0.0, -np.inf]), np.float32([1.0, np.inf]))).tolist()
     [False, True]
     """
     if isinstance(space, Box):

@@ -24,7 +24,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import make_plan
 from recrl.orchestrator.remote.opening import sweep_place
-from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import REQUEST_SECONDS
 from recrl.orchestrator.sweep_progress import (
     DisplayStatus,
@@ -55,19 +55,24 @@ def run_status(request: StatusRequest, console: Console) -> ExitCode:
 def _warn_of_curricula(now: SweepProgress, store: SweepStore, console: Console) -> None:
     """Print the warnings about curricula that had no effect or ended far above d_d."""
     none = [it.spec.title for it in now.trials if it.spec.is_no_curriculum(it.record.start_limits)]
-    hard = [it.spec.title for it in now.trials if landed_hard(it.spec, _events(it, store))]
+    hard = []
+    for trial in now.trials:
+        if trial.record.status is TrialState.DAMAGED:  # it is printed above
+            continue
+        try:
+            if landed_hard(trial.spec, _events(trial, store)):
+                hard.append(trial.spec.title)
+        except StorageError as error:
+            say(console, f"damaged: {trial.spec.title}: {error}")
     for sentence in filter(None, (no_curriculum_sentence(none), hard_landing_sentence(hard))):
         say(console, f"warning: {sentence}")
 
 
 def _events(trial: TrialProgress, store: SweepStore) -> list[str]:
-    """The names of the events of a trial in its deployment phase; none of a damaged one."""
+    """Return the names of the events of a trial in its deployment phase."""
     if trial.record.env_steps < trial.spec.train_steps:
         return []
-    try:
-        return [str(event.get("event")) for event in store.trial(trial.spec).events()]
-    except StorageError:
-        return []
+    return [str(event.get("event")) for event in store.trial(trial.spec).events()]
 
 
 def run_check(request: CheckRequest, console: Console) -> ExitCode:

@@ -93,14 +93,14 @@ def test_every_option_is_described(capsys: pytest.CaptureFixture[str], name: str
 
 def test_options_show_type_default_and_description(capsys: pytest.CaptureFixture[str]) -> None:
     out = output(capsys, "options", "cpo")
-    assert re.search(r"^discount +number +0.99 +gamma of the critics", out, re.MULTILINE)
+    assert re.search(r"^discount +number +0.99 +Discount gamma of the critics", out, re.MULTILINE)
     out = output(capsys, "options", "rivergrid")
     assert re.search(r"^generate.seed +whole number +required +Seed of the map", out, re.MULTILINE)
 
 
 def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
     out = output(capsys, "options", "run")
-    assert out.startswith("run, a section of a grid: How long and how wide every trial runs.\n")
+    assert out.startswith("run, a section of a grid: Length and width of every trial.\n")
     assert re.search(r"^total_steps +whole number +required +Environment steps", out, re.MULTILINE)
     assert "silence_seconds" in output(capsys, "options", "resources")
     assert "train_limits" in output(capsys, "options", "limits")
