@@ -303,7 +303,6 @@ def fresh_agent(
         seed: of the initial parameters and of the order of minibatches.
         make_rule: the agent's rule for a policy.
     """
-    generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
     encoder = Encoder(
         observation_size(cmdp.observation_space),
         cmdp.components,
@@ -316,10 +315,16 @@ def fresh_agent(
         config.activation,
         None if config.network is None else trusted_attribute(config.network),
     )
-    policy = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
+
+    def first_policy() -> tuple[StochasticPolicy, torch.Generator]:
+        """Make the policy before the first update; return the generator for further networks, too."""
+        generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
+        made = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
+        return made, generator
+
+    policy, generator = first_policy()
+    averaged, _ = first_policy()
     critics = Critics(encoder.size, cmdp.num_costs, form, generator)
-    averaged = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
-    averaged.parameters.load(policy.parameters.to_numpy())
     order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))
     return ActorCritic(
         cmdp,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+import torch
 
 from recrl.agents.agent import Averaging, final_policy
 from recrl.agents.collection import Collector, episode_costs
@@ -17,7 +20,7 @@ STEP = CurriculumStep(CostLimits((5.0,)))
 
 
 def learnt(
-    name: str, task: str, options: dict[str, float], updates: int
+    name: str, task: str, options: dict[str, Any], updates: int
 ) -> tuple[ActorCritic, list[np.ndarray]]:
     """An agent after some updates, and the policy's parameters after each."""
     environments = make_vector(task, 4, options={"horizon": 10} if task == "two-state" else {})
@@ -45,7 +48,7 @@ def test_the_mean_has_geometric_weights(decay: float) -> None:
 @pytest.mark.parametrize("name", AGENTS)
 def test_without_averaging_the_final_policy_is_the_last(name: str) -> None:
     agent, _ = learnt(name, "two-state", {"policy_average": 0.0}, UPDATES)
-    observations = np.eye(2, dtype=np.float32)[:, : agent._encoder.size]
+    observations = np.eye(2, dtype=np.float32)
     assert isinstance(agent, Averaging)
     assert np.array_equal(final_policy(agent).act_greedily(observations), agent.act_greedily(observations))
     assert np.array_equal(
@@ -58,7 +61,7 @@ def test_the_final_policy_acts_by_the_mean() -> None:
     other, _ = learnt("ppo-lag", "continuous-bandit", {}, 1)
     state = agent.state_dict()
     other.load_state_dict({**state, "policy": state["average"]["mean"]})
-    observations = np.random.default_rng(0).standard_normal((5, agent._encoder.size)).astype(np.float32)
+    observations = np.random.default_rng(0).random((5, 1), np.float32)
     assert np.array_equal(agent.final_policy().act_greedily(observations), other.act_greedily(observations))
     assert not np.array_equal(
         agent.final_policy().act_greedily(observations), agent.act_greedily(observations)
@@ -73,7 +76,29 @@ def test_averaging_does_not_change_training() -> None:
 
 def test_before_the_first_update_the_final_policy_is_the_first() -> None:
     agent, _ = learnt("ppo-lag", "two-state", {}, 0)
-    observations = np.eye(2, dtype=np.float32)[:, : agent._encoder.size]
+    observations = np.eye(2, dtype=np.float32)
+    assert np.array_equal(
+        agent.final_policy().action_probabilities(observations), agent.action_probabilities(observations)
+    )
+
+
+class FixedFeatures(torch.nn.Module):
+    """A network with random numbers that are neither parameters nor buffers."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.features = (torch.randn(inputs, 4),)
+        self.last = torch.nn.Linear(4, outputs)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        outputs: torch.Tensor = self.last(torch.tanh(rows @ self.features[0]))
+        return outputs
+
+
+def test_the_average_has_the_constants_of_a_users_network() -> None:
+    options = {"policy_average": 0.0, "network": f"{__name__}:FixedFeatures"}
+    agent, _ = learnt("ppo-lag", "two-state", options, UPDATES)
+    observations = np.eye(2, dtype=np.float32)
     assert np.array_equal(
         agent.final_policy().action_probabilities(observations), agent.action_probabilities(observations)
     )
