@@ -24,11 +24,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
 
 import pandas as pd
 
@@ -44,6 +42,10 @@ VIEW = "recrl"  # key of the prepared chart view
 
 # The UI's own state, in its own words (MLflow 3.17; undocumented, so a link without it must work as well).
 VIEW_STATE = {
+    "groupBy": {
+        "aggregateFunction": "average",
+        "groupByKeys": [{"mode": "tag", "groupByData": "recrl.group"}],
+    },
     "runsHiddenMode": "SHOW_ALL",
     "selectedColumns": [
         *(f"params.`{name}`" for name in ("task", "agent", "method")),
@@ -65,24 +67,6 @@ VIEW_STATE = {
 }
 
 Row = Mapping[str, str]
-
-
-GROUPED = {
-    "aggregateFunction": "average",
-    "groupByKeys": [{"mode": "tag", "groupByData": "recrl.group"}],
-}
-
-
-def view_state(specs: Iterable[TrialSpec]) -> Mapping[str, Any]:
-    """Return the state of the prepared chart view: seeds averaged, where there are several.
-
-    Groups of one run each would only hide the runs' names.
-
-    Args:
-        specs: the sweep's trials.
-    """
-    sizes = Counter(spec.group for spec in specs)
-    return {**VIEW_STATE, "groupBy": GROUPED if any(size > 1 for size in sizes.values()) else None}
 
 
 @dataclass(frozen=True)

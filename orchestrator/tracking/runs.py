@@ -16,11 +16,16 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.tracking.address import is_server
 from recrl.orchestrator.tracking.client import EXPERIMENTS, connect
-from recrl.orchestrator.tracking.points import VIEW, view_state
+from recrl.orchestrator.tracking.points import VIEW, VIEW_STATE
 from recrl.orchestrator.tracking.positions import Position, file_mark
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
+
+EXPERIMENT_TAGS = {
+    "mlflow.experimentKind": "custom_model_development",
+    f"mlflow.sharedViewState.{VIEW}": json.dumps(VIEW_STATE),
+}
 
 
 class SweepRuns:
@@ -114,19 +119,15 @@ class SweepRuns:
 
     def _find_experiment(self) -> str:
         name = f"{EXPERIMENTS}{self._store.name}"
-        tags = {
-            "mlflow.experimentKind": "custom_model_development",
-            f"mlflow.sharedViewState.{VIEW}": json.dumps(view_state(self._store.specs())),
-        }
         experiment = self.client.get_experiment_by_name(name)
         if experiment is None:
             # A server knows its artifact location; for a bare database the default would be the current
             # folder.
             place = None if is_server(self._uri) else self._store.mlflow_artifacts.as_uri()
-            return str(self.client.create_experiment(name, artifact_location=place, tags=tags))
+            return str(self.client.create_experiment(name, artifact_location=place, tags=EXPERIMENT_TAGS))
         if experiment.lifecycle_stage != "active":
             self.client.restore_experiment(experiment.experiment_id)
-        for key, value in tags.items():
+        for key, value in EXPERIMENT_TAGS.items():
             if experiment.tags.get(key) != value:
                 self.client.set_experiment_tag(experiment.experiment_id, key, value)
         return str(experiment.experiment_id)

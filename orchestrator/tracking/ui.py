@@ -33,7 +33,7 @@ def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
 
 
 def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:
-    """Return the address of the sweep's charts; several seeds are averaged."""
+    """Return the address of the sweep's charts, grouped by task, agent and method."""
     address = uri.rstrip("/") if is_server(uri) else f"http://127.0.0.1:{port}"
     report = last_report(store, uri)
     if report is None or not report.experiment_id:

@@ -34,7 +34,6 @@ from recrl.orchestrator.tracking.points import (
     points,
     rows_after,
     thinned,
-    view_state,
 )
 from recrl.orchestrator.tracking.run_states import mlflow_status
 from recrl.orchestrator.tracking.ui import open_ui, ui_command, ui_url
@@ -162,14 +161,6 @@ def test_a_long_note_is_cut_where_mlflow_would_refuse_it() -> None:
     text = note("demo", {"complete": 999}, complete, charts="#/charts")
     assert len(text) < 8000
     assert text.endswith("More groups than fit here: see the table figure.")
-
-
-def test_seeds_are_averaged_in_charts_where_there_are_several(
-    made_up_sweep: Callable[..., SweepStore],
-) -> None:
-    specs = [trial.spec for trial in made_up_sweep(seeds=2, tasks=["a"], methods=["none"]).trials()]
-    assert view_state(specs)["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "recrl.group"}]
-    assert view_state([spec for spec in specs if spec.seed == 0])["groupBy"] is None
 
 
 def test_params_are_few_and_flat(made_up_sweep: Callable[..., SweepStore]) -> None:
