@@ -13,25 +13,28 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-PREFIX = "recrl-"
+PREFIX = "recrl-"  # eight characters follow
 LOCK = "recrl-scratch.lock"  # only scratch folders of recrl have such a file
 EMPTY_SECONDS = 60.0  # older empty folders are not just being made or removed
-_MADE_HERE = re.compile(re.escape(PREFIX) + "[a-z0-9_]{8}")  # prefix and suffix as in tempfile
 
 
 @contextmanager
-def scratch_folder(parent: str) -> Iterator[Path]:
+def scratch_folder(
+    parent: str, *, prefix: str = PREFIX, before_removal: Callable[[Path], None] | None = None
+) -> Iterator[Path]:
     """Make a folder that only this user can read, removed at the end; also remove those of dead processes.
 
     Args:
         parent: the folder to make it in.
+        prefix: beginning of its name. Only folders with this prefix and eight more characters are removed.
+        before_removal: called with each folder of a dead process before it is removed.
     """
-    remove_dead(parent)
-    folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
+    remove_dead(parent, prefix=prefix, before_removal=before_removal)
+    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
     with (folder / LOCK).open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         try:
@@ -40,27 +43,30 @@ def scratch_folder(parent: str) -> Iterator[Path]:
             _remove(folder)
 
 
-def remove_dead(parent: str) -> None:
-    """Remove this user's scratch folders without a running process."""
-    for folder in dead_folders(parent):
-        with suppress(OSError):
-            _remove(folder)
-    for folder in Path(parent).glob(f"{PREFIX}*"):  # its process died before it made the lock, or after
+def remove_dead(
+    parent: str, *, prefix: str = PREFIX, before_removal: Callable[[Path], None] | None = None
+) -> None:
+    """Remove this user's scratch folders without a running process; arguments as for ``scratch_folder``."""
+    made_here = re.compile(re.escape(prefix) + "[a-z0-9_]{8}")  # suffix as in tempfile
+    for folder in Path(parent).glob(f"{prefix}*"):
         with suppress(OSError):
             status = folder.stat()
-            is_old = time.time() - status.st_mtime > EMPTY_SECONDS
-            if _MADE_HERE.fullmatch(folder.name) and status.st_uid == os.getuid() and is_old:
-                folder.rmdir()  # fails unless it is empty
+            if not made_here.fullmatch(folder.name) or status.st_uid != os.getuid():
+                continue
+            if (folder / LOCK).exists():
+                _remove_unlocked(folder, before_removal)
+            elif time.time() - status.st_mtime > EMPTY_SECONDS:
+                folder.rmdir()  # its process died before it made the lock, or after; fails unless it is empty
 
 
-def dead_folders(parent: str) -> Iterator[Path]:
-    """This user's scratch folders that no process holds any more, each locked until the next is asked for."""
-    for lock_path in Path(parent).glob(f"{PREFIX}*/{LOCK}"):
-        with suppress(OSError), lock_path.open("r+") as lock:
-            if os.fstat(lock.fileno()).st_uid == os.getuid():
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails where its process lives
-                if os.fstat(lock.fileno()).st_nlink:  # no other process was faster
-                    yield lock_path.parent
+def _remove_unlocked(folder: Path, before_removal: Callable[[Path], None] | None) -> None:
+    """Remove a scratch folder, unless a process holds its lock."""
+    with (folder / LOCK).open("r+") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails where its process lives
+        if os.fstat(lock.fileno()).st_nlink:  # no other process was faster
+            if before_removal is not None:
+                before_removal(folder)
+            _remove(folder)
 
 
 def _remove(folder: Path) -> None:

@@ -17,7 +17,7 @@ import ray
 
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.own_package import copy_package
-from recrl.orchestrator.files.scratch import dead_folders, scratch_folder
+from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.ray.private_api import (
     at_loopback,
     fewer_processes,
@@ -36,6 +36,7 @@ from recrl.orchestrator.ray.services import (
 CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray requires 75 MiB at least; recrl stores nothing of that size
+PREFIX = "recrl-ray-"  # only the next cluster removes such a folder: it ends the processes first
 LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
 
 QUIET = {
@@ -85,9 +86,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
     Raises:
         ClusterError: Ray does not start.
     """
-    for dead in dead_folders(_short_folder()):
-        end_processes(dead)
-    with scratch_folder(_short_folder()) as folder:
+    with scratch_folder(_short_folder(), prefix=PREFIX, before_removal=end_processes) as folder:
         token_path = folder / TOKEN
         with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
             file.write(_token())
@@ -196,7 +195,7 @@ def _token() -> str:
 
 def _short_folder() -> str:
     folder = tempfile.gettempdir()
-    return folder if len(folder) <= LONGEST_SOCKET_FOLDER - len("/recrl-12345678/ray") else "/tmp"
+    return folder if len(folder) <= LONGEST_SOCKET_FOLDER - len(f"/{PREFIX}12345678/{RAY_FOLDER}") else "/tmp"
 
 
 def first_line(error: BaseException) -> str:

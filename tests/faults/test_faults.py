@@ -283,6 +283,22 @@ def test_folders_of_dead_processes_are_removed_and_no_others(tmp_path: Path) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["recrl-demo"]
 
 
+def test_a_folder_with_a_prefix_of_its_own_is_removed_only_with_its_processes(tmp_path: Path) -> None:
+    """A launch beside a killed one must not remove the only trace of the processes that Ray left."""
+    program = (
+        "import os, signal, sys; from recrl.orchestrator.files.scratch import scratch_folder\n"
+        "with scratch_folder(sys.argv[1], prefix='recrl-ray-'): os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False)
+    [dead] = tmp_path.iterdir()
+    with scratch_folder(str(tmp_path)):
+        assert dead.exists()
+    ended: list[Path] = []
+    with scratch_folder(str(tmp_path), prefix="recrl-ray-", before_removal=ended.append):
+        assert not dead.exists()
+    assert ended == [dead]
+
+
 @pytest.mark.parametrize("moment", ["before its lock was there", "while it was removed"])
 def test_a_scratch_folder_whose_process_was_interrupted_is_removed_by_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
