@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +28,12 @@ class TextConsole(Console):
         """Render with escaped control characters of texts; colours are Rich's own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=printable(segment.text))
+
+    def on_broken_pipe(self) -> None:
+        """Pass the error on to ``main``; Rich would end the process, as if the user's code had."""
+        if threading.current_thread() is not threading.main_thread():
+            super().on_broken_pipe()
+        raise  # noqa: PLE0704  (Rich calls this while it handles the BrokenPipeError)
 
 
 @contextmanager

@@ -294,6 +294,20 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
     assert not any(trial.record().status.is_finished for trial in store.trials())
 
 
+def test_a_closed_pipe_ends_a_command_quietly(folder: Path) -> None:
+    """``recrl-sweep list tasks | head -1``: the reader is gone before anything is written."""
+    code = """
+import os, sys
+from recrl.orchestrator.cli.main import main
+reader, writer = os.pipe()
+os.dup2(writer, 1)
+os.close(reader)
+sys.exit(main(["list", "tasks"]))
+"""
+    done = _python(code, folder)
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+
+
 def test_the_module_runs_like_the_script(folder: Path) -> None:
     command = [sys.executable, "-m", "recrl", "--version"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
