@@ -32,23 +32,43 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     Args:
         verdicts: of ``verdicts.verdicts``.
     """
-    how = "computed exactly from the recorded policies"
-    if not verdicts["exact"].all():
-        sampled = int(verdicts.loc[~verdicts["exact"], "episodes"].min())
-        how = f"means over {sampled} episodes, or exact where the task is finite"
     several = bool((verdicts["seeds"] > 1).any())
     interval = ", with its 95% interval (Student's t)" if several else ""
     errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
     return [
-        f"The verdict, the return and the cost are those of the final policy, without learning: {how}.",
+        f"The verdict, the return and the cost are those of the final policy, without learning: "
+        f"{measured_how(verdicts)}.",
         *errors,
         f"Solved: feasible, and within {OPTIMAL_GAP} of the constrained optimum, where that is known.",
-        f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error.",
+        tolerance_sentence(verdicts),
         "The return of an infeasible policy may be above the optimum: it is no success.",
         f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
         *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
     ]
+
+
+def measured_how(verdicts: pd.DataFrame) -> str:
+    """Say how the numbers of the final policies were found: computed, or averaged over episodes.
+
+    Args:
+        verdicts: of ``verdicts.verdicts``.
+    """
+    if verdicts["exact"].all():
+        return "computed exactly from the recorded policies"
+    sampled = f"means over {int(verdicts.loc[~verdicts['exact'], 'episodes'].min())} episodes"
+    tasks = [str(task) for task in dict.fromkeys(verdicts.loc[verdicts["exact"], "task"])]
+    return f"{sampled}, but computed exactly on {_listed(tasks)}" if tasks else sampled
+
+
+def tolerance_sentence(verdicts: pd.DataFrame) -> str:
+    """Say how far above its limit the mean cost of a feasible policy may be.
+
+    Args:
+        verdicts: of ``verdicts.verdicts``.
+    """
+    error = "" if verdicts["exact"].all() else ", or by one standard error of a sampled cost if that is more"
+    return f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%}{error}."
 
 
 def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:

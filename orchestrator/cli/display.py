@@ -24,6 +24,7 @@ TERMINAL_SECONDS = 1.0
 LINE_SECONDS = 10.0
 LOG_SECONDS = 0.5
 SHOWN_RUNNING = 8
+WRAPPED = ("verdict", "summary")  # columns of sentences, wrapped on a narrow terminal
 
 _STYLES = {
     "complete": "green",
@@ -231,7 +232,7 @@ def _picture(progress: SweepProgress) -> RenderableType:
 
 
 def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """A table of finished text."""
+    """A table of finished text; where it does not fit, the columns WRAPPED are wrapped."""
     table = _table(*columns)
     for row in rows:
         table.add_row(*map(Text, row))
@@ -252,7 +253,7 @@ def _table(*columns: str) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     for column in columns:
         right = column in ("seed", "done", "steps/s", "CPU", "tries")
-        table.add_column(column, justify="right" if right else "left", no_wrap=True)
+        table.add_column(column, justify="right" if right else "left", no_wrap=column not in WRAPPED)
     return table
 
 

@@ -150,13 +150,13 @@ def _say_starting(request: LaunchRequest, console: Console) -> None:
 def _say_results(sweep: Sweep, console: Console) -> None:
     """Print return and cost of the final policies."""
     from recrl.analysis.data.validity import curriculum_warnings  # noqa: PLC0415
-    from recrl.orchestrator.cli.result_table import CAPTION, result_table  # noqa: PLC0415
+    from recrl.orchestrator.cli.result_table import result_table  # noqa: PLC0415
 
-    table = result_table(sweep)
+    table, caption = result_table(sweep)
     if len(table):
         say(console, "")
         show(table, console)
-        say(console, CAPTION)
+        say(console, caption)
         for sentence in curriculum_warnings(sweep):
             say(console, f"warning: {sentence}")
         say(console, "")
@@ -164,6 +164,7 @@ def _say_results(sweep: Sweep, console: Console) -> None:
 
 def _draw_at_end(sweep: Sweep, store: SweepStore, console: Console) -> None:
     """Draw a launch's figures. If that fails, log the error and continue: MLflow must still be updated."""
+    say(console, "Drawing figures ...")
     try:
         draw(sweep, store.figures_folder, console)
     except (RecrlError, OSError):

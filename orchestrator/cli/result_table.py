@@ -6,34 +6,48 @@ import math
 
 import pandas as pd
 
-from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.validity import curriculum_flags
 from recrl.analysis.report_tables import number, with_error
-from recrl.analysis.report_verdicts import verdict_text
+from recrl.analysis.report_verdicts import measured_how, tolerance_sentence, verdict_text
+from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import verdicts
 
-CAPTION = (
-    "Final policies (stochastic), evaluated without learning: means over n seeds, returns ± standard error.\n"
-    "Verdicts as in the report: solved, feasible, or infeasible by how much."
-)
 
-
-def result_table(sweep: Sweep) -> pd.DataFrame:
+def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:
     """Return the results as text, one row per task, agent and method; empty without evaluations.
 
     Args:
         sweep: its complete trials are used.
+
+    Returns:
+        The table, and its caption.
     """
     if sweep.evaluations.empty:
-        return pd.DataFrame()
+        return pd.DataFrame(), ""
     rows = verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep))
-    return pd.DataFrame([_line(row, sweep.num_costs) for _, row in rows.iterrows()])
+    return pd.DataFrame([_line(row, sweep.num_costs) for _, row in rows.iterrows()]), caption(rows)
+
+
+def caption(rows: pd.DataFrame) -> str:
+    """Return two lines: how the numbers were measured, and what the verdicts allow.
+
+    Args:
+        rows: of ``verdicts.verdicts``.
+    """
+    several = int(rows["seeds"].max()) > 1
+    means = "means over n seeds, returns ± standard error" if several else "one seed (n = 1): no intervals"
+    return (
+        f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"
+        f"Verdicts: solved (feasible, and within {OPTIMAL_GAP} of the optimum), feasible, or infeasible by "
+        f"how much. {tolerance_sentence(rows)}"
+    )
 
 
 def _line(row: pd.Series, num_costs: int) -> dict[str, str]:
-    line = {name: str(row[name]) for name in GROUP} | {"n": str(row["seeds"])}
+    line = {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
+    line["n"] = str(row["seeds"])
     line["return"] = with_error(row["episode_return"], row["episode_return_se"])
     for i in range(num_costs):
         which = "" if num_costs == 1 else f" {i + 1}"

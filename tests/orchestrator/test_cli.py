@@ -134,12 +134,16 @@ def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "Figures    runs/small/figures\n" in out
     assert "Starting Ray" not in out
     table = out.partition("\n\n")[2].splitlines()
-    assert table[0].split() == ["task", "agent", "method", "n", "return", "cost", "limit", "verdict"]
+    assert table[0].split() == ["task", "agent", "curriculum", "n", "return", "cost", "limit", "verdict"]
     assert [line.split()[:4] for line in table[1:3]] == [
         ["two-state", "ppo-lag", "none", "1"],
         ["two-state", "ppo-lag", "linear", "1"],
     ]
     assert re.search(r" 2\.00 +(solved|feasible|infeasible by [0-9.]+ \([0-9]+%\)) *$", table[1])
+    assert table[3].startswith("Final policies (stochastic), without learning, computed exactly from the")
+    assert table[3].endswith("; one seed (n = 1): no intervals.")
+    assert table[4].endswith("Feasible: no mean cost exceeds its limit by more than 1%.")
+    assert out.index("Drawing figures ...\n") < out.index("Figures    runs/small/figures\n")
     assert table[-2] == "Report     runs/small/figures/report.html"
     assert "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n" in out
     assert any((folder / "runs/small/figures").glob("*.png"))

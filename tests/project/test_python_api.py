@@ -273,7 +273,7 @@ def test_a_launch_prints_what_the_command_prints(folder: Path, capsys: pytest.Ca
     recrl.launch(GRID, executor="inline", mlflow=False, figures=False)
     out = capsys.readouterr().out
     assert "small: 2 trials: 2 new" in out
-    assert "task       agent    method  n  return" in out
+    assert "task       agent    curriculum  n  return" in out
     assert "\nwarning: hard landing, " in out
     assert main(["status", "--brief", "runs/small"]) == ExitCode.OK
     assert len(recrl.load_sweep("small").trials) == len(recrl.load_sweep("runs/small").trials) == 2
