@@ -45,7 +45,7 @@ import pandas as pd
 
 from recrl.analysis.data.exact_values import exact_values, finite_model
 from recrl.analysis.data.labels import DOUBLES, KEY, TRIAL, keys_of
-from recrl.analysis.data.optima import UNKNOWN_OPTIMUM, optima_of
+from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -255,7 +255,9 @@ def assemble(
         checked_name(name)
     except ValueError as error:
         raise RecrlError(str(error)) from error
-    optima, unknown = optima_of([it.spec for it in facts])
+    tabulated = rows["policies"][TRIAL].unique() if len(rows["policies"]) else ()
+    finite = {facts[int(i)].spec.task.label for i in tabulated}
+    optima, unknown = optima_of([it.spec for it in facts], finite=finite)
     costs = range(max((len(it.spec.deploy_limits) for it in facts), default=0))
     cost_columns, limit_columns = [f"cost_{i}" for i in costs], [f"limit_{i}" for i in costs]
     phase_columns = [f"{kind}_{i}{end}" for i in costs for kind, end in PHASE_COST_COLUMNS]
@@ -279,7 +281,7 @@ def assemble(
 
 def is_made_again(note: str) -> bool:
     """Whether ``assemble`` made a note from the trials, and will make it again if it still holds."""
-    return DOUBLES in note or UNKNOWN_OPTIMUM in note
+    return any(text in note for text in (DOUBLES, UNKNOWN_OPTIMUM, NO_OPTIMUM))
 
 
 def joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
