@@ -6,7 +6,9 @@ AGENT_ORDER and METHOD_ORDER. i counts the costs, 0 ... k-1. If tasks of a sweep
 that a task lacks are NaN. All returns and costs are undiscounted sums over an episode.
 
     trials       one row per trial of the sweep's last launch, started or not:
-                 KEY, trial_id, group, status, error, task_name, agent_name, method_name, num_costs,
+                 KEY, trial_id, group, status (as recorded in its files: waiting, running, complete,
+                 failed or damaged; what recrl-sweep status calls stopped is waiting here, and what it
+                 calls interrupted is running), error, task_name, agent_name, method_name, num_costs,
                  train_steps, boundary_step (the first step under d_d: B rounded up to a policy update),
                  total_steps (rounded up likewise), steps_per_update, env_steps (taken so far),
                  cpu_seconds, train_limit_i, deploy_limit_i, start_limit_i (measured d_t, or NaN),

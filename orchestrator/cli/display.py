@@ -127,9 +127,7 @@ def status_sentence(progress: SweepProgress) -> str:
 def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress], str]) -> Iterator[str]:
     """Describe every trial with an error: its name, the error, and the place of its log and traceback."""
     for trial in trials:
-        broken = trial.status in (DisplayStatus.FAILED, DisplayStatus.DAMAGED)
-        word = str(trial.status) if broken else "waiting"
-        yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was recorded'}"
+        yield f"{trial.status}: {trial.spec.title}: {trial.record.error or 'no reason was recorded'}"
         what = "its files" if trial.status is DisplayStatus.DAMAGED else "log and traceback"
         yield f"        {what}: {folder_of(trial)}"
 

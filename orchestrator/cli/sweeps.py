@@ -12,6 +12,8 @@ from recrl.orchestrator.grid.grid import read_name
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.validation import nearest
 
+EXPORT_SUFFIX = ".zip"
+
 
 def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
     """Find the sweep of a command.
@@ -38,6 +40,10 @@ def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> Sw
         raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
     if sweep.endswith((".yaml", ".yml")):
         sweep = read_name(Path(sweep))
+    if sweep.endswith(EXPORT_SUFFIX) and sweep not in names:
+        raise RecrlError(
+            f"{sweep}: an export has tables but no policies, logs or trials; give the sweep's name or folder"
+        )
     if sweep not in names:
         folder = Path(sweep).absolute()
         if not storage and (is_sweep(folder) or (folder / "trials").is_dir()):

@@ -112,7 +112,7 @@ def test_a_wrong_grid_starts_nothing(
     shown = capsys.readouterr()
     assert shown.out == ""
     first, second, last = shown.err.splitlines()
-    assert first.startswith("grid.yaml:4: methods.1: no teacher is called 'linea'; did you mean 'linear'?")
+    assert first.startswith("grid.yaml:4: methods.1: no curriculum is called 'linea'; did you mean 'linear'?")
     assert second == "grid.yaml:5: seeds: must be a number of seeds from 1 to 10000, or a list, got 0"
     assert last == "2 mistakes in grid.yaml; nothing was started"
     assert not (folder / "runs").exists()
@@ -378,7 +378,7 @@ def test_logs_of_nobody_and_of_several(
     assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
 
 
-def test_status_says_why_a_trial_waits(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_says_why_a_trial_was_stopped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(folder / "runs", "small")
     spec = grid.trials()[0]
@@ -387,7 +387,11 @@ def test_status_says_why_a_trial_waits(folder: Path, capsys: pytest.CaptureFixtu
     assert main(["status", "--brief"]) == ExitCode.OK  # nothing was launched: no trials are known
     store.write_specs([spec])
     assert main(["status", "--brief"]) == ExitCode.OK
-    assert "\nwaiting: two-state ppo-lag none seed 0: the disk was full\n" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert (
+        "0 waiting, 0 failed, 1 stopped; 0%\nstopped: two-state ppo-lag none seed 0: the disk was full\n"
+        in out
+    )
 
 
 def test_a_disk_that_takes_nothing_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -549,6 +553,14 @@ def test_an_environment_without_costs_is_refused_at_validate(
     _own_room(folder, "room_b", "{'speed': 1.0}", task)
     assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.startswith(sentence)
+
+
+def test_an_export_has_no_policies(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "small.zip"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: small.zip: an export has tables but no policies, logs or trials; give the sweep's "
+        "name or folder\n"
+    )
 
 
 def test_logs_show_return_and_cost(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
