@@ -16,6 +16,7 @@ from recrl.analysis.data.validity import curriculum_flags
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
 from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
+from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import verdicts
 
@@ -25,6 +26,14 @@ SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 TIES = (
     f"P(higher return): a tie counts half. Returns tie within {OPTIMAL_GAP} of each other where the optimum "
     "is known, as for solved; elsewhere only where they differ by rounding."
+)
+FEW = f"{report_tables.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
+BOUNDS_NOTE = (
+    "Sums over the policies of the training phase, one expected episode each; means over n seeds. Limits in "
+    "force: the sum of the limits that the curriculum set. Above limits in force, above the limit: the part "
+    "of the measured cost above them, and above the deployment limit. Bound: if every update solves CPO's "
+    "problem (CPO only). Discounted bound: Proposition 1 of the paper. Trivial bound: every step at the "
+    "largest cost."
 )
 
 
@@ -36,11 +45,13 @@ class ShownTable:
         heading: its title.
         table: finished text.
         note: a sentence below it, or empty.
+        kinds: of each row, ``infeasible`` or empty; none for a table without such rows.
     """
 
     heading: str
     table: pd.DataFrame
     note: str = ""
+    kinds: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -83,7 +94,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     judged = verdicts(rows, compared, curriculum_flags(sweep))
     outcomes = _outcome_tables(averaged)
     latex = [f"% {it.heading}.\n{report_tables.latex(it.table)}\n" for it in outcomes]
-    shown = [*outcomes, *_comparison_tables(compared)]
+    shown = [*outcomes, *_comparison_tables(compared, averaged)]
     if len(weighed):
         written.append(report_tables.write_csv(weighed, folder / "claims.csv"))
         shown.append(ShownTable("What the paper says of these maps", claims.claims_table(weighed)))
@@ -91,7 +102,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
         which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
         if len(costs):
             heading = f"Cumulative cost of training against its bounds{which}"
-            shown.append(ShownTable(heading, bound_table(costs)))
+            shown.append(ShownTable(heading, bound_table(costs), BOUNDS_NOTE))
     written += [
         report_tables.write_csv(judged, folder / "verdicts.csv"),
         report_tables.write_csv(rows, folder / "outcomes.csv"),
@@ -105,20 +116,27 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
 
 def _outcome_tables(averaged: pd.DataFrame) -> list[ShownTable]:
     """Return the outcomes, those of the final policy first."""
-    tables = [(measure, report_tables.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
-    return [ShownTable(_heading(measure), table) for measure, table in tables if len(table)]
+    tables = []
+    for measure in SHOWN_MEASURES:
+        rows = averaged[averaged["measure"] == measure.value]
+        if len(rows):
+            table, kinds = report_tables.outcome_table(averaged, measure), report_tables.row_kinds(rows)
+            tables.append(ShownTable(_heading(measure), table, kinds=kinds))
+    return tables
 
 
-def _comparison_tables(compared: pd.DataFrame) -> list[ShownTable]:
+def _comparison_tables(compared: pd.DataFrame, averaged: pd.DataFrame) -> list[ShownTable]:
     """Return differences to the agent without a curriculum, those of the final policy first."""
-    if not len(compared):
-        return []
-    return [
-        ShownTable(
-            f"{_heading(measure)}, minus none", report_tables.comparison_table(compared, measure), TIES
+    tables = []
+    for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT) if len(compared) else ():
+        rows = report_tables.compared_rows(compared, averaged, measure)
+        table = report_tables.comparison_table(rows)
+        marked = table["P(higher return)"].str.contains(report_tables.TOO_FEW).any() if len(table) else False
+        note = f"{TIES} {FEW}" if marked else TIES
+        tables.append(
+            ShownTable(f"{_heading(measure)}, minus none", table, note, report_tables.row_kinds(rows))
         )
-        for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
-    ]
+    return tables
 
 
 def _heading(measure: Measure) -> str:
