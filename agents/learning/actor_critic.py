@@ -83,8 +83,10 @@ class ActorCritic:
         self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
-        self._form = (
-            TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
+        self._measure = (
+            TailCost(config.cvar_level, cmdp.num_costs)
+            if config.constraint == "cvar"
+            else MeanCost(config.constraint_window)
         )
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,
@@ -92,7 +94,7 @@ class ActorCritic:
             "critic_optimiser": self._critic_optimiser,
             "value_scale": self._value_scale,
             "recent_episodes": self._recent,
-            "constraint": self._form,
+            "constraint": self._measure,
             **rule.parts,
         }
 
@@ -140,11 +142,11 @@ class ActorCritic:
             compact=config.compaction,
             most_observations=config.minibatch_size,
         )
-        recent_costs, lengths = self._recent.add(episode_costs, rollout.finished_lengths())
-        costs, constrained = self._form.constraint_costs(rollout, recent_costs, limits)
-        estimates = self._estimate(rollout, costs, batch)
+        episodes = self._recent.add(episode_costs, rollout.finished_lengths())
+        measured = self._measure.measure(rollout, episodes, limits)
+        estimates = self._estimate(rollout, measured.step_costs, batch)
         advantages = estimates.advantages
-        constraints = Constraints.measure(recent_costs, lengths, constrained, limits)
+        constraints = Constraints.of(measured, episodes.lengths, limits)
         experience = Experience.of(self._policy, batch, advantages, constraints)
         if step.entropy_coefficient:
             experience = experience.with_entropy(step.entropy_coefficient)
