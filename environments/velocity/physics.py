@@ -20,7 +20,7 @@ from recrl.environments.simulation.machine_code import (
     mj_rnePostConstraint,
     mj_step,
 )
-from recrl.environments.simulation.mujoco_layout import structure
+from recrl.environments.simulation.struct_offsets import structure
 
 MAX_FIELDS = 5
 """Maximum number of fields of ``mjData`` that are copied."""

@@ -41,7 +41,7 @@ from recrl.environments.safety_gym.tasks import (
     SafetyTask,
 )
 from recrl.environments.simulation.mujoco_batch import BAD_STATES, ROW
-from recrl.environments.simulation.mujoco_layout import structure
+from recrl.environments.simulation.struct_offsets import structure
 
 _NONE = slice(0, 0)
 _FIELDS = (
