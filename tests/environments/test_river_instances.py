@@ -24,8 +24,8 @@ from recrl.environments.rivergrid.instances import (
     quickest_route,
     suggested_limit,
 )
-from recrl.environments.rivergrid.limits import grid_entry, main
 from recrl.environments.rivergrid.maps import DRY, MAPS, RIVER, MapError, parse_map
+from recrl.environments.rivergrid.print_instances import grid_entry, main
 from recrl.orchestrator.grid.grid import parse_grid, read_grid
 
 PAPERS = {name: parse_map(drawing) for name, drawing in MAPS.items()}
