@@ -32,10 +32,11 @@ from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.estimates import Estimates, row_targets
 from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
-from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
 from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
+from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.observation_features import Encoder
 from recrl.agents.shared_options import ActorCriticConfig
 from recrl.agents.spaces import observation_size, unbounded_numbers

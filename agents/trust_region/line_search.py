@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from recrl.agents.learning.networks import FlatParameters
+from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.shared_options import TrustRegionConfig
 
 # For a system scaled to a right-hand side of length 1.

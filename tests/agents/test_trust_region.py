@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recrl.agents.learning.networks import FlatParameters
+from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.trust_region.line_search import backtrack, conjugate_gradient
 
 
