@@ -159,15 +159,16 @@ def find_task(name: str) -> Task:
         return found
     if not callable(found):
         raise ValueError(f"task {name!r} must be a Task or return an environment, got {type(found).__name__}")
+    from recrl.environments.gymnasium_adapter import (  # noqa: PLC0415  # only if a task needs it
+        draw_from_callable,
+        make_from_callable,
+    )
+
     return Task(
         summary=f"The environment that {name} returns.",
         options=KeywordOptions,
-        make=functools.partial(
-            load_attribute("recrl.environments.gymnasium_adapter:make_from_callable"), found
-        ),
-        drawn=functools.partial(
-            load_attribute("recrl.environments.gymnasium_adapter:draw_from_callable"), found
-        ),
+        make=functools.partial(make_from_callable, found),
+        drawn=functools.partial(draw_from_callable, found),
     )
 
 
