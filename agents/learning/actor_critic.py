@@ -25,7 +25,6 @@ from torch import Tensor
 
 from recrl.agents.agent import Rollout
 from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, TailCost
-from recrl.agents.encoding import Encoder
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import generalised_advantages, next_values
@@ -33,10 +32,12 @@ from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.estimates import Estimates, row_targets
 from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
-from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
 from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
+from recrl.agents.networks.flat_parameters import Adam
+from recrl.agents.observation_features import Encoder
 from recrl.agents.shared_options import ActorCriticConfig
 from recrl.agents.spaces import observation_size, unbounded_numbers
 from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats

@@ -13,9 +13,9 @@ from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import scaled_advantages
 from recrl.agents.learning.batch import LearningBatch
-from recrl.agents.learning.networks import NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
 
 STATES = np.array([0, 0, 1, 1, 1, 2])
 ACTIONS = np.array([0, 1, 0, 1, 1, 0])

@@ -1,4 +1,4 @@
-"""Encoding of observations for an agent's networks: proximity features and normalisation.
+"""Inputs of an agent's networks, computed from observations: proximity features and normalisation.
 
 Proximity. A lidar number v belongs to one direction: the closest object of a kind is at the distance (1 - v)
 r, r the lidar's range; v = 0 if nothing is in range. Safety Gym's range is 3 m and its hazards have a radius

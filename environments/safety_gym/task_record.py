@@ -1,6 +1,6 @@
 """The record of a task for compiled code: constants, addresses, and offsets in MuJoCo's structures.
 
-The record is declared in ``recrl.environments.safety_gym.native.environment_step``.
+The record is declared in ``recrl.environments.safety_gym.compiled_step``.
 """
 
 from __future__ import annotations
@@ -14,9 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
-from recrl.environments.safety_gym.layout import keepouts
-from recrl.environments.safety_gym.native.environment_step import (
+from recrl.environments.safety_gym.compiled_step import (
     ENVIRONMENT,
     KINDS,
     MAX_BODIES,
@@ -27,6 +25,8 @@ from recrl.environments.safety_gym.native.environment_step import (
     TASK,
     TERMS,
 )
+from recrl.environments.safety_gym.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
+from recrl.environments.safety_gym.layout import keepouts
 from recrl.environments.safety_gym.scene import Scene
 from recrl.environments.safety_gym.tasks import (
     GOAL_HEIGHT,
@@ -41,7 +41,7 @@ from recrl.environments.safety_gym.tasks import (
     SafetyTask,
 )
 from recrl.environments.simulation.mujoco_batch import BAD_STATES, ROW
-from recrl.environments.simulation.mujoco_layout import structure
+from recrl.environments.simulation.struct_offsets import structure
 
 _NONE = slice(0, 0)
 _FIELDS = (

@@ -1,7 +1,7 @@
 """Print generated RiverGrid instances as lines for a grid file: map, J*(d) and limit d_d.
 
-    python -m recrl.environments.rivergrid.limits 0 1 2
-    python -m recrl.environments.rivergrid.limits 7 --options '{"width": 12, "river_width": [1, 3]}'
+    python -m recrl.environments.rivergrid.print_instances 0 1 2
+    python -m recrl.environments.rivergrid.print_instances 7 --options '{"width": 12, "river_width": [1, 3]}'
 
 Paste the output below ``tasks:``. The limit is that of ``instances.suggested_limit``.
 """
@@ -52,7 +52,7 @@ def _words(route: Route) -> str:
 def main() -> None:
     """Print one entry for each map seed on the command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m recrl.environments.rivergrid.limits",
+        prog="python -m recrl.environments.rivergrid.print_instances",
         description="Entries for the tasks of a grid file: generated RiverGrid maps and their limits.",
     )
     parser.add_argument("map_seed", type=int, nargs="+", help="seeds of the maps")

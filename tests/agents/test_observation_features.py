@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-from recrl.agents.encoding import Encoder, ProximityObservation, RunningMoments
+from recrl.agents.observation_features import Encoder, ProximityObservation, RunningMoments
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec, ObservationComponent
 from recrl.environments.registry import make_vector

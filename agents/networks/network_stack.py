@@ -8,8 +8,10 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from recrl.agents.learning.module_stack import ModuleStack, checked_module, perceptron
-from recrl.agents.learning.networks import FlatParameters, NetworkForm, Scratch, TanhStack
+from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.flat_parameters import FlatParameters
+from recrl.agents.networks.module_stack import ModuleStack, checked_module, perceptron
+from recrl.agents.networks.tanh_stack import Scratch, TanhStack
 
 
 class Stack(Protocol):

@@ -7,18 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from recrl.agents.learning import networks
 from recrl.agents.learning.critics import Critics
-from recrl.agents.learning.networks import (
-    FEW_COLUMNS,
-    INITIALISERS,
-    Adam,
-    FlatParameters,
-    NetworkForm,
-    TanhStack,
-    orthogonal,
-    xavier,
-)
+from recrl.agents.networks import tanh_stack
+from recrl.agents.networks.architecture import INITIALISERS, NetworkForm, orthogonal, xavier
+from recrl.agents.networks.flat_parameters import Adam, FlatParameters
+from recrl.agents.networks.tanh_stack import FEW_COLUMNS, TanhStack
 
 # One layer wider than what add_product multiplies as rows, the others not.
 SIZES = (3, FEW_COLUMNS + 2, 4, 2)
@@ -149,7 +142,7 @@ def test_many_rows_in_blocks_are_all_rows_at_once(monkeypatch: pytest.MonkeyPatc
     weights = torch.full((23,), 1.0 / 23.0)
     found = []
     for size in (23, 5):
-        monkeypatch.setattr(networks, "BLOCK_ROWS", size)
+        monkeypatch.setattr(tanh_stack, "BLOCK_ROWS", size)
         losses = critics.differentiate(rows, weights, targets)
         values = torch.from_numpy(critics.values(rows))
         found.append(torch.cat([losses, critics.parameters.gradient.clone(), values.ravel()]))
@@ -159,10 +152,10 @@ def test_many_rows_in_blocks_are_all_rows_at_once(monkeypatch: pytest.MonkeyPatc
 def test_blocks_cover_all_rows() -> None:
     for count, lengths in ((1, [1]), (1024, [1024]), (1300, [1024, 276]), (9000, [2250] * 4)):
         rows = list(range(count))
-        parts = [rows[block] for block in networks.blocks(count)]
+        parts = [rows[block] for block in tanh_stack.blocks(count)]
         assert [len(part) for part in parts] == lengths
         assert [row for part in parts for row in part] == rows
-    assert len(networks.blocks(0)) == 1
+    assert len(tanh_stack.blocks(0)) == 1
 
 
 def test_saved_are_layer_by_layer_the_weights_of_all_networks_then_their_biases() -> None:

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from recrl.agents.errors import NetworkError
-from recrl.agents.learning.networks import FlatParameters, blocks
+from recrl.agents.networks.flat_parameters import FlatParameters
+from recrl.agents.networks.tanh_stack import blocks
 
 # (inputs n, outputs) -> a module that maps float32 rows, [U, n], to [U, outputs].
 ModuleFactory = Callable[[int, int], nn.Module]
