@@ -43,7 +43,8 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         f"The verdict, the return and the cost are those of the final policy, without learning: {how}.",
         *errors,
         f"Solved: feasible, and within {OPTIMAL_GAP} of the constrained optimum, where that is known.",
-        f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error.",
+        f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error, "
+        "whichever is larger.",
         "The return of an infeasible policy may be above the optimum: it is no success.",
         f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",

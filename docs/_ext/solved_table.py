@@ -47,7 +47,7 @@ def solved_table(path: Path, methods: list[str]) -> str:
                 continue
             counts = [of.loc[of["measure"] == measure, "solved"] for measure in MEASURES]
             texts = " | ".join(f"{int(each.sum())} of {len(each)}" for each in counts)
-            lines.append(f"| {task} | {agent} | {method} | {texts} |")
+            lines.append(f"| `{task}` | `{agent}` | `{method}` | {texts} |")
     return "\n".join(lines)
 
 
@@ -64,6 +64,8 @@ class SolvedTable(SphinxDirective):
         methods = [it.strip() for it in self.options.get("methods", "").split(",") if it.strip()]
         table = nodes.container()
         self.state.nested_parse(StringList(solved_table(path, methods).split("\n")), 0, table)
+        for each in table.findall(nodes.table):
+            each["classes"].append("names")  # recrl.css keeps names on one line
         return list(table.children)
 
 
