@@ -23,7 +23,8 @@ from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.provenance import collect
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan, select
+from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan
+from recrl.orchestrator.grid.selection import select
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
@@ -78,7 +79,7 @@ class LaunchSettings:
         grid: the checked grid.
         place: of the sweep's files.
         executor: runs the trials.
-        only: the selected trials, see ``plan.select``; all by default.
+        only: the selected trials, see ``selection.select``; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again.
         rerun_changed: whether trials that ran other code than is installed now are run again.

@@ -18,7 +18,6 @@ from recrl.orchestrator.cli.plan import room, say_plan
 from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
 from recrl.orchestrator.cli.results import draw
 from recrl.orchestrator.cli.status import say_failures
-from recrl.orchestrator.cli.sweeps import wanted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
@@ -26,6 +25,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.grid.grid_spec import GridSpec
 from recrl.orchestrator.grid.plan import Plan
+from recrl.orchestrator.grid.selection import parse_only
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.opening import sweep_place
@@ -54,7 +54,7 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
     from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
 
     store = SweepStore(request.root, grid.name)
-    only = wanted(request.only)
+    only = parse_only(request.only)
     place = sweep_place(store, request.storage)
     place.prepare()
     executor = _executor(grid, place, request)

@@ -9,7 +9,6 @@ from rich.console import Console
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short
 from recrl.orchestrator.cli.requests import GridRequest, LaunchRequest, PlanRequest, ValidateRequest
-from recrl.orchestrator.cli.sweeps import wanted
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.code_changes import other_code_sentence
@@ -17,6 +16,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.grid import read_grid
 from recrl.orchestrator.grid.grid_spec import GridSpec
 from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, trials_at_once, unmeasured
+from recrl.orchestrator.grid.selection import parse_only
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialState
 
@@ -46,7 +46,7 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     plan = make_plan(
         grid.trials(),
         store,
-        only=wanted(request.only),
+        only=parse_only(request.only),
         retry_failed=request.retry_failed,
         rerun_damaged=request.rerun_damaged,
         rerun_changed=request.rerun_changed,

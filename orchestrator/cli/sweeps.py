@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from recrl.orchestrator.cli.requests import SweepRequest
@@ -57,14 +56,3 @@ def open_store(request: SweepRequest, *, checkpoints: bool = False) -> SweepStor
     store = sweep_store(request.root, request.sweep, request.storage)
     sweep_place(store, request.storage).refresh(checkpoints=checkpoints)
     return store
-
-
-def wanted(pairs: Sequence[str]) -> dict[str, list[str]]:
-    """Parse ``["method=none,linear", "seed=0"]`` for ``plan.select``."""
-    wanted: dict[str, list[str]] = {}
-    for pair in pairs:
-        key, equals, values = pair.partition("=")
-        if not equals or not values:
-            raise RecrlError(f"--only: must look like method=dynamic or seed=0,1, got {pair!r}")
-        wanted.setdefault(key, []).extend(values.split(","))
-    return wanted
