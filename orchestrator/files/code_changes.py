@@ -25,7 +25,7 @@ from recrl.teachers.registry import TEACHERS
 
 OURS = "recrl"
 FOLDERS = ("agents", "environments", "teachers")
-MODULES = ("trial/trial.py", "trial/runner.py", "spec.py")  # of the orchestrator
+MODULES = ("trial/trial.py", "trial/attempt.py", "spec.py")  # of the orchestrator
 SUFFIXES = (".py", ".xml", ".txt")  # top-level parts that affect results
 KINDS = (
     ("task", "recrl.tasks", TASKS),

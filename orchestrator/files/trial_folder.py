@@ -8,8 +8,8 @@ from pathlib import Path
 
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.aside import move_aside
+from recrl.orchestrator.files.atomic_files import write_sealed
 from recrl.orchestrator.files.locks import locked
-from recrl.orchestrator.files.small_files import write_sealed
 from recrl.orchestrator.files.trial_reader import RECORD_FORMAT
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_tables import TrialTables

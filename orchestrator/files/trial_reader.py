@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 from recrl.orchestrator.errors import CheckpointError, DamagedError, OtherFormatError, StorageError
 from recrl.orchestrator.files import checkpoint_format
+from recrl.orchestrator.files.atomic_files import read_sealed
 from recrl.orchestrator.files.row_files import Extent, digest_of, shortage
-from recrl.orchestrator.files.small_files import read_sealed
 from recrl.orchestrator.files.trial_paths import TrialPaths
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState

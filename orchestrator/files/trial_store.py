@@ -15,8 +15,8 @@ from dataclasses import replace
 
 from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.files.aside import move_aside
+from recrl.orchestrator.files.atomic_files import parsed_object, read_whole, write_sealed
 from recrl.orchestrator.files.row_files import Extent, digest_of
-from recrl.orchestrator.files.small_files import parsed_object, read_whole, write_sealed
 from recrl.orchestrator.files.trial_folder import TrialFolder
 from recrl.orchestrator.files.trial_reader import SPEC_FORMAT
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields

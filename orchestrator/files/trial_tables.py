@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from recrl.orchestrator.files.small_files import parsed_object
+from recrl.orchestrator.files.atomic_files import parsed_object
 from recrl.orchestrator.files.trial_reader import TrialReader
 
 EPISODE_COLUMNS = ("index", "phase", "end_step", "length", "episode_return", "noise")

@@ -22,8 +22,8 @@ from typing import Any
 from recrl.environments.cmdp import EpisodeStats
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, RowError
 from recrl.orchestrator.files import checkpoint_format
+from recrl.orchestrator.files.atomic_files import write_atomically, write_sealed
 from recrl.orchestrator.files.row_files import Extent, RowFile, rows_text
-from recrl.orchestrator.files.small_files import write_atomically, write_sealed
 from recrl.orchestrator.files.trial_folder import TrialFolder
 from recrl.orchestrator.files.trial_paths import PROVENANCE
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields

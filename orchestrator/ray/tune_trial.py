@@ -44,7 +44,7 @@ class TuneTrial(tune.Trainable):
             TeacherUnavailableError: the teacher does not answer; Tune tries the trial again.
             StorageError: the object store was down for too long; Tune tries the trial again.
         """
-        from recrl.orchestrator.trial.runner import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
+        from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
         if not self._stop_sign.is_set():
             with _given_gpu(), self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:

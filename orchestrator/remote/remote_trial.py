@@ -1,7 +1,7 @@
 """A trial in an object store: its objects, and their download to a folder.
 
     <address>/<sweep>/trials/<trial>/<attempt>-<token>/
-        commit-<number>     record, new rows and checkpoint: see ``commit``
+        commit-<number>     record, new rows and checkpoint: see ``commit_format``
         alive.json          while the attempt works: its record, every few seconds
 
 A trial runs in a folder of its machine, like any trial; ``upload`` sends each commit. Rules. Readers check
@@ -28,10 +28,10 @@ from pathlib import PurePosixPath
 from typing import Self
 
 from recrl.orchestrator.errors import StorageError
-from recrl.orchestrator.files.small_files import write_atomically, write_json
+from recrl.orchestrator.files.atomic_files import write_atomically, write_json
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.remote.commit import APPENDED, CHECKPOINT, COMMIT, Commit, Piece, unpack
+from recrl.orchestrator.remote.commit_format import APPENDED, CHECKPOINT, COMMIT, Commit, Piece, unpack
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.spec import TrialState
 

@@ -20,7 +20,7 @@ from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.remote import patience
-from recrl.orchestrator.remote.commit import APPENDED, WHOLE, Commit, Piece, pack
+from recrl.orchestrator.remote.commit_format import APPENDED, WHOLE, Commit, Piece, pack
 from recrl.orchestrator.remote.patience import patiently
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial, attempt_of, attempts_in, size_of
 from recrl.orchestrator.spec import TrialSpec, TrialState

@@ -35,7 +35,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
-from recrl.orchestrator.trial.runner import run_trial
+from recrl.orchestrator.trial.attempt import run_trial
 from recrl.teachers.registry import make_teacher
 
 STEPS_PER_UPDATE = 16_000

@@ -37,7 +37,7 @@ from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep import LaunchSettings, launch
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 
 GRID = """\
 name: {name}

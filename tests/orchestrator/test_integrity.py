@@ -18,8 +18,8 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import CheckpointError, DamagedError, RowError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.atomic_files import read_sealed, write_sealed
 from recrl.orchestrator.files.row_files import Extent, RowFile
-from recrl.orchestrator.files.small_files import read_sealed, write_sealed
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.grid import parse_grid
@@ -27,7 +27,7 @@ from recrl.orchestrator.grid.plan import PlannedAction, make_plan
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 
 GRID = """\
 name: small

@@ -113,7 +113,7 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
 
     class Stopping(InlineExecutor):
         def run(self, specs: object, place: SweepPlace, stop: threading.Event) -> None:
-            from recrl.orchestrator.trial.runner import run_recorded  # noqa: PLC0415
+            from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415
 
             answers = iter([False])
             run_recorded(spec, place.store.trial(spec), should_stop=lambda: next(answers, True))

@@ -34,7 +34,7 @@ from recrl.orchestrator.remote.stop_object import StopObject
 from recrl.orchestrator.remote.upload import Upload
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
 
 GRID = """\
@@ -178,7 +178,7 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
         "from recrl.orchestrator.files.sweep_store import SweepStore\n"
         "from recrl.orchestrator.remote.opening import sweep_place\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
-        "from recrl.orchestrator.trial.runner import run_recorded\n"
+        "from recrl.orchestrator.trial.attempt import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
         "asked = iter(range(99))\n"
         "hang = lambda: next(asked) >= 3 and threading.Event().wait()\n"

@@ -16,7 +16,7 @@ from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
-from recrl.orchestrator.remote.commit import Commit, pack, unpack
+from recrl.orchestrator.remote.commit_format import Commit, pack, unpack
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import RemoteTrial
 from recrl.orchestrator.remote.upload import Upload
