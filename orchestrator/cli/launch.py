@@ -22,8 +22,8 @@ from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.plan import Plan
 from recrl.orchestrator.grid.selection import parse_only
 from recrl.orchestrator.places import SweepPlace

@@ -12,7 +12,7 @@ from recrl.orchestrator.cli.requests import ExportRequest, FiguresRequest, Merge
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.grid.grid import read_name
+from recrl.orchestrator.grid.checking import read_name
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.address import checked_uri
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from recrl.orchestrator.cli.requests import SweepRequest
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_name
+from recrl.orchestrator.grid.checking import read_name
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.validation import nearest
 

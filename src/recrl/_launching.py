@@ -18,8 +18,8 @@ from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_in
 from recrl.orchestrator.errors import GridError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid, read_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
 
 if TYPE_CHECKING:

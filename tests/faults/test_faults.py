@@ -172,7 +172,7 @@ def test_what_a_full_disk_keeps_from_being_said_hides_nothing(
             fill(small_disk)
             raise ArithmeticError("the first error")
 
-    from recrl.orchestrator.grid.grid import parse_grid  # noqa: PLC0415
+    from recrl.orchestrator.grid.checking import parse_grid  # noqa: PLC0415
 
     text = (
         "name: sweep\ntasks: [{name: two-state, options: {horizon: 10}, deploy_limits: 3}]\nagents: "

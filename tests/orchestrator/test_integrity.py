@@ -22,7 +22,7 @@ from recrl.orchestrator.files.atomic_files import read_sealed, write_sealed
 from recrl.orchestrator.files.row_files import Extent, RowFile
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import PlannedAction, make_plan
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState

@@ -22,7 +22,7 @@ from recrl.orchestrator.files.code_changes import (
 )
 from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.sweep import LaunchSettings, launch
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import PlannedAction, estimate, make_plan, trials_at_once
 from recrl.orchestrator.spec import TrialSpec, TrialState
 

@@ -10,7 +10,7 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import ClusterError, GridError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.own_package import copy_package, source_digest
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.ray.clusters import existing_cluster
 from recrl.orchestrator.ray.nodes import SIGHT, differences
 

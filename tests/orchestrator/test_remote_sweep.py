@@ -24,8 +24,8 @@ from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore

@@ -3,7 +3,7 @@
 import pytest
 
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.selection import number_of_pairs, parse_only, select
 
 GRID = b"""\

@@ -18,8 +18,8 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files import trial_tables
-from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.grid_file import GridFile
+from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.grid.file_models import GridFile
 from tests.project.documentation import DOCS, PAGES, ROOT, Fence, fences, label
 
 BASE: dict[str, Any] = {

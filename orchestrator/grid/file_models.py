@@ -1,4 +1,4 @@
-"""Pydantic models of a grid file's content; ``grid`` checks its meaning.
+"""Pydantic models of a grid file's content; ``checking`` checks its meaning.
 
 Symbols: ``train_limits`` is d_t, ``deploy_limits`` is d_d, T ``rollout_steps``. Limits are undiscounted costs
 per episode.
