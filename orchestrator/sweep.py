@@ -20,12 +20,12 @@ from typing import Protocol
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.executors import Executor
-from recrl.orchestrator.files.provenance import collect
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan
 from recrl.orchestrator.grid.selection import select
 from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.provenance.versions import collect
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
 

@@ -9,10 +9,10 @@ from recrl.orchestrator.cli.requests import EvaluateRequest
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.code_changes import has_other_code, other_code_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.selection import parse_only, select
+from recrl.orchestrator.provenance.code_changes import has_other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process

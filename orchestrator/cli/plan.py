@@ -11,12 +11,12 @@ from recrl.orchestrator.cli.output import say, short
 from recrl.orchestrator.cli.requests import GridRequest, LaunchRequest, PlanRequest, ValidateRequest
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.code_changes import other_code_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, trials_at_once, unmeasured
 from recrl.orchestrator.grid.selection import parse_only
+from recrl.orchestrator.provenance.code_changes import other_code_sentence
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.spec import TrialState
 

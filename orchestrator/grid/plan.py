@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from recrl.orchestrator.files.code_changes import has_other_code
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.selection import select
+from recrl.orchestrator.provenance.code_changes import has_other_code
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 
 # Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the MLflow

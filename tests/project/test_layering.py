@@ -21,6 +21,7 @@ ALLOWED = {
         "recrl.environments",
         "recrl.orchestrator.errors",
         "recrl.orchestrator.files",
+        "recrl.orchestrator.provenance.code_changes",
         "recrl.orchestrator.redaction",
         "recrl.orchestrator.spec",
         "recrl.orchestrator.tracking.read",
@@ -53,6 +54,7 @@ ADAPTERS = {
 LAYERS = (
     ("background", "errors", "exit_codes", "located_yaml", "redaction", "spec", "untrusted", "validation"),
     ("files",),
+    ("provenance",),
     ("executors", "places", "sweep_progress", "trial"),
     ("grid", "remote"),
     ("tracking",),
