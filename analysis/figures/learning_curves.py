@@ -22,14 +22,14 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.curves import MEAN, Averaging, mean_curve, step_grid
-from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
 
 BINS = 100
 DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
 LEAST_SHOWN = 0.2  # of a limit, above and below it
-LEAST_SHOWN_RETURN = 2.0 * OPTIMAL_GAP  # above and below J*(d_d)
+LEAST_SHOWN_RETURN = 2.0 * SOLVED_GAP  # above and below J*(d_d)
 WORTH_MARKING = 0.03  # of a trial: shorter periods of infinite limits (the measurement of d_t) are not marked
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from recrl.analysis.statistics.feasibility import is_cost
 from recrl.analysis.statistics.intervals import CONFIDENCE, ENOUGH_RUNS, interquartile_mean
+from recrl.analysis.statistics.verdicts import is_cost
 from recrl.environments.cmdp import Floats
 
 BAND_REPLICATIONS = 500  # a band has a hundred intervals

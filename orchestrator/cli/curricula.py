@@ -51,7 +51,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
 
     from recrl.analysis.figures import styles  # noqa: PLC0415
     from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits  # noqa: PLC0415
-    from recrl.analysis.report_tables import write_csv  # noqa: PLC0415
+    from recrl.analysis.report.table_formats import write_csv  # noqa: PLC0415
     from recrl.analysis.statistics.curriculum_replay import replay, replay_summary  # noqa: PLC0415
 
     store = open_store(request)

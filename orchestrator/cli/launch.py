@@ -149,7 +149,7 @@ def _say_starting(request: LaunchRequest, console: Console) -> None:
 
 def _say_results(sweep: Sweep, console: Console) -> None:
     """Print return and cost of the final policies."""
-    from recrl.analysis.data.validity import curriculum_warnings  # noqa: PLC0415
+    from recrl.analysis.data.sweep_warnings import curriculum_warnings  # noqa: PLC0415
     from recrl.orchestrator.cli.result_table import CAPTION, result_table  # noqa: PLC0415
 
     table = result_table(sweep)

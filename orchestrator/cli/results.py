@@ -66,7 +66,7 @@ def run_merge(request: MergeRequest, console: Console) -> ExitCode:
 
 def say_warnings(sweep: Sweep, console: Console) -> None:
     """Print the trials that are left out, and other remarks on validity."""
-    from recrl.analysis.data.validity import damages, doubts  # noqa: PLC0415  (imports pandas)
+    from recrl.analysis.data.sweep_warnings import damages, doubts  # noqa: PLC0415  (imports pandas)
 
     for sentence in damages(sweep):
         say(console, f"damaged: {sentence}")
@@ -97,7 +97,7 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
 
 def draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True) -> None:
     """Draw a sweep's figures, tables and report, and print their place."""
-    from recrl.analysis.report import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
+    from recrl.analysis.report.drawing import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
 
     (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])
     say(console, f"Figures    {short(folder)}")

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recrl.analysis import report
 from recrl.analysis.data import sweep_data
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import CheckpointError, DamagedError, RowError
@@ -133,7 +132,7 @@ def test_a_complete_trial_that_was_cut_is_damaged_and_its_numbers_are_not_used(
     assert sweep.trials["status"].tolist() == ["complete", "damaged"]
     assert set(sweep.phases["method"]) == set(sweep.updates["method"]) == {"none"}
     title = trial.spec.title
-    assert f"{title}: damaged, 0% of its steps done: {sentence}" in report.missing(sweep)
+    assert f"{title}: damaged, 0% of its steps done: {sentence}" in drawing.missing(sweep)
     for command in (["status", "--brief"], ["plan", "grid.yaml"], ["export", "small"]):
         assert main(command) == ExitCode.OK
         assert f"damaged: {title}: {sentence}\n" in capsys.readouterr().out
