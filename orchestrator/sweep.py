@@ -37,7 +37,7 @@ REQUEST_SECONDS = 0.5  # between two checks for a stop request
 logger = logging.getLogger("recrl.sweep")
 
 
-class BackgroundSync(Protocol):
+class RunningSync(Protocol):
     """A process that copies the sweep to MLflow while it runs."""
 
     def stop(self, timeout: float) -> bool:
@@ -95,7 +95,7 @@ class LaunchSettings:
     retry_failed: bool = False
     rerun_damaged: bool = False
     rerun_changed: bool = False
-    start_sync: Callable[[SweepStore], BackgroundSync] | None = None
+    start_sync: Callable[[SweepStore], RunningSync] | None = None
     watch: Callable[[Plan], None] = lambda plan: None
     finish: Callable[[SweepProgress], None] = lambda after: None
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from recrl.orchestrator.redaction import printable
-from recrl.orchestrator.validation import sentences, shown
+from recrl.orchestrator.validation import as_written, sentences
 
 LONGEST_NAME = 200
 _NAME = re.compile(r"[^\W_.-][^/\\\x00-\x1f]{0,127}")
@@ -30,7 +30,7 @@ def checked_name(value: Any) -> str:
     'demo'
     """
     if not isinstance(value, str) or not _NAME.fullmatch(value) or printable(value) != value:
-        raise ValueError(f"the sweep's name must be a name for a folder, got {shown(value)}")
+        raise ValueError(f"the sweep's name must be a name for a folder, got {as_written(value)}")
     return value
 
 
@@ -48,7 +48,7 @@ def plain_text(text: str) -> str:
 def _limits(values: list[float | str]) -> list[float | str]:
     for value in values:
         if not (value == "inf" or (isinstance(value, float | int) and math.isfinite(value) and value >= 0)):
-            raise ValueError(f"must be numbers of at least 0, or 'inf', got {shown(value)}")
+            raise ValueError(f"must be numbers of at least 0, or 'inf', got {as_written(value)}")
     return values
 
 

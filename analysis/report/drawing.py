@@ -52,7 +52,7 @@ from recrl.analysis.figures.profiles import performance_profiles
 from recrl.analysis.report import html_page, table_formats, verdict_texts
 from recrl.analysis.report.html_page import Section
 from recrl.analysis.report.table_files import BOOTSTRAP_SEED, Tables, write_tables
-from recrl.analysis.statistics.curves import MEAN, Averaging, interquartile
+from recrl.analysis.statistics.curves import MEAN, CurveAverage, interquartile
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.errors import RecrlError, described
@@ -81,7 +81,7 @@ class NothingToDrawError(RecrlError):
     """The sweep has no policy update on disk yet."""
 
 
-def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
+def draw(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[Path]:
     """Draw every figure and write every table of a finished or running sweep.
 
     Args:
@@ -107,7 +107,7 @@ def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Pat
     return written
 
 
-def sketch(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
+def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[Path]:
     """Draw only the fast figures, for a running sweep; otherwise like ``draw``.
 
     Args:
@@ -203,7 +203,7 @@ def _marked(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(verdict=texts)
 
 
-def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable[[], Figure | None]]:
+def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Callable[[], Figure | None]]:
     """Return the figures of a sweep by file stem, as functions; a function returns None without data.
 
     Args:
@@ -242,7 +242,7 @@ def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable
     return made
 
 
-def averagings() -> dict[str, Averaging]:
+def curve_averages() -> dict[str, CurveAverage]:
     """Return the kinds of lines and bands, by their names on the command line."""
     return {"mean": MEAN, "iqm": interquartile(np.random.default_rng(BOOTSTRAP_SEED))}
 

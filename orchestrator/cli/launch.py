@@ -30,7 +30,7 @@ from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.opening import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
-from recrl.orchestrator.sweep import BackgroundSync, LaunchSettings, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep import LaunchSettings, RunningSync, SweepResult, launch, stopping_on_signals
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, progress
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
@@ -138,7 +138,7 @@ def _executor(grid: GridSpec, place: SweepPlace, request: LaunchRequest) -> Exec
     )
 
 
-def _sync_to(uri: str) -> Callable[[SweepStore], BackgroundSync]:
+def _sync_to(uri: str) -> Callable[[SweepStore], RunningSync]:
     return lambda store: start_sync(store, uri, interval_seconds=SYNC_INTERVAL_SECONDS)
 
 

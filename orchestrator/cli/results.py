@@ -97,7 +97,7 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
 
 def draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True) -> None:
     """Draw a sweep's figures, tables and report, and print their place."""
-    from recrl.analysis.report.drawing import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
+    from recrl.analysis.report.drawing import curve_averages, draw, sketch  # noqa: PLC0415  (imports matplotlib)
 
-    (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])
+    (draw if whole else sketch)(sweep, folder, averaging=curve_averages()[band])
     say(console, f"Figures    {short(folder)}")

@@ -44,7 +44,7 @@ from recrl.orchestrator.grid.file_models import (
 )
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice
-from recrl.orchestrator.validation import nearest, sentences, shown
+from recrl.orchestrator.validation import as_written, nearest, sentences
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000
@@ -146,7 +146,7 @@ class _Check:
         """Return the grid, or None if there are problems."""
         if not isinstance(self._document.value, dict):
             if not self.problems:
-                self.add((), f"a grid must be a mapping of settings, got {shown(self._document.value)}")
+                self.add((), f"a grid must be a mapping of settings, got {as_written(self._document.value)}")
             return None
         file = self._validated(GridFile, self._raw)
         tasks = self._tasks()
@@ -187,7 +187,7 @@ class _Check:
             for key, values in wanted.items():
                 for value in (value for value in values if value not in known[key]):
                     hint = nearest(str(value), [str(name) for name in known[key]])
-                    self.add(("exclude", index, key), f"this grid has no {key} {shown(value)}{hint}")
+                    self.add(("exclude", index, key), f"this grid has no {key} {as_written(value)}{hint}")
         if not self.problems and not grid.trials():
             self.add(("exclude",), "leaves no trial")
 

@@ -19,7 +19,7 @@ SQLITE_HEAD = b"SQLite format 3\0"
 
 # Read by mlflow at its import. A lost server must delay a pass by seconds, not by MLflow's own four minutes;
 # the next pass tries again. A user's own settings have priority.
-ENVIRONMENT = {
+MLFLOW_SETTINGS = {
     "DO_NOT_TRACK": "true",
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",
@@ -30,17 +30,17 @@ ENVIRONMENT = {
 }
 
 
-def connect(uri: str, *, environment: Mapping[str, str] = ENVIRONMENT) -> MlflowClient:
+def connect(uri: str, *, settings: Mapping[str, str] = MLFLOW_SETTINGS) -> MlflowClient:
     """Return a client of a store; a missing sqlite file is created.
 
     Args:
         uri: of ``address.tracking_uri``.
-        environment: settings of MLflow; the user's own environment has priority.
+        settings: of MLflow, as environment variables; the user's own environment has priority.
 
     Raises:
         Exception: raised by mlflow if the store cannot be used.
     """
-    for key, value in environment.items():
+    for key, value in settings.items():
         os.environ.setdefault(key, value)
     from mlflow.tracking import MlflowClient  # noqa: PLC0415
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from recrl.analysis.data import sweep_data
+from recrl.analysis.report import drawing
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import CheckpointError, DamagedError, RowError
 from recrl.orchestrator.executors import Executor, InlineExecutor

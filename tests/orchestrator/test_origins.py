@@ -11,6 +11,7 @@ import pytest
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_warnings import curriculum_flags
+from recrl.analysis.report import drawing
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
