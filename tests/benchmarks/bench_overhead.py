@@ -30,8 +30,8 @@ from typing import Any
 import torch
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.cli.launch import SYNC_INTERVAL_SECONDS
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.launching import SYNC_INTERVAL_SECONDS
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
