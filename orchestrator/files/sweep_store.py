@@ -66,7 +66,7 @@ from recrl.orchestrator.files.atomic_files import (
 )
 from recrl.orchestrator.files.locks import look_at_lock, open_lock
 from recrl.orchestrator.files.row_files import Extent
-from recrl.orchestrator.files.trial_paths import Below
+from recrl.orchestrator.files.trial_files import Below
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 

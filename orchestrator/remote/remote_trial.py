@@ -38,7 +38,6 @@ from recrl.orchestrator.spec import TrialState
 LOOKS = 3  # wait for a newer commit, before a damaged one is reported
 
 ALIVE = "alive.json"
-PULLED = ".pulled.json"
 _ATTEMPT = re.compile(r"(\d{6})-[0-9a-f]{16}")
 
 logger = logging.getLogger("recrl.trial")
@@ -181,7 +180,7 @@ class _Pulled:
     def of(cls, trial: TrialStore) -> Self:
         """Read it from the folder."""
         try:
-            value = json.loads((trial.folder / PULLED).read_text())
+            value = json.loads(trial.pulled_path.read_text())
             return cls(value["key"], Commit.from_json(value["commit"]))
         except (OSError, ValueError, KeyError, TypeError):
             return cls("", Commit(TrialRecord(), {}))
@@ -189,7 +188,7 @@ class _Pulled:
     def write(self, trial: TrialStore) -> None:
         """Store it in the folder."""
         trial.folder.mkdir(parents=True, exist_ok=True)
-        write_json(trial.folder / PULLED, {"key": self.key, "commit": self.commit.to_json()})
+        write_json(trial.pulled_path, {"key": self.key, "commit": self.commit.to_json()})
 
 
 def _missing(

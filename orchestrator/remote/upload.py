@@ -17,6 +17,7 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
+from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.remote import patience
@@ -28,8 +29,6 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 LOOK_SECONDS = 0.5  # between two checks of the trial's folder
 ALIVE_SECONDS = 15.0  # between two signs of life
 KEPT_COMMITS = 2  # a reader may still use the last but one
-
-ROWS = ("episodes.csv", "updates.csv", "events.jsonl")
 
 logger = logging.getLogger("recrl.trial")
 
@@ -120,9 +119,10 @@ class Upload:
         with self._trial.locked():
             record = self._trial.stated()
             saved, rows = _newest_checkpoint(self._trial)
-            extents = {**record.extents, **dict.fromkeys(ROWS, Extent()), **rows}
+            extents = {**record.extents, **dict.fromkeys(files_of(FileKind.ROWS), Extent()), **rows}
             committed = {name: extent.length for name, extent in extents.items()}
-            lengths = {**committed, "log.txt": size_of(self._trial, "log.txt")}
+            logs = {name: size_of(self._trial, name) for name in files_of(FileKind.LOG)}
+            lengths = {**committed, **logs}
             kept: dict[str, tuple[Piece, ...]] = {}
             new: dict[str, tuple[int, bytes]] = {}
             for name in APPENDED:
