@@ -7,6 +7,7 @@ from pathlib import Path
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import read_name
+from recrl.orchestrator.remote.remote_sweep import sweeps_at
 from recrl.orchestrator.validation import nearest
 
 
@@ -22,12 +23,7 @@ def find_sweep(root: Path, sweep: str | None, storage: str | None = None) -> Swe
         RecrlError: there is no such sweep, or more than one.
     """
     place: str | Path = storage or root
-    if storage:
-        from recrl.orchestrator.remote.remote_sweep import sweeps_at  # noqa: PLC0415  (imports fsspec)
-
-        names = sweeps_at(storage)
-    else:
-        names = sorted(path.name for path in root.glob("*") if is_sweep(path))
+    names = sweeps_at(storage) if storage else sorted(path.name for path in root.glob("*") if is_sweep(path))
     if sweep is None:
         if len(names) == 1:
             return SweepStore(root, names[0])

@@ -23,12 +23,12 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.grid.plan import Plan, trials_at_once
 from recrl.orchestrator.places import SweepPlace
-from recrl.orchestrator.remote.opening import sweep_place
+from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.sweep import LaunchSettings, RunningSync, SweepResult, launch, stopping_on_signals
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress
-from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
+from recrl.orchestrator.tracking.client import tracking_uri
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep

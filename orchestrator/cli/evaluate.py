@@ -14,7 +14,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.selection import parse_only, select
 from recrl.orchestrator.provenance.code_changes import has_other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 

@@ -14,7 +14,7 @@ from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import read_name
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.tracking.address import checked_uri
+from recrl.orchestrator.tracking.client import checked_uri
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep

@@ -5,7 +5,7 @@ from __future__ import annotations
 from recrl.orchestrator.cli.requests import SweepRequest
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.find_sweep import find_sweep
-from recrl.orchestrator.remote.opening import sweep_place
+from recrl.orchestrator.remote.remote_sweep import sweep_place
 
 
 def open_store(request: SweepRequest, *, checkpoints: bool = False) -> SweepStore:

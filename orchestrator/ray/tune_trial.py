@@ -17,7 +17,7 @@ from ray import tune
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
-from recrl.orchestrator.remote.opening import sweep_place
+from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialSpec
 
 

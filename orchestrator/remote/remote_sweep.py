@@ -283,6 +283,22 @@ class RemoteSweep(SweepPlace):
             yield
 
 
+def sweep_place(store: SweepStore, given: str | None = None) -> SweepPlace:
+    """Return a sweep's place: the given address, the address stored in its folder, or the folder.
+
+    Args:
+        store: the sweep's folder on this machine.
+        given: the address of an object store, or None.
+
+    Raises:
+        RecrlError: the address is invalid, needs a package that is not installed, or cannot be read.
+    """
+    if not given and not store.storage_path.exists():
+        return SweepPlace(store)
+    uri = given or remembered_uri(store)
+    return RemoteSweep(uri, store) if uri else SweepPlace(store)
+
+
 def remembered_uri(store: SweepStore) -> str | None:
     """Return the address of which a folder is a copy; None if it is no copy.
 

@@ -73,7 +73,7 @@ def sync(
 
     Args:
         store: the sweep.
-        uri: of ``address.tracking_uri``.
+        uri: of ``client.tracking_uri``.
         rebuild: delete the sweep's runs in MLflow and send everything again.
         write_export: writes the sweep's export file, for its upload; None to upload none.
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.redaction import redacted
-from recrl.orchestrator.tracking.address import sqlite_path
-from recrl.orchestrator.tracking.client import EXPERIMENTS, MLFLOW_SETTINGS, connect, one_line
+from recrl.orchestrator.tracking.client import EXPERIMENTS, MLFLOW_SETTINGS, connect, one_line, sqlite_path
 from recrl.orchestrator.tracking.export_file import FILE_NAME, FOLDER, UPLOADED_TAG
 
 if TYPE_CHECKING:

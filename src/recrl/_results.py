@@ -52,7 +52,7 @@ def load_sweep(
     """
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415
     from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
-    from recrl.orchestrator.tracking.address import checked_uri  # noqa: PLC0415
+    from recrl.orchestrator.tracking.client import checked_uri  # noqa: PLC0415
 
     with following(trust):
         if "://" in str(source):

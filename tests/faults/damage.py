@@ -35,7 +35,7 @@ from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep import LaunchSettings, launch
-from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.trial.attempt import run_recorded
 

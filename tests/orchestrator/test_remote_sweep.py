@@ -176,7 +176,7 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
         "import json, sys, threading\n"
         "from pathlib import Path\n"
         "from recrl.orchestrator.files.sweep_store import SweepStore\n"
-        "from recrl.orchestrator.remote.opening import sweep_place\n"
+        "from recrl.orchestrator.remote.remote_sweep import sweep_place\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
         "from recrl.orchestrator.trial.attempt import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
