@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
 from recrl.orchestrator.cli import requests
-from recrl.orchestrator.cli.requests import VIDEOS, Request
+from recrl.orchestrator.cli.argument_fields import Request
+from recrl.orchestrator.cli.requests import VIDEOS
 from recrl.orchestrator.grid.selection import number_of_pairs
 
 DESCRIPTION = """\

@@ -59,8 +59,8 @@ class Upload:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
             LostLeaseError: a newer attempt runs the trial.
         """
-        record = self._trial.stated()
-        if not record.token or record.token == self._before:
+        record = self._own_record()
+        if record is None:
             return
         if self._shown is None or time.monotonic() >= self._spoke_at + ALIVE_SECONDS:
             self._speak(record)
@@ -68,18 +68,18 @@ class Upload:
             self.push()
 
     def finish(self) -> None:
-        """Send the remaining commits, after the attempt's end.
-
-        Raises:
-            StorageError: the store cannot be written; nothing is lost, the next call tries again.
-            LostLeaseError: a newer attempt runs the trial.
-        """
-        record = self._trial.stated()
-        if not record.token or record.token == self._before:
+        """Send the remaining commits, after the attempt's end; raise the errors of ``follow``."""
+        record = self._own_record()
+        if record is None:
             return
         self._speak(replace(record, heartbeat=time.time()))  # uploads may take long
         self.push()
         self._remote.objects.delete([f"{attempt_of(record)}/{ALIVE}"])
+
+    def _own_record(self) -> TrialRecord | None:
+        """Return the record of the attempt to upload; None before it has begun."""
+        record = self._trial.stated()
+        return None if record.token in ("", self._before) else record
 
     def push(self) -> None:
         """Send a commit of the present files.
