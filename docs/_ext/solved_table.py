@@ -4,7 +4,7 @@
     :methods: none, linear, dynamic
     ```
 
-``recrl.analysis.statistics.feasibility`` defines "solved" and its tolerance.
+``recrl.analysis.statistics.verdicts`` defines "solved" and its tolerance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from recrl.analysis.statistics.feasibility import optimal
+from recrl.analysis.statistics.verdicts import solved
 
 ROOT = Path(__file__).resolve().parents[2]
 MEASURES = {
@@ -37,7 +37,7 @@ def solved_table(path: Path, methods: list[str]) -> str:
         methods: the curricula to show, in this order; all if empty.
     """
     rows = pd.read_csv(path)
-    rows["solved"] = optimal(rows)
+    rows["solved"] = solved(rows)
     shown = methods or list(dict.fromkeys(rows["method"]))
     lines = [f"| task | agent | curriculum | {' | '.join(MEASURES.values())} |", "|---|---|---|---|---|---|"]
     for (task, agent), cell in rows.groupby(["task", "agent"], sort=False):

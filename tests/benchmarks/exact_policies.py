@@ -16,7 +16,7 @@ import pandas as pd
 
 from recrl.analysis.data.exact_values import exact_values, finite_model
 from recrl.analysis.data.labels import KEY
-from recrl.analysis.statistics.feasibility import optimal
+from recrl.analysis.statistics.verdicts import solved
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import optimal_return
 
@@ -38,7 +38,7 @@ def exact(path: Path) -> pd.DataFrame:
     best = values.apply(
         lambda row: optimal_return(row["task"], {}, CostLimits((row["deploy_limit_0"],))), axis=1
     )
-    values["solved"] = optimal(values.assign(gap=best - values["return"]))
+    values["solved"] = solved(values.assign(gap=best - values["return"]))
     return values.rename(columns={"cost_0": "cost", "deploy_limit_0": "limit"}).round(4)
 
 

@@ -26,7 +26,7 @@ from recrl.environments.rivergrid.instances import (
 )
 from recrl.environments.rivergrid.maps import DRY, MAPS, RIVER, MapError, parse_map
 from recrl.environments.rivergrid.print_instances import grid_entry, main
-from recrl.orchestrator.grid.grid import parse_grid, read_grid
+from recrl.orchestrator.grid.checking import parse_grid, read_grid
 
 PAPERS = {name: parse_map(drawing) for name, drawing in MAPS.items()}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from recrl.analysis.statistics.feasibility import optimal
+from recrl.analysis.statistics.verdicts import solved
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -99,7 +99,7 @@ def test_the_table_of_rivergrid_is_counted() -> None:
     rows["optimal_return"] = rows["task"].map({"rivergrid-1a": 9.5, "rivergrid-1b": 9.1})
     rows["gap"] = rows["optimal_return"] - rows["return"]
     rows = rows.rename(columns={"cost": "cost_0", "limit": "deploy_limit_0"})
-    rows = rows[rows["policy"] == "average"].assign(solved=optimal(rows))
+    rows = rows[rows["policy"] == "average"].assign(solved=solved(rows))
     solved = rows.pivot_table(index=["task", "agent", "seed"], columns="method", values="solved")
     for method in ("none", "dynamic"):
         counts = solved[method].groupby(["task", "agent"]).sum().astype(int)

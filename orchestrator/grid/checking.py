@@ -21,21 +21,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from recrl.agents.registry import AGENTS, agent_config, make_agent
+from recrl.agents.registry import agent_config
 from recrl.environments.cmdp import CMDPSpec, CostLimits
-from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.plugins import UnknownNameError, UntrustedNameError, trusted_attribute
-from recrl.environments.registry import make_vector, task_options
+from recrl.environments.registry import task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
-from recrl.orchestrator.grid.grid_file import (
+from recrl.orchestrator.grid.building import BuildError, build_own, cmdp_of
+from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
+from recrl.orchestrator.grid.file_models import (
     Entry,
     GridFile,
     Limits,
@@ -43,12 +42,10 @@ from recrl.orchestrator.grid.grid_file import (
     SweepName,
     TaskEntry,
 )
-from recrl.orchestrator.grid.grid_spec import GridSpec, TaskCell
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice
-from recrl.orchestrator.validation import nearest, sentences, shown
-from recrl.teachers.registry import TEACHERS, make_teacher, teacher_config
-from recrl.teachers.teacher import checked_answer
+from recrl.orchestrator.validation import as_written, nearest, sentences
+from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000
 ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many updates
@@ -89,7 +86,8 @@ def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
     check = _Check(data)
     grid = check.grid()
     if grid is not None and build:
-        check.build_own(grid)
+        for place, sentence in build_own(grid):
+            check.add(place, sentence)
     if check.problems:
         ordered = sorted(set(check.problems), key=lambda problem: (problem.line, str(problem.place)))
         raise GridError([f"{source}:{problem}" for problem in ordered])
@@ -148,7 +146,7 @@ class _Check:
         """Return the grid, or None if there are problems."""
         if not isinstance(self._document.value, dict):
             if not self.problems:
-                self._add((), f"a grid must be a mapping of settings, got {shown(self._document.value)}")
+                self.add((), f"a grid must be a mapping of settings, got {as_written(self._document.value)}")
             return None
         file = self._validated(GridFile, self._raw)
         tasks = self._tasks()
@@ -174,7 +172,7 @@ class _Check:
         """Check the product of all parts."""
         size = len(grid.tasks) * len(grid.agents) * len(grid.methods) * len(grid.seeds)
         if size > MAX_TRIALS:
-            self._add((), f"a grid must have at most {MAX_TRIALS} trials, got {size}")
+            self.add((), f"a grid must have at most {MAX_TRIALS} trials, got {size}")
             return
         known: dict[str, list[Any]] = {
             "task": [cell.task.label for cell in grid.tasks],
@@ -185,45 +183,23 @@ class _Check:
         for index, rule in enumerate(grid.exclude):
             wanted = rule.model_dump(exclude_none=True)
             if not wanted:
-                self._add(("exclude", index), f"must name at least one of {', '.join(known)}")
+                self.add(("exclude", index), f"must name at least one of {', '.join(known)}")
             for key, values in wanted.items():
                 for value in (value for value in values if value not in known[key]):
                     hint = nearest(str(value), [str(name) for name in known[key]])
-                    self._add(("exclude", index, key), f"this grid has no {key} {shown(value)}{hint}")
+                    self.add(("exclude", index, key), f"this grid has no {key} {as_written(value)}{hint}")
         if not self.problems and not grid.trials():
-            self._add(("exclude",), "leaves no trial")
-
-    def build_own(self, grid: GridSpec) -> None:
-        """Build the user's own agents, networks and curricula once on each task that they meet."""
-        trials = grid.trials()
-        cells = {cell.task.label: cell.task for cell in grid.tasks}
-        agents = {(it.task.label, it.agent.label): it for it in trials if _is_own_agent(it.agent)}
-        methods = {(it.task.label, it.method.label): it for it in trials if it.method.name not in TEACHERS}
-        for (task, label), spec in agents.items():
-            cmdp = make_vector(cells[task].name, 1, options=cells[task].options).cmdp
-            place = ("agents", [agent.label for agent in grid.agents].index(label))
-            with self._described(place, f"{label} cannot be built on {task}"):
-                make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
-        for (task, label), spec in methods.items():
-            place = ("methods", [method.label for method in grid.methods].index(label))
-            with self._described(place, f"{label} cannot be started on {task}"):
-                checked_answer(make_teacher(spec.teacher).start(), label, len(spec.deploy_limits))
-
-    @contextmanager
-    def _described(self, place: Place, what: str) -> Iterator[None]:
-        """Add what is raised meanwhile by the user's own code."""
-        try:
-            yield
-        except USERS_ERRORS as error:
-            self._add(place, f"{what}: {described(error)}")
+            self.add(("exclude",), "leaves no trial")
 
     def _tasks(self) -> list[TaskCell]:
         """Return the tasks with correct limits and rollouts."""
         run = _valid(Run, self._raw.get("run"))
         cells = []
         for index, task in self._choices("tasks", TaskEntry, task_options).items():
-            cmdp = self._cmdp(index, task)
-            if cmdp is None:
+            try:
+                cmdp = cmdp_of(task)
+            except BuildError as error:
+                self.add(("tasks", index), str(error))
                 continue
             limits = self._both_limits(index, task.label, cmdp)
             rollout_steps = self._rollout_steps(run, task.label, cmdp)
@@ -254,15 +230,15 @@ class _Check:
             _require_json(options)
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
-                self._add((*place, "options", *inner), sentence)
+                self.add((*place, "options", *inner), sentence)
         except UnknownNameError as error:
-            self._add(name_place, str(error))
+            self.add(name_place, str(error))
         except UntrustedNameError as error:
             self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
         except NotJsonError as error:
-            self._add((*place, "options"), f"must be finite JSON values ({error})")
+            self.add((*place, "options"), f"must be finite JSON values ({error})")
         except USERS_ERRORS as error:
-            self._add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
+            self.add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
         else:
             self._check_network((*place, "options", "network"), options)
             return options
@@ -276,42 +252,23 @@ class _Check:
         try:
             trusted_attribute(path)
         except UnknownNameError as error:
-            self._add(place, str(error))
+            self.add(place, str(error))
         except UntrustedNameError as error:
             self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
         except USERS_ERRORS as error:
-            self._add(place, f"{path!r} cannot be imported: {described(error)}")
+            self.add(place, f"{path!r} cannot be imported: {described(error)}")
 
     def _check_differs(self, place: Place, choice: Choice, earlier: Mapping[int, Choice]) -> None:
         """Check that no earlier entry has the same label, or is the same under another label."""
         for index, other in earlier.items():
             if other.label == choice.label:
-                self._add(
+                self.add(
                     place, f"is called {choice.label!r}, as is {place[0]}.{index}; give it another label"
                 )
                 return
             if (other.name, other.options) == (choice.name, choice.options) and place[0] != "tasks":
-                self._add(place, f"is the same as {place[0]}.{index}, under another label")
+                self.add(place, f"is the same as {place[0]}.{index}, under another label")
                 return
-
-    def _cmdp(self, index: int, task: Choice) -> CMDPSpec | None:
-        """Return the task's CMDP, by building one environment; a user's environment also takes one step."""
-        try:
-            envs = make_vector(task.name, 1, options=task.options)
-        except USERS_ERRORS as error:
-            self._add(("tasks", index), f"{task.name} cannot be built: {described(error)}")
-            return None
-        try:
-            if isinstance(envs, SyncCMDPVectorEnv):  # a user's environment: does a step report its cost?
-                envs.reset(seed=0)
-                envs.action_space.seed(0)
-                envs.step(envs.action_space.sample())
-        except USERS_ERRORS as error:
-            self._add(("tasks", index), f"{task.name} fails in its first step: {described(error)}")
-            return None
-        finally:
-            envs.close()
-        return envs.cmdp
 
     def _both_limits(self, index: int, label: str, cmdp: CMDPSpec) -> tuple[CostLimits, CostLimits] | None:
         """Return the task's d_t and d_d."""
@@ -320,7 +277,7 @@ class _Check:
         if train_limits is None or deploy_limits is None:
             return None
         if any(train < deploy for train, deploy in zip(train_limits, deploy_limits, strict=True)):
-            self._add(
+            self.add(
                 place,
                 f"must be at least the deploy_limits of {label} (d_t >= d_d), "
                 f"got {_numbers(train_limits)} under {_numbers(deploy_limits)}",
@@ -340,11 +297,11 @@ class _Check:
                 return None, place
             values = getattr(shared, key) or DEFAULT_LIMITS[key]
         if values is None:
-            self._add(("tasks", index), f"{key} is required, here or for all tasks")
+            self.add(("tasks", index), f"{key} is required, here or for all tasks")
             return None, place
         if len(values) not in (1, cmdp.num_costs):
             costs = f"{cmdp.num_costs} cost{'s' * (cmdp.num_costs > 1)} ({', '.join(cmdp.cost_names)})"
-            self._add(place, f"{label} has {costs}, got {len(values)} limits")
+            self.add(place, f"{label} has {costs}, got {len(values)} limits")
             return None, place
         return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
 
@@ -355,7 +312,7 @@ class _Check:
         default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
         steps, num_envs = run.rollout_steps or default, run.num_envs
         if run.total_steps < num_envs * steps:
-            self._add(
+            self.add(
                 ("run", "total_steps"),
                 f"must be at least one update of {label}, "
                 f"{num_envs} environments x {steps} steps = {num_envs * steps}, got {run.total_steps}",
@@ -370,15 +327,12 @@ class _Check:
             return model.model_validate(value)
         except ValidationError as error:
             for place, sentence in sentences(error, model):
-                self._add(place, sentence)
+                self.add(place, sentence)
         return None
 
-    def _add(self, place: Place, sentence: str) -> None:
+    def add(self, place: Place, sentence: str) -> None:
+        """Add a problem, with the line of its place."""
         self.problems.append(Problem(self._document.line(place), place, sentence))
-
-
-def _is_own_agent(agent: Choice) -> bool:
-    return agent.name not in AGENTS or isinstance(agent.options.get("network"), str)
 
 
 def _valid(model: type[Model], value: Any) -> Model | None:

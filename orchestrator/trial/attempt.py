@@ -19,10 +19,10 @@ from recrl.orchestrator.errors import (
     TeacherUnavailableError,
     described,
 )
-from recrl.orchestrator.files.code_changes import code_of
-from recrl.orchestrator.files.provenance import collect as collect_provenance
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
+from recrl.orchestrator.provenance.code_changes import code_of
+from recrl.orchestrator.provenance.versions import collect as collect_provenance
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.heartbeat import Heartbeat

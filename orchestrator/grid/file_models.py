@@ -1,4 +1,4 @@
-"""Pydantic models of a grid file's content; ``grid`` checks its meaning.
+"""Pydantic models of a grid file's content; ``checking`` checks its meaning.
 
 Symbols: ``train_limits`` is d_t, ``deploy_limits`` is d_d, T ``rollout_steps``. Limits are undiscounted costs
 per episode.
@@ -23,7 +23,7 @@ from pydantic import (
 
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.untrusted import PlainText, ShortText
-from recrl.orchestrator.validation import shown
+from recrl.orchestrator.validation import as_written
 
 MAX_SEEDS = 10_000
 MAX_STEPS = 10**12
@@ -31,7 +31,7 @@ MAX_STEPS = 10**12
 
 def _not_a_truth_value(value: Any) -> Any:
     if isinstance(value, bool):
-        raise ValueError(f"must be a number, got {shown(value)}")
+        raise ValueError(f"must be a number, got {as_written(value)}")
     return value
 
 
@@ -42,7 +42,7 @@ def _read_limits(value: Any) -> tuple[float, ...]:
         raise ValueError("must be a number or a list of numbers, got []")
     for limit in values:
         if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
-            raise ValueError(f"must be numbers of at least 0 (cost per episode), got {shown(limit)}")
+            raise ValueError(f"must be numbers of at least 0 (cost per episode), got {as_written(limit)}")
     return tuple(float(limit) for limit in values)
 
 
@@ -50,7 +50,7 @@ def _read_train_limits(value: Any) -> tuple[float, ...]:
     """As ``_read_limits``; ``auto`` is infinite: the curriculum measures its start."""
     if isinstance(value, str):
         if value != "auto":
-            raise ValueError(f"must be 'auto', a number or a list of numbers, got {shown(value)}")
+            raise ValueError(f"must be 'auto', a number or a list of numbers, got {as_written(value)}")
         return (math.inf,)
     return _read_limits(value)
 
@@ -69,10 +69,10 @@ def _read_seeds(value: Any) -> tuple[int, ...]:
             raise ValueError(f"must be a number of seeds from 1 to {MAX_SEEDS}, or a list, got {value}")
         return tuple(range(value))
     if not isinstance(value, list) or not 1 <= len(value) <= MAX_SEEDS:
-        raise ValueError(f"must be a number of seeds or a list of seeds, got {shown(value)}")
+        raise ValueError(f"must be a number of seeds or a list of seeds, got {as_written(value)}")
     for index, seed in enumerate(value):
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-            raise ValueError(f"must be whole numbers from 0 to 2^63 - 1, got {shown(seed)}")
+            raise ValueError(f"must be whole numbers from 0 to 2^63 - 1, got {as_written(seed)}")
         if seed in value[:index]:
             raise ValueError(f"must differ, got {seed} twice")
     return tuple(value)
@@ -81,14 +81,14 @@ def _read_seeds(value: Any) -> tuple[int, ...]:
 def _read_custom(value: Any) -> dict[str, float]:
     """Read amounts of a cluster's custom resources, by name; Ray's own resources have separate settings."""
     if not isinstance(value, dict):
-        raise ValueError(f"must be a mapping of names to amounts, got {shown(value)}")
+        raise ValueError(f"must be a mapping of names to amounts, got {as_written(value)}")
     for name, amount in value.items():
         if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.:-]{0,63}", name):
-            raise ValueError(f"must have names of letters, digits and _ . : - only, got {shown(name)}")
+            raise ValueError(f"must have names of letters, digits and _ . : - only, got {as_written(name)}")
         if name.lower() in ("cpu", "gpu", "memory", "object_store_memory"):
             raise ValueError(f"must not name {name}; see cpus_per_trial and gpus_per_trial")
         if isinstance(amount, bool) or not isinstance(amount, int | float) or not 0.0 < amount <= 1e6:
-            raise ValueError(f"must be amounts above 0 and at most 1e6, got {shown(amount)} of {name}")
+            raise ValueError(f"must be amounts above 0 and at most 1e6, got {as_written(amount)} of {name}")
     return {name: float(amount) for name, amount in value.items()}
 
 
@@ -99,7 +99,8 @@ def _listed(value: Any) -> Any:
 def _read_name(value: Any) -> str:
     if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", value):
         raise ValueError(
-            f"must be a name for a folder: letters, digits and . _ - only, at most 64, got {shown(value)}"
+            "must be a name for a folder: letters, digits and . _ - only, at most 64, "
+            f"got {as_written(value)}"
         )
     return value
 
@@ -157,7 +158,7 @@ class Entry(_Written):
         if isinstance(value, str):
             return {"name": value}
         if not isinstance(value, dict):
-            raise ValueError(f"must be a name or a mapping with a name, got {shown(value)}")
+            raise ValueError(f"must be a name or a mapping with a name, got {as_written(value)}")
         return value
 
 

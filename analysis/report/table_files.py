@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from recrl.analysis import report_tables
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.validity import curriculum_flags
+from recrl.analysis.data.sweep_warnings import curriculum_flags
+from recrl.analysis.report import table_formats
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
-from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
 from recrl.analysis.statistics.metrics import Measure
-from recrl.analysis.statistics.verdict_counts import verdicts
+from recrl.analysis.statistics.verdict_counts import count_verdicts
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
 
 BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 
 TIES = (
-    f"P(higher return): a tie counts half. Returns tie within {OPTIMAL_GAP} of each other where the optimum "
+    f"P(higher return): a tie counts half. Returns tie within {SOLVED_GAP} of each other where the optimum "
     "is known, as for solved; elsewhere only where they differ by rounding."
 )
 
@@ -48,7 +48,7 @@ class Tables:
     """Content of the report besides the figures.
 
     Attributes:
-        verdicts: of ``verdicts.verdicts``; empty before a trial is complete.
+        verdicts: of ``verdict_counts.count_verdicts``; empty before a trial is complete.
         shown: the tables for people.
     """
 
@@ -69,8 +69,8 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     rows = metrics.outcomes(sweep)
     bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
     written = [
-        report_tables.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
-        report_tables.write_csv(pd.concat(bounds), folder / "bounds.csv"),
+        table_formats.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
+        table_formats.write_csv(pd.concat(bounds), folder / "bounds.csv"),
     ]
     if not len(rows):
         return written, Tables()
@@ -80,12 +80,12 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     compared = metrics.comparisons(rows, generator)
     weighed = claims.weigh(rows)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
-    judged = verdicts(rows, compared, curriculum_flags(sweep))
+    judged = count_verdicts(rows, compared, curriculum_flags(sweep))
     outcomes = _outcome_tables(averaged)
-    latex = [f"% {it.heading}.\n{report_tables.latex(it.table)}\n" for it in outcomes]
+    latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
     shown = [*outcomes, *_comparison_tables(compared)]
     if len(weighed):
-        written.append(report_tables.write_csv(weighed, folder / "claims.csv"))
+        written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
         shown.append(ShownTable("What the paper says of these maps", claims.claims_table(weighed)))
     for i, costs in enumerate(bounds):
         which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
@@ -93,19 +93,19 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
             heading = f"Cumulative cost of training against its bounds{which}"
             shown.append(ShownTable(heading, bound_table(costs)))
     written += [
-        report_tables.write_csv(judged, folder / "verdicts.csv"),
-        report_tables.write_csv(rows, folder / "outcomes.csv"),
-        report_tables.write_parquet(rows, folder / "outcomes.parquet"),
-        report_tables.write_csv(whole, folder / "summary.csv"),
-        report_tables.write_csv(compared, folder / "comparisons.csv"),
-        report_tables.write_text("\n".join(latex), folder / "outcomes.tex"),
+        table_formats.write_csv(judged, folder / "verdicts.csv"),
+        table_formats.write_csv(rows, folder / "outcomes.csv"),
+        table_formats.write_parquet(rows, folder / "outcomes.parquet"),
+        table_formats.write_csv(whole, folder / "summary.csv"),
+        table_formats.write_csv(compared, folder / "comparisons.csv"),
+        table_formats.write_text("\n".join(latex), folder / "outcomes.tex"),
     ]
     return written, Tables(judged, shown)
 
 
 def _outcome_tables(averaged: pd.DataFrame) -> list[ShownTable]:
     """Return the outcomes, those of the final policy first."""
-    tables = [(measure, report_tables.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
+    tables = [(measure, table_formats.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
     return [ShownTable(_heading(measure), table) for measure, table in tables if len(table)]
 
 
@@ -115,7 +115,7 @@ def _comparison_tables(compared: pd.DataFrame) -> list[ShownTable]:
         return []
     return [
         ShownTable(
-            f"{_heading(measure)}, minus none", report_tables.comparison_table(compared, measure), TIES
+            f"{_heading(measure)}, minus none", table_formats.comparison_table(compared, measure), TIES
         )
         for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     ]

@@ -18,14 +18,14 @@ from typing import Any
 from recrl.agents.registry import AGENTS
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import StorageError
-from recrl.orchestrator.files.own_package import digest_of_files, folder_of
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.provenance.own_package import digest_of_files, folder_of
 from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
 
 OURS = "recrl"
 FOLDERS = ("agents", "environments", "teachers")
-MODULES = ("trial/trial.py", "trial/runner.py", "spec.py")  # of the orchestrator
+MODULES = ("trial/trial.py", "trial/attempt.py", "spec.py")  # of the orchestrator
 SUFFIXES = (".py", ".xml", ".txt")  # top-level parts that affect results
 KINDS = (
     ("task", "recrl.tasks", TASKS),

@@ -4,7 +4,7 @@ There is one tolerance. Feasible means that every mean cost is at most its limit
 fraction COST_TOLERANCE of the limit, or one standard error of the mean if that is larger. A policy with
 softmax outputs cannot meet a limit exactly like the optimum, because each action keeps some probability.
 
-Solved (the column ``optimal``) means feasible and at most OPTIMAL_GAP below J*(d_d), if that is known.
+Solved (the column ``optimal``) means feasible and at most SOLVED_GAP below J*(d_d), if that is known.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import numpy as np
 import pandas as pd
 
-OPTIMAL_GAP = 0.2  # of the return to J*(d_d)
+SOLVED_GAP = 0.2  # of the return to J*(d_d)
 COST_TOLERANCE = 0.01  # of a limit; in episode cost where the limit is 0
 ROUNDING = 1e-9  # of a difference of two returns: 9.5 - 9.3 is more than 0.2
 
@@ -44,25 +44,25 @@ def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[f
     return pd.Series(np.maximum(share, errors.fillna(0.0)) + ROUNDING * (1.0 + limits), index=limits.index)
 
 
-def optimal(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether a trial is solved: feasible, and at most OPTIMAL_GAP below a known J*(d_d).
+def solved(rows: pd.DataFrame) -> pd.Series[bool]:
+    """Whether a trial is solved: feasible, and at most SOLVED_GAP below a known J*(d_d).
 
     Args:
         rows: gap, and the columns for ``within_limits``.
     """
-    near = (rows["gap"] <= OPTIMAL_GAP + ROUNDING) & (rows["gap"] > -math.inf)  # NaN is neither
+    near = (rows["gap"] <= SOLVED_GAP + ROUNDING) & (rows["gap"] > -math.inf)  # NaN is neither
     return near & within_limits(rows)
 
 
 def tie(optimal_return: float) -> float:
-    """How far apart two equal returns may be: OPTIMAL_GAP where J*(d_d) is known, elsewhere ROUNDING.
+    """How far apart two equal returns may be: SOLVED_GAP where J*(d_d) is known, elsewhere ROUNDING.
 
     Policies with softmax outputs that have all found one path differ by what other actions keep.
 
     Args:
         optimal_return: J*(d_d); NaN if it is not known, minus infinity if no policy is feasible.
     """
-    return (OPTIMAL_GAP if math.isfinite(optimal_return) else 0.0) + ROUNDING
+    return (SOLVED_GAP if math.isfinite(optimal_return) else 0.0) + ROUNDING
 
 
 def costs_of(rows: pd.DataFrame) -> list[str]:

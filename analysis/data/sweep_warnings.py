@@ -9,13 +9,13 @@ import pandas as pd
 
 from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
-from recrl.orchestrator.files.code_changes import other_code, other_code_sentence
 from recrl.orchestrator.files.curriculum_warnings import (
     HARD_LANDING,
     hard_landing_sentence,
     landed_hard,
     no_curriculum_sentence,
 )
+from recrl.orchestrator.provenance.code_changes import other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
 
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
+from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 
 FORMAT = 2
@@ -24,8 +25,8 @@ PREFIX_BYTES = 76
 FIRST_READ_BYTES = 8192  # most headers are shorter
 SMALLEST_HEADER = 2048
 
-APPENDED = ("episodes.csv", "updates.csv", "events.jsonl", "log.txt")
-WHOLE = ("spec.json", "provenance.json", "error.txt", "evaluation.csv", "policy.csv")
+APPENDED = files_of(FileKind.ROWS, FileKind.LOG)
+WHOLE = files_of(FileKind.WHOLE)
 CHECKPOINT = re.compile(r"checkpoints/checkpoint-\d{8}\.recrl")
 COMMIT = re.compile(r"commit-\d{8}")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.grid.grid_file import (
+from recrl.orchestrator.grid.file_models import (
     Exclusion,
     Resources,
     Run,

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from recrl.analysis.report_tables import DASH, number, with_error, with_interval
-from recrl.analysis.statistics.feasibility import COST_TOLERANCE, OPTIMAL_GAP, is_cost
+from recrl.analysis.report.table_formats import DASH, number, with_error, with_interval
+from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
@@ -30,7 +30,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     """Return sentences that define the words of the verdict table.
 
     Args:
-        verdicts: of ``verdicts.verdicts``.
+        verdicts: of ``verdict_counts.count_verdicts``.
     """
     how = "computed exactly from the recorded policies"
     if not verdicts["exact"].all():
@@ -42,7 +42,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     return [
         f"The verdict, the return and the cost are those of the final policy, without learning: {how}.",
         *errors,
-        f"Solved: feasible, and within {OPTIMAL_GAP} of the constrained optimum, where that is known.",
+        f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known.",
         f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error, "
         "whichever is larger.",
         "The return of an infeasible policy may be above the optimum: it is no success.",
@@ -56,7 +56,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
     """Return one row per task, agent and curriculum, as text.
 
     Args:
-        verdicts: of ``verdicts.verdicts``.
+        verdicts: of ``verdict_counts.count_verdicts``.
     """
     costs = [str(name) for name in verdicts if is_cost(str(name))]
     warned = bool(verdicts[list(WARNINGS)].to_numpy().any())
@@ -131,7 +131,7 @@ def answers(verdicts: pd.DataFrame) -> list[str]:
     """Return one sentence per task: how many final policies solve it, by which curricula, and which violate.
 
     Args:
-        verdicts: of ``verdicts.verdicts``.
+        verdicts: of ``verdict_counts.count_verdicts``.
     """
     return [_answer(task, verdicts[verdicts["task"] == task]) for task in dict.fromkeys(verdicts["task"])]
 

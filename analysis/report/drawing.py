@@ -40,19 +40,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from recrl.analysis import report_page, report_tables, report_verdicts
 from recrl.analysis.data.labels import GROUP, ordered
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.validity import doubts
+from recrl.analysis.data.sweep_warnings import doubts
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import return_against_cost
 from recrl.analysis.figures.policy_map import policy_maps
 from recrl.analysis.figures.profiles import performance_profiles
-from recrl.analysis.report_files import BOOTSTRAP_SEED, Tables, write_tables
-from recrl.analysis.report_page import Section
-from recrl.analysis.statistics.curves import MEAN, Averaging, interquartile
+from recrl.analysis.report import html_page, table_formats, verdict_texts
+from recrl.analysis.report.html_page import Section
+from recrl.analysis.report.table_files import BOOTSTRAP_SEED, Tables, write_tables
+from recrl.analysis.statistics.curves import MEAN, CurveAverage, interquartile
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.errors import RecrlError, described
@@ -81,7 +81,7 @@ class NothingToDrawError(RecrlError):
     """The sweep has no policy update on disk yet."""
 
 
-def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
+def draw(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[Path]:
     """Draw every figure and write every table of a finished or running sweep.
 
     Args:
@@ -107,7 +107,7 @@ def draw(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Pat
     return written
 
 
-def sketch(sweep: Sweep, folder: Path, *, averaging: Averaging = MEAN) -> list[Path]:
+def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[Path]:
     """Draw only the fast figures, for a running sweep; otherwise like ``draw``.
 
     Args:
@@ -157,8 +157,8 @@ def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
     """Write the tables and the two reports with the figures; return all files, the reports first."""
     written, tables = write_tables(sweep, folder)
     reports = [
-        report_tables.write_text(_html(sweep, drawn, tables), folder / "report.html"),
-        report_tables.write_text(_markdown(sweep, drawn, tables), folder / "report.md"),
+        table_formats.write_text(_html(sweep, drawn, tables), folder / "report.html"),
+        table_formats.write_text(_markdown(sweep, drawn, tables), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
 
@@ -176,34 +176,34 @@ def _full_sizes(drawn: list[Path]) -> dict[Path, str]:
 def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     """Return the report as text: answers, verdicts, warnings, figures, tables, provenance."""
     judged = tables.verdicts
-    lines = [f"# {report_tables.markdown_text(sweep.name)}", ""]
+    lines = [f"# {table_formats.markdown_text(sweep.name)}", ""]
     if len(judged):
-        lines += [*_list(report_verdicts.answers(judged)), ""]
-        lines += [report_tables.markdown(_marked(report_verdicts.verdict_table(judged))), ""]
-        lines += _list(report_verdicts.explanation(judged))
+        lines += [*_list(verdict_texts.answers(judged)), ""]
+        lines += [table_formats.markdown(_marked(verdict_texts.verdict_table(judged))), ""]
+        lines += _list(verdict_texts.explanation(judged))
     else:
-        lines.append(report_verdicts.NO_VERDICT)
+        lines.append(verdict_texts.NO_VERDICT)
     lines += ["", "## Warnings", "", _count(sweep), "", *_list(missing(sweep)), "", "## Figures", ""]
     for path in _full_sizes(drawn):
         lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
     for it in tables.shown:
-        lines += [f"## {it.heading}", "", report_tables.markdown(it.table), ""]
+        lines += [f"## {it.heading}", "", table_formats.markdown(it.table), ""]
         lines += [it.note, ""] if it.note else []
     provenance = "\n".join(_provenance(sweep)).splitlines()
     return "\n".join([*lines, "## Provenance", "", *(f"    {line}" for line in provenance)])
 
 
 def _list(sentences: Sequence[str]) -> list[str]:
-    return [f"- {report_tables.markdown_text(sentence)}" for sentence in sentences]
+    return [f"- {table_formats.markdown_text(sentence)}" for sentence in sentences]
 
 
 def _marked(table: pd.DataFrame) -> pd.DataFrame:
     """Return the verdict table with violations in bold."""
-    texts = [f"**{text}**" if report_verdicts.INFEASIBLE in text else text for text in table["verdict"]]
+    texts = [f"**{text}**" if verdict_texts.INFEASIBLE in text else text for text in table["verdict"]]
     return table.assign(verdict=texts)
 
 
-def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable[[], Figure | None]]:
+def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Callable[[], Figure | None]]:
     """Return the figures of a sweep by file stem, as functions; a function returns None without data.
 
     Args:
@@ -242,7 +242,7 @@ def drawings(sweep: Sweep, *, averaging: Averaging = MEAN) -> dict[str, Callable
     return made
 
 
-def averagings() -> dict[str, Averaging]:
+def curve_averages() -> dict[str, CurveAverage]:
     """Return the kinds of lines and bands, by their names on the command line."""
     return {"mean": MEAN, "iqm": interquartile(np.random.default_rng(BOOTSTRAP_SEED))}
 
@@ -277,7 +277,7 @@ def missing(sweep: Sweep) -> list[str]:
     elif few:
         sentences.append(
             f"{' or '.join(map(str, few))} seeds: bootstrap intervals are too short below {ENOUGH_RUNS} "
-            f"seeds (marked {report_tables.TOO_FEW}); Student's and Wilson's hold"
+            f"seeds (marked {table_formats.TOO_FEW}); Student's and Wilson's hold"
         )
     return sentences
 
@@ -296,37 +296,35 @@ def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     figures = _full_sizes(drawn)
     first = {path: file for path, file in figures.items() if SKETCHED.fullmatch(path.stem)}
     further = {path: file for path, file in figures.items() if path not in first}
-    settings = report_page.verbatim(sweep.grid) + report_page.verbatim(_settings(sweep))
+    settings = html_page.verbatim(sweep.grid) + html_page.verbatim(_settings(sweep))
     sections = [
-        Section("Warnings", report_page.items(sentences, kind="failed" if failed else "plain")),
+        Section("Warnings", html_page.items(sentences, kind="failed" if failed else "plain")),
         Section("Figures", _figures(first)),
         *([Section("More figures", _figures(further), folded=True)] if further else []),
-        *(Section(it.heading, report_page.table(it.table, it.note), folded=True) for it in tables.shown),
+        *(Section(it.heading, html_page.table(it.table, it.note), folded=True) for it in tables.shown),
         Section("Settings", settings, folded=True),
-        Section("Provenance", report_page.verbatim("\n".join(_provenance(sweep))), folded=True),
+        Section("Provenance", html_page.verbatim("\n".join(_provenance(sweep))), folded=True),
     ]
     goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
-    return report_page.page(
+    return html_page.page(
         sweep.name, _opening(tables.verdicts), sections, reload_seconds=RELOAD_SECONDS if goes_on else None
     )
 
 
 def _figures(figures: Mapping[Path, str]) -> str:
     """Figures with their captions, as HTML."""
-    return "\n".join(report_page.figure(path, _caption(path), file) for path, file in figures.items())
+    return "\n".join(html_page.figure(path, _caption(path), file) for path, file in figures.items())
 
 
 def _opening(judged: pd.DataFrame) -> str:
     """Return the answers and the verdict table."""
     if not len(judged):
-        return report_page.items([report_verdicts.NO_VERDICT], kind="answers")
+        return html_page.items([verdict_texts.NO_VERDICT], kind="answers")
     return "\n".join(
         [
-            report_page.items(report_verdicts.answers(judged), kind="answers"),
-            report_page.verdict_table(
-                report_verdicts.verdict_table(judged), report_verdicts.verdict_kinds(judged)
-            ),
-            report_page.items(report_verdicts.explanation(judged), kind="notes"),
+            html_page.items(verdict_texts.answers(judged), kind="answers"),
+            html_page.verdict_table(verdict_texts.verdict_table(judged), verdict_texts.verdict_kinds(judged)),
+            html_page.items(verdict_texts.explanation(judged), kind="notes"),
         ]
     )
 
