@@ -134,9 +134,9 @@ class ActorCriticConfig(BaseModel):
     )
     constraint_window: Count = Field(
         default=16,
-        description="Least number of episodes for a mean cost. If fewer finish in an update, the mean cost of "
-        "the rollout's steps times the mean episode length is used; with fewer environments than this, "
-        "episodes of earlier updates are included (ours).",
+        description="Least number of episodes for a mean cost. If fewer finish in an update, the "
+        "mean cost of the rollout's steps times the mean episode length is used; with "
+        "fewer environments than this, episodes of earlier updates are included (ours).",
     )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",

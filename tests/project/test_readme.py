@@ -100,14 +100,14 @@ def test_the_table_of_rivergrid_is_counted() -> None:
     rows["gap"] = rows["optimal_return"] - rows["return"]
     rows = rows.rename(columns={"cost": "cost_0", "limit": "deploy_limit_0"})
     rows = rows[rows["policy"] == "average"].assign(solved=solved(rows))
-    solved = rows.pivot_table(index=["task", "agent", "seed"], columns="method", values="solved")
+    outcomes = rows.pivot_table(index=["task", "agent", "seed"], columns="method", values="solved")
     for method in ("none", "dynamic"):
-        counts = solved[method].groupby(["task", "agent"]).sum().astype(int)
+        counts = outcomes[method].groupby(["task", "agent"]).sum().astype(int)
         cells = [counts[f"rivergrid-{task}", agent] for task in ("1a", "1b") for agent in ("ppo-lag", "cpo")]
         assert f"| `{method}` | {' | '.join(map(str, cells))} |" in README
         count = ((rows["method"] == method) & (rows["return"] < 0.0)).sum()
         assert f"{count or 'No policy'} " in README.partition("McNemar")[2]
-    gained = solved.loc["rivergrid-1b", "dynamic"] - solved.loc["rivergrid-1b", "none"]
+    gained = outcomes.loc["rivergrid-1b", "dynamic"] - outcomes.loc["rivergrid-1b", "none"]
     only_dynamic, only_none = (gained > 0).sum(), (gained < 0).sum()
     pairs = only_dynamic + only_none
     tail = sum(math.comb(pairs, k) for k in range(min(only_dynamic, only_none) + 1)) / 2**pairs
