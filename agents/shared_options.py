@@ -223,10 +223,10 @@ class LagrangianConfig(BaseModel):
         "per unit of cost (paper).",
     )
     multiplier_step: Positive = Field(
-        default=0.2,
+        default=0.1,
         description="Step of the dual ascent, K_I, or Adam's learning rate, without unit (ours; paper 0.05).",
     )
-    multiplier_proportional: NonNegative = Field(default=2.0, description="K_P of the PID rule (ours).")
+    multiplier_proportional: NonNegative = Field(default=1.0, description="K_P of the PID rule (ours).")
     multiplier_derivative: NonNegative = Field(default=0.0, description="K_D of the PID rule (ours).")
     multiplier_maximum: Positive = Field(
         default=1000.0,

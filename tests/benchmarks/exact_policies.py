@@ -35,9 +35,8 @@ def exact(path: Path) -> pd.DataFrame:
     names = dict.fromkeys(trials["task"])
     values = exact_values(chosen, {name: finite_model(name, {}) for name in names})
     values = values.merge(trials, on=list(KEY)).rename(columns={"episode_return": "return"})
-    best = values.apply(
-        lambda row: optimal_return(row["task"], {}, CostLimits((row["deploy_limit_0"],))), axis=1
-    )
+    limits = zip(values["task"], values["deploy_limit_0"], strict=True)
+    best = pd.Series([optimal_return(task, {}, CostLimits((limit,))) for task, limit in limits], values.index)
     values["solved"] = solved(values.assign(gap=best - values["return"]))
     return values.rename(columns={"cost_0": "cost", "deploy_limit_0": "limit"}).round(4)
 
