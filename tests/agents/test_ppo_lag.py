@@ -60,7 +60,7 @@ def test_equal_shares_of_the_limit_have_equal_multipliers_whatever_the_limit(rul
 
 
 def test_a_pid_answers_half_a_limit_too_much_with_half_its_gain() -> None:
-    assert improved(2.5, 5.0)["multiplier_0"] == pytest.approx((0.5 * 0.2 + 0.5 * 0.1) * EXCHANGE)
+    assert improved(2.5, 5.0)["multiplier_0"] == pytest.approx((0.5 * 1.0 + 0.5 * 0.1) * EXCHANGE)
 
 
 def test_without_a_finished_episode_the_multiplier_stays() -> None:

@@ -107,9 +107,9 @@ def test_the_table_of_rivergrid_is_counted() -> None:
         assert f"| `{method}` | {' | '.join(map(str, cells))} |" in README
         count = ((rows["method"] == method) & (rows["return"] < 0.0)).sum()
         assert f"{count or 'No policy'} " in README.partition("McNemar")[2]
-    on_1b = outcomes.xs("rivergrid-1b").astype(bool)
-    only_dynamic = int((on_1b["dynamic"] & ~on_1b["none"]).sum())
-    only_none = int((on_1b["none"] & ~on_1b["dynamic"]).sum())
+    on_1b = outcomes.xs("rivergrid-1b")
+    dynamic, none = on_1b["dynamic"].to_numpy(bool), on_1b["none"].to_numpy(bool)
+    only_dynamic, only_none = int((dynamic & ~none).sum()), int((none & ~dynamic).sum())
     pairs = only_dynamic + only_none
     tail = sum(math.comb(pairs, k) for k in range(min(only_dynamic, only_none) + 1)) / 2**pairs
     said = f"alone solves {only_dynamic} pairs of equal seeds, `none` alone {only_none} "
