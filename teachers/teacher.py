@@ -11,8 +11,9 @@ steps / B in [0, 1] the progress, k the number of costs.
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -129,6 +130,49 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
     raise TypeError(
         f"curriculum {curriculum}: must return a CurriculumStep and its state, a mapping, got {got}"
     )
+
+
+def check_limits_fall(
+    step: CurriculumStep,
+    before: CostLimits | None,
+    train_limits: CostLimits,
+    *,
+    curriculum: str,
+    cost_names: Sequence[str],
+    update: int,
+) -> None:
+    """Check that no limit of a step has risen, and that no finite limit is above d_t.
+
+    An infinite limit may start above a finite d_t: it constrains nothing, as in the control
+    ``unconstrained``. Differences by rounding are allowed.
+
+    Args:
+        step: the step to be checked.
+        before: the limits before it, [k]; None for the first step.
+        train_limits: d_t, [k].
+        curriculum: its label, for the error.
+        cost_names: of the task, [k].
+        update: the last policy update before the step; 0 for the first step.
+
+    Raises:
+        ValueError: a limit has risen, or is above d_t.
+    """
+    when = f"after update {update}" if update else "at the start"
+    for i, (name, limit, highest) in enumerate(zip(cost_names, step.limits, train_limits, strict=True)):
+        if before is not None and _exceeds(limit, before[i]):
+            raise ValueError(
+                f"curriculum {curriculum}: the limit of {name} rose from {before[i]:g} to {limit:g} {when}; "
+                "limits may only fall"
+            )
+        if math.isfinite(limit) and _exceeds(limit, highest):
+            raise ValueError(
+                f"curriculum {curriculum}: the limit of {name} is {limit:g} {when}, above its train_limits "
+                f"of {highest:g}; limits may only fall"
+            )
+
+
+def _exceeds(limit: float, other: float) -> bool:
+    return limit > other and not math.isclose(limit, other, rel_tol=1e-9, abs_tol=1e-9)
 
 
 # The rest is common to the teachers of this package. Their states hold at least ``update``, the last update

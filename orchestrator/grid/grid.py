@@ -48,7 +48,7 @@ from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice
 from recrl.orchestrator.validation import nearest, sentences, shown
 from recrl.teachers.registry import TEACHERS, make_teacher, teacher_config
-from recrl.teachers.teacher import checked_answer
+from recrl.teachers.teacher import check_limits_fall, checked_answer
 
 MAX_TRIALS = 100_000
 ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many updates
@@ -141,6 +141,7 @@ class _Check:
         self._document = parse(data)
         self.problems = list(self._document.problems)
         self.uncalled: list[str] = []
+        self._cmdps: dict[str, CMDPSpec] = {}  # of the tasks that can be built, by label
         raw = self._document.value
         self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
 
@@ -207,7 +208,16 @@ class _Check:
         for (task, label), spec in methods.items():
             place = ("methods", [method.label for method in grid.methods].index(label))
             with self._described(place, f"{label} cannot be started on {task}"):
-                checked_answer(make_teacher(spec.teacher).start(), label, len(spec.deploy_limits))
+                answer = make_teacher(spec.teacher).start()
+                step, _ = checked_answer(answer, label, len(spec.deploy_limits))
+                check_limits_fall(
+                    step,
+                    None,
+                    spec.train_limits,
+                    curriculum=label,
+                    cost_names=self._cmdps[task].cost_names,
+                    update=0,
+                )
 
     @contextmanager
     def _described(self, place: Place, what: str) -> Iterator[None]:
@@ -225,6 +235,7 @@ class _Check:
             cmdp = self._cmdp(index, task)
             if cmdp is None:
                 continue
+            self._cmdps[task.label] = cmdp
             limits = self._both_limits(index, task.label, cmdp)
             rollout_steps = self._rollout_steps(run, task.label, cmdp)
             if limits is not None and rollout_steps is not None:
