@@ -111,7 +111,7 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
         num_costs: k.
 
     Raises:
-        TypeError: it is not a pair of a CurriculumStep and a mapping.
+        TypeError: it is not a pair of a CurriculumStep and a mapping, or the state has other than JSON values.
         ValueError: the number of its limits is not that of the costs.
     """
     match answer:
@@ -121,6 +121,8 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
                     f"curriculum {curriculum}: a step must have one limit per cost, {num_costs}, "
                     f"got {len(step.limits)}"
                 )
+            if problem := _not_json(dict(state), "state"):
+                raise TypeError(f"curriculum {curriculum}: {problem}; a state holds JSON values only")
             return step, state
     got = (
         ", ".join(type(one).__name__ for one in answer)
@@ -130,6 +132,34 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
     raise TypeError(
         f"curriculum {curriculum}: must return a CurriculumStep and its state, a mapping, got {got}"
     )
+
+
+def _not_json(value: object, path: str) -> str:
+    """Describe the first part of a state that is no JSON value; empty if there is none.
+
+    Tuples are not allowed: a checkpoint gives back a list. Infinite numbers are, because checkpoints keep
+    them.
+
+    >>> _not_json({"update": 1, "seen": {3}}, "state")
+    "state['seen'] is a set"
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return ""
+    if isinstance(value, list):
+        parts = ((f"{path}[{index}]", part) for index, part in enumerate(value))
+    elif isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str):
+                return f"{path} has the key {key!r}, {_with_article(key)}, and keys must be text"
+        parts = ((f"{path}[{key!r}]", part) for key, part in value.items())
+    else:
+        return f"{path} is {_with_article(value)}"
+    return next((problem for name, part in parts if (problem := _not_json(part, name))), "")
+
+
+def _with_article(value: object) -> str:
+    kind = type(value).__name__
+    return f"an {kind}" if kind[0].lower() in "aeiou" or kind == "ndarray" else f"a {kind}"
 
 
 def check_limits_fall(

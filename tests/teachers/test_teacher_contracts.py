@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -302,6 +303,28 @@ STATE: dict[str, Any] = {"update": 0}
 def test_what_is_wrong_with_a_curriculums_answer_is_said(answer: object, sentence: str) -> None:
     with pytest.raises((TypeError, ValueError), match=sentence):
         checked_answer(answer, "mine", 1)
+
+
+@pytest.mark.parametrize(
+    ("state", "problem"),
+    [
+        ({"seen": {1}}, "state['seen'] is a set"),
+        ({"costs": [[1.0], np.zeros(2)]}, "state['costs'][1] is an ndarray"),
+        ({"best": {"mean": np.float32(1.0)}}, "state['best']['mean'] is a float32"),
+        ({"rows": (row for row in [1])}, "state['rows'] is a generator"),
+        ({"pair": (1, 2)}, "state['pair'] is a tuple"),
+        ({"of": {3: 1.0}}, "state['of'] has the key 3, an int, and keys must be text"),
+    ],
+)
+def test_a_state_that_is_no_json_is_said_with_its_path(state: dict[str, Any], problem: str) -> None:
+    with pytest.raises(TypeError) as caught:
+        checked_answer((CurriculumStep(CostLimits((1.0,))), state), "set", 1)
+    assert str(caught.value) == f"curriculum set: {problem}; a state holds JSON values only"
+
+
+def test_a_state_of_json_values_is_right() -> None:
+    state = {"update": 3, "costs": [[1.0, math.inf]], "best": None, "of": {"a": True}, "said": "yes"}
+    assert checked_answer((CurriculumStep(CostLimits((1.0,))), state), "mine", 1)[1] is state
 
 
 def test_plain_numbers_are_limits_too() -> None:
