@@ -342,10 +342,10 @@ class _Check:
     def _limits(self, index: int, key: str, label: str, cmdp: CMDPSpec) -> tuple[CostLimits | None, Place]:
         """Return one kind of a task's limits, its own or the grid's, and their place in the file."""
         place: Place = ("tasks", index, key)
-        entry = _valid(TaskEntry, self._raw["tasks"][index])
-        values = getattr(entry, key)
+        raw = self._raw["tasks"][index]
+        values = getattr(_valid(TaskEntry, raw), key)
         if values is None:
-            place = (key,)
+            place, raw = (key,), self._raw
             shared = _valid(Limits, {key: self._raw.get(key)})
             if shared is None:  # the schema check has reported it
                 return None, place
@@ -353,9 +353,11 @@ class _Check:
         if values is None:
             self._add(("tasks", index), f"{key} is required, here or for all tasks")
             return None, place
-        if len(values) not in (1, cmdp.num_costs):
+        is_listed = isinstance(raw, dict) and isinstance(raw.get(key), list)
+        if len(values) != cmdp.num_costs and (is_listed or len(values) > 1):
             costs = f"{cmdp.num_costs} cost{'s' * (cmdp.num_costs > 1)} ({', '.join(cmdp.cost_names)})"
-            self._add(place, f"{label} has {costs}, got {len(values)} limits")
+            got = f"{len(values)} limits" if len(values) > 1 else "1 limit; one for all is a plain number"
+            self._add(place, f"{label} has {costs}, got {got}")
             return None, place
         return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
 
