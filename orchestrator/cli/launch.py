@@ -14,7 +14,7 @@ from rich.console import Console
 
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short, show
-from recrl.orchestrator.cli.plan import room, say_plan
+from recrl.orchestrator.cli.plan import room, say_other_code, say_plan
 from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
 from recrl.orchestrator.cli.results import draw
 from recrl.orchestrator.cli.status import say_failures
@@ -65,6 +65,7 @@ def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> Exi
 
     def watch(plan: Plan) -> None:
         say_plan(plan, grid, console, at_once=at_once, where=where)
+        say_other_code(plan, console)
         if plan.to_do:
             if request.executor == "ray":
                 _say_starting(request, console)

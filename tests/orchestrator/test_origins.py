@@ -86,6 +86,10 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert not has_other_code(trial, trial.spec)
     before = trial.episodes_path.read_bytes()
     change(folder)
+    capsys.readouterr()
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK  # nothing to do, but not without a word
+    assert SENTENCE in capsys.readouterr().out.splitlines()
+    assert main(["plan", "grid.yaml", "--trust", "--check"]) == ExitCode.TRIALS_LEFT
     (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1"))
     capsys.readouterr()
     assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
