@@ -111,7 +111,8 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
         num_costs: k.
 
     Raises:
-        TypeError: it is not a pair of a CurriculumStep and a mapping, or the state has other than JSON values.
+        TypeError: it is not a pair of a CurriculumStep and a mapping, or the mapping has other values than
+            JSON.
         ValueError: the number of its limits is not that of the costs.
     """
     match answer:

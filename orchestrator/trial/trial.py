@@ -222,9 +222,7 @@ class Trial:
                 "not support; choose another of the two"
             )
 
-    def _checked(
-        self, answer: object, *, before: CostLimits | None
-    ) -> tuple[CurriculumStep, TeacherState]:
+    def _checked(self, answer: object, *, before: CostLimits | None) -> tuple[CurriculumStep, TeacherState]:
         """Check the curriculum's answer; ``before`` has the limits before it, None at the start."""
         label = self.spec.method.label
         step, state = checked_answer(answer, label, self._cmdp.num_costs)

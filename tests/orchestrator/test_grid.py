@@ -399,8 +399,8 @@ def test_a_list_of_one_limit_is_not_for_all_costs(key: str, at_task: bool) -> No
     top = "" if at_task else f"{key}: [8]\n"
     others = "" if key == "deploy_limits" else ", deploy_limits: 1"
     data = (
-        f"name: two\ntasks: [{{name: two-state-2{others}{entry}}}]\nagents: [cpo]\nmethods: [none]\nseeds: 1\n"
-        f"{top}run: {{total_steps: 10_000}}\n"
+        f"name: two\ntasks: [{{name: two-state-2{others}{entry}}}]\n"
+        f"agents: [cpo]\nmethods: [none]\nseeds: 1\n{top}run: {{total_steps: 10_000}}\n"
     )
     with pytest.raises(GridError) as caught:
         parse_grid(data.encode(), source="grid.yaml")

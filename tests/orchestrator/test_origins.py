@@ -15,9 +15,11 @@ from recrl.analysis.data.validity import curriculum_flags
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files import code_changes
 from recrl.orchestrator.files.code_changes import (
     code_of,
     has_other_code,
+    other_code,
     other_code_sentence,
 )
 from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
@@ -141,6 +143,41 @@ def test_the_code_of_a_task_is_found_without_running_it(folder: Path) -> None:
     sys.modules.pop("my_scaled_task", None)
     assert set(code_of(spec)) == {"recrl", "my_scaled_task"}
     assert "my_scaled_task" not in sys.modules
+
+
+def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    own = "import json\nimport numpy as np\nfrom my_physics import GRAVITY\n" + TASK
+    (folder / "my_scaled_task.py").write_text(own)
+    (folder / "my_physics.py").write_text("def late():\n    import my_units.lengths\n")
+    (folder / "my_units").mkdir()
+    (folder / "my_units" / "lengths.py").write_text("import my_scaled_task  # a circle\n")
+    (folder / "my_other.py").write_text("")  # nobody imports it
+    importlib.invalidate_caches()
+    before = code_of(spec)
+    assert list(before) == ["recrl", "my_scaled_task", "my_physics", "my_units"]
+    (folder / "my_units" / "lengths.py").write_text("METRE = 2\n")
+    after = code_of(spec)
+    assert {name for name in before if before[name] != after[name]} == {"my_units"}
+    assert other_code([{"code": before}], spec)
+    old = {name: before[name] for name in ("recrl", "my_scaled_task")}  # what earlier versions wrote
+    assert not other_code([{"code": old}], spec)
+    assert not {"my_physics", "my_units"} & set(sys.modules)
+
+
+def test_the_imports_of_a_plug_in_are_followed_within_its_project_and_bounds(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    (folder / "my_scaled_task.py").write_text(f"import my_a, my_b, my_elsewhere\n{TASK}")
+    for name in ("my_a", "my_b"):
+        (folder / f"{name}.py").write_text("")
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (elsewhere / "my_elsewhere.py").write_text("")
+    monkeypatch.syspath_prepend(elsewhere)
+    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a", "my_b"]
+    monkeypatch.setattr(code_changes, "MOST_FILES", 2)
+    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a"]
 
 
 def test_of_a_package_that_is_not_here_nothing_is_said(folder: Path) -> None:

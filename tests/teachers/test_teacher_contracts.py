@@ -130,7 +130,7 @@ def test_every_answer_passes_the_trials_checks(history: History) -> None:
     for spec in history.specs():
         before = None
         for update, answer in enumerate(played(spec, history.reports)):
-            step, state = checked_answer(answer, spec.name, len(names))
+            step, _ = checked_answer(answer, spec.name, len(names))
             check_limits_fall(
                 step, before, spec.train_limits, curriculum=spec.name, cost_names=names, update=update
             )
