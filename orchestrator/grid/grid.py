@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,6 +51,7 @@ from recrl.teachers.registry import TEACHERS, make_teacher, teacher_config
 from recrl.teachers.teacher import check_limits_fall, checked_answer
 
 MAX_TRIALS = 100_000
+TASK_MARK = "\0"  # stands for a task in a sentence, after "on" or "of"
 ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many updates
 # Defaults: an infinite d_t, so that the curriculum measures its start. There is no default d_d.
 DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
@@ -91,7 +92,8 @@ def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
     if grid is not None and build:
         check.build_own(grid)
     if check.problems:
-        ordered = sorted(set(check.problems), key=lambda problem: (problem.line, str(problem.place)))
+        unique = dict.fromkeys(check.problems)
+        ordered = sorted(unique, key=lambda problem: (problem.line, str(problem.place)))
         raise GridError([f"{source}:{problem}" for problem in ordered])
     if grid is None:
         raise UncalledError(source, check.uncalled)
@@ -141,6 +143,7 @@ class _Check:
         self._document = parse(data)
         self.problems = list(self._document.problems)
         self.uncalled: list[str] = []
+        self._of_tasks: dict[tuple[Place, str], list[str]] = {}  # tasks with the same mistake
         self._cmdps: dict[str, CMDPSpec] = {}  # of the tasks that can be built, by label
         raw = self._document.value
         self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
@@ -203,11 +206,11 @@ class _Check:
         for (task, label), spec in agents.items():
             cmdp = make_vector(cells[task].name, 1, options=cells[task].options).cmdp
             place = ("agents", [agent.label for agent in grid.agents].index(label))
-            with self._described(place, f"{label} cannot be built on {task}"):
+            with self._described(place, f"{label} cannot be built", task):
                 make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
         for (task, label), spec in methods.items():
             place = ("methods", [method.label for method in grid.methods].index(label))
-            with self._described(place, f"{label} cannot be started on {task}"):
+            with self._described(place, f"{label} cannot be started", task):
                 answer = make_teacher(spec.teacher).start()
                 step, _ = checked_answer(answer, label, len(spec.deploy_limits))
                 check_limits_fall(
@@ -220,12 +223,12 @@ class _Check:
                 )
 
     @contextmanager
-    def _described(self, place: Place, what: str) -> Iterator[None]:
-        """Add what is raised meanwhile by the user's own code."""
+    def _described(self, place: Place, what: str, task: str) -> Iterator[None]:
+        """Add what is raised meanwhile by the user's own code on a task."""
         try:
             yield
         except USERS_ERRORS as error:
-            self._add(place, f"{what}: {described(error)}")
+            self._add_of_task(place, f"{what} on {TASK_MARK}: {described(error)}", task)
 
     def _tasks(self) -> list[TaskCell]:
         """Return the tasks with correct limits and rollouts."""
@@ -368,10 +371,11 @@ class _Check:
         default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
         steps, num_envs = run.rollout_steps or default, run.num_envs
         if run.total_steps < num_envs * steps:
-            self._add(
+            self._add_of_task(
                 ("run", "total_steps"),
-                f"must be at least one update of {label}, "
+                f"must be at least one update of {TASK_MARK}, "
                 f"{num_envs} environments x {steps} steps = {num_envs * steps}, got {run.total_steps}",
+                label,
             )
         else:
             return steps
@@ -387,7 +391,39 @@ class _Check:
         return None
 
     def _add(self, place: Place, sentence: str) -> None:
-        self.problems.append(Problem(self._document.line(place), place, sentence))
+        self.problems.append(self._problem(place, sentence))
+
+    def _add_of_task(self, place: Place, sentence: str, task: str) -> None:
+        """Add a mistake on a task; the same mistake on further tasks stays one problem, which names them.
+
+        Args:
+            place: of the mistake.
+            sentence: with ``TASK_MARK`` in place of the task, after a preposition.
+            task: its label.
+        """
+        tasks = self._of_tasks.setdefault((place, sentence), [])
+        if tasks:
+            self.problems.remove(self._problem(place, _of_tasks(sentence, tasks)))
+        tasks.append(task)
+        self._add(place, _of_tasks(sentence, tasks))
+
+    def _problem(self, place: Place, sentence: str) -> Problem:
+        return Problem(self._document.line(place), place, sentence)
+
+
+def _of_tasks(sentence: str, tasks: Sequence[str]) -> str:
+    """Return the sentence of a mistake with its task, or with several in brackets at the end.
+
+    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a"])
+    'mine cannot be built on a: no'
+    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a", "b"])
+    'mine cannot be built: no (on a, b)'
+    """
+    before, after = sentence.split(TASK_MARK, 1)
+    if len(tasks) == 1:
+        return f"{before}{tasks[0]}{after}"
+    head = before.removesuffix(" on ").removesuffix(" of ")
+    return f"{head}{after} (on {', '.join(tasks)})"
 
 
 def _is_own_agent(agent: Choice) -> bool:

@@ -463,3 +463,32 @@ run: {total_steps: 10_000}
         "own_parts:CURRICULUM: must return a CurriculumStep and its state, a mapping, got NoneType"
     )
     assert len(parse_grid(data, source="grid.yaml").trials()) == 4  # a launch leaves that to the trials
+
+
+def test_one_mistake_on_every_task_is_one_line_with_the_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_parts.py").write_text(OWN_PARTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    data = b"""\
+name: own
+deploy_limits: 2
+tasks: [{name: two-state, label: zebra}, {name: two-state, label: ant}, two-state-2]
+agents: ["own_parts:AGENT"]
+methods: ["own_parts:CURRICULUM"]
+seeds: 2
+run: {total_steps: 10_000}
+"""
+    with pytest.raises(GridError) as caught:
+        parse_grid(data, source="grid.yaml", build=True)
+    assert caught.value.problems == [
+        "grid.yaml:4: agents.0: own_parts:AGENT cannot be built: KeyError: 'momentum' "
+        "(on zebra, ant, two-state-2)",
+        "grid.yaml:5: methods.0: own_parts:CURRICULUM cannot be started: TypeError: curriculum "
+        "own_parts:CURRICULUM: must return a CurriculumStep and its state, a mapping, got NoneType "
+        "(on zebra, ant, two-state-2)",
+    ]
+    with pytest.raises(GridError) as caught:
+        parse_grid(data.replace(b"10_000", b"100"), source="grid.yaml")
+    (problem,) = caught.value.problems
+    assert problem.endswith("got 100 (on zebra, ant, two-state-2)")
