@@ -240,6 +240,19 @@ def test_a_teachers_state_is_opaque_to_the_trial(undisturbed: TrialStore, tmp_pa
     assert [event["event"] for event in store.events()] == ["start limits measured"]
 
 
+def test_the_names_of_several_costs_are_recorded(undisturbed: TrialStore, tmp_path: Path) -> None:
+    spec = replace(
+        SPEC,
+        task=Choice("two-state-2", {"horizon": 10}),
+        train_limits=CostLimits((9.0, 9.0)),
+        deploy_limits=CostLimits((3.0, 3.0)),
+    )
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=stop_after(1)) is TrialState.WAITING
+    assert store.provenance()[0]["cost_names"] == ["wear", "noise"]
+    assert "cost_names" not in undisturbed.provenance()[0]
+
+
 class Rising:
     """A curriculum of the user's own that raises its limit after update 2."""
 
