@@ -415,7 +415,8 @@ class OptionsRequest(Request):
 
     name: str = by_place(
         metavar="NAME",
-        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits",
+        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits, "
+        "tasks, agents, methods",
     )
     trust: bool = by_flag(**_TRUST)
 
