@@ -1,9 +1,9 @@
 """Detect whether a trial ran other code than is installed now.
 
 A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
-only the former are in the digest. For a user's task, agent or curriculum there is a digest of its top-level
-package (all Python files) or single module, and one of each module of the user's project that it imports,
-directly or through others. Nothing is imported to find them: import statements are read from the files.
+only the former are in the digest. A user's task, agent or curriculum has a digest of its top-level package
+(all Python files) or single module. Each module of the user's project that it imports, directly or through
+others, has one too. Nothing is imported to find them: import statements are read from the files.
 
 The project is the nearest folder above the module that holds a project file or a repository, else the
 module's own folder. Installed packages, the standard library and imports by a computed name are left out.
@@ -149,8 +149,8 @@ def _with_imports(package: str) -> dict[str, dict[str, Path]]:
         name = waiting.pop(0)
         if name in found or name == OURS or name in sys.stdlib_module_names:
             continue
-        files = _files_of(name)
-        if not files or not all(_is_in_project(path, project) for path in files.values()):
+        files = _files_of(name, project)
+        if not files:
             continue
         found[name] = dict(sorted(files.items())[:room])
         room -= len(found[name])
@@ -158,8 +158,13 @@ def _with_imports(package: str) -> dict[str, dict[str, Path]]:
     return found
 
 
-def _files_of(package: str) -> dict[str, Path]:
-    """Return the Python files of a top-level package or module; empty if it is not found."""
+def _files_of(package: str, project: Path | None = None) -> dict[str, Path]:
+    """Return the Python files of a top-level package or module; empty if it is not found in the project.
+
+    Args:
+        package: its name.
+        project: the folder of a project; None to look everywhere.
+    """
     try:
         spec = importlib.util.find_spec(package)
     except (ImportError, ValueError):
@@ -167,6 +172,9 @@ def _files_of(package: str) -> dict[str, Path]:
     if spec is None:
         return {}
     folders = [Path(place) for place in spec.submodule_search_locations or ()]
+    places = folders or [Path(spec.origin or "")]
+    if project is not None and not all(_is_in_project(place, project) for place in places):
+        return {}  # before the files of a large package are listed
     files = {str(path.relative_to(folder)): path for folder in folders for path in folder.rglob("*.py")}
     if not folders and spec.origin and spec.origin.endswith(tuple(importlib.machinery.SOURCE_SUFFIXES)):
         files = {Path(spec.origin).name: Path(spec.origin)}
@@ -185,9 +193,9 @@ def _project_of(package: str, files: Mapping[str, Path]) -> Path | None:
     return next(marked, folder)
 
 
-def _is_in_project(path: Path, project: Path | None) -> bool:
+def _is_in_project(path: Path, project: Path) -> bool:
     resolved = path.resolve()
-    return project is not None and project in resolved.parents and not set(INSTALLED) & set(resolved.parts)
+    return project in resolved.parents and not set(INSTALLED) & set(resolved.parts)
 
 
 def _imported_by(files: Mapping[str, Path]) -> set[str]:
