@@ -10,8 +10,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.learning.networks import NetworkForm, blocks
-from recrl.agents.learning.stacks import make_stack
+from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.network_stack import make_stack
+from recrl.agents.networks.tanh_stack import blocks
 
 
 class Critics:

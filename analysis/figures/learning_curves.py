@@ -22,19 +22,19 @@ from recrl.analysis.data.labels import occurring
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.curves import MEAN, Averaging, mean_curve, step_grid
-from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
+from recrl.analysis.statistics.curves import MEAN, CurveAverage, mean_curve, step_grid
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
 
 BINS = 100
 DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
 LEAST_SHOWN = 0.2  # of a limit, above and below it
-LEAST_SHOWN_RETURN = 2.0 * OPTIMAL_GAP  # above and below J*(d_d)
+LEAST_SHOWN_RETURN = 2.0 * SOLVED_GAP  # above and below J*(d_d)
 WORTH_MARKING = 0.03  # of a trial: shorter periods of infinite limits (the measurement of d_t) are not marked
 
 
-def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) -> Figure:
+def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN) -> Figure:
     """Draw the paper's Figures 3 and 4: one row per task, return and cost over training and deployment.
 
     Args:
@@ -133,7 +133,7 @@ def _task_row(
     updates: pd.DataFrame,
     look: dict[str, MethodStyle],
     *,
-    averaging: Averaging,
+    averaging: CurveAverage,
 ) -> None:
     """Draw one task's panels: return, return in deployment, then the same for each cost."""
     boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
@@ -187,7 +187,7 @@ def _curves(
     edges: Floats,
     look: dict[str, MethodStyle],
     *,
-    averaging: Averaging,
+    averaging: CurveAverage,
 ) -> None:
     """Draw every method's line with its band; markers are staggered so that equal lines remain visible."""
     for position, (method, style) in enumerate(look.items()):

@@ -1,7 +1,7 @@
 """Counts of verdicts on the final policies (solved, feasible, infeasible), by task, agent and curriculum.
 
 Every verdict is on the stochastic final policy, evaluated without learning.
-``recrl.analysis.statistics.feasibility`` defines the verdicts. The deployment phase is given for comparison
+``recrl.analysis.statistics.verdicts`` defines the verdicts. The deployment phase is given for comparison
 only.
 """
 
@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
-from recrl.analysis.statistics.feasibility import is_cost
 from recrl.analysis.statistics.metrics import Measure
+from recrl.analysis.statistics.verdicts import is_cost
 
 FINAL = Measure.STOCHASTIC
 
 
-def verdicts(
+def count_verdicts(
     rows: pd.DataFrame,
     compared: pd.DataFrame,
     flags: pd.DataFrame,
@@ -30,7 +30,7 @@ def verdicts(
     Args:
         rows: of ``metrics.outcomes``.
         compared: of ``metrics.comparisons``, with the baseline ``none``.
-        flags: of ``validity.curriculum_flags``.
+        flags: of ``sweep_warnings.curriculum_flags``.
         names: of ``cost_names``: the names of the costs of each task with several; their numbers by default.
 
     Returns:

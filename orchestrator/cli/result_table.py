@@ -10,11 +10,11 @@ import pandas as pd
 from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.validity import curriculum_flags
-from recrl.analysis.report_tables import number, with_error
-from recrl.analysis.report_verdicts import verdict_text
+from recrl.analysis.data.sweep_warnings import curriculum_flags
+from recrl.analysis.report.table_formats import number, with_error
+from recrl.analysis.report.verdict_texts import verdict_text
 from recrl.analysis.statistics.metrics import outcomes
-from recrl.analysis.statistics.verdict_counts import verdicts
+from recrl.analysis.statistics.verdict_counts import count_verdicts
 
 CAPTION = (
     "Final policies (stochastic), evaluated without learning: means over n seeds, returns ± standard error.\n"
@@ -30,7 +30,7 @@ def result_table(sweep: Sweep) -> pd.DataFrame:
     """
     if sweep.evaluations.empty:
         return pd.DataFrame()
-    rows = verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), cost_names(sweep))
+    rows = count_verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
     return pd.DataFrame([_line(row, suffixes) for _, row in rows.iterrows()])
 

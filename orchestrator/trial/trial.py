@@ -4,11 +4,11 @@ Independent of Ray and MLflow. All of a trial's state (agent, optimisers, multip
 generators, counters, partial episodes) is in one tree. So a trial that was killed and resumed gives the same
 bytes as an uninterrupted one.
 
-The steps of an update: collect T x B environment steps; append the finished episodes; call
-``agent.update(rollout, episode costs, step)`` with the curriculum's step, then ``teacher.step(state,
-report)`` for the next one. After the budget B the phase is deployment: the limits are d_d, the noise is 0,
-and the teacher is not called any more. The agent continues learning. At the end the final policy is evaluated
-without learning.
+The steps of an update: collect T steps in each environment; call ``agent.update(rollout, episode costs,
+step)`` with the curriculum's step; append the finished episodes and the update's row; call
+``teacher.step(state, report)`` for the next step of the curriculum. After the budget B the phase is
+deployment: the limits are d_d, the noise is 0, and the teacher is not called any more. The agent continues
+learning. At the end the final policy is evaluated without learning.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Fl
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.orchestrator.errors import (
-    RowError,
-)
+from recrl.orchestrator.errors import RowError
+from recrl.orchestrator.files.curriculum_warnings import HARD_LANDING
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.rollout_check import check_rollout
@@ -46,9 +45,10 @@ from recrl.teachers.teacher import (
 
 LOGGED_UPDATES = 50
 """Approximate number of log lines of a trial."""
-HARD_LANDING = 0.1
-"""Fraction of d_d (of 1, if d_d is smaller) by which the last training limit may exceed d_d without an event.
-"""
+LANDING_FRACTION = 0.1
+"""Fraction of d_t - d_d by which the last training limit may exceed d_d without an event.
+
+It is a fraction of d_d, or of 1, where that is larger."""
 
 logger = logging.getLogger("recrl.trial")
 
@@ -241,10 +241,10 @@ class Trial:
         before, after = self._step.limits, self.spec.deploy_limits
         start = self._step.start_limits or self.spec.train_limits
         if any(
-            late - final > HARD_LANDING * max(first - final if math.isfinite(first) else 0.0, final, 1.0)
+            late - final > LANDING_FRACTION * max(first - final if math.isfinite(first) else 0.0, final, 1.0)
             for first, late, final in zip(start, before, after, strict=True)
         ):
-            self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
+            self._event(HARD_LANDING, limits=before.to_json(), deploy_limits=after.to_json())
 
     def _told(self, row: Mapping[str, Any]) -> str:
         """Format return and costs of an update as a log line."""

@@ -12,8 +12,10 @@ from torch import Tensor, nn
 
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.errors import NetworkError
-from recrl.agents.learning.module_stack import ModuleStack, checked_module
-from recrl.agents.learning.networks import FlatParameters, TanhStack, orthogonal
+from recrl.agents.networks.architecture import orthogonal
+from recrl.agents.networks.flat_parameters import FlatParameters
+from recrl.agents.networks.module_stack import ModuleStack, checked_module
+from recrl.agents.networks.tanh_stack import TanhStack
 from recrl.agents.registry import make_agent
 from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CostLimits, CurriculumStep

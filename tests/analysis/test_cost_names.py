@@ -7,10 +7,10 @@ from collections.abc import Callable
 import pandas as pd
 import pytest
 
-from recrl.analysis import report_tables, report_verdicts
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.report import table_formats, verdict_texts
 from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.cli.result_table import result_table
@@ -51,9 +51,9 @@ def test_titles_of_tables_have_the_names(two: Sweep) -> None:
     sweep = named(two, ["fuel", "noise"])
     assert {"cost fuel", "limit fuel", "cost noise", "limit noise"} <= set(result_table(sweep))
     summary = metrics.summary(metrics.outcomes(sweep))
-    table = report_tables.outcome_table(summary, Measure.STOCHASTIC, (" fuel", " noise"))
+    table = table_formats.outcome_table(summary, Measure.STOCHASTIC, (" fuel", " noise"))
     assert {"cost fuel", "limit of cost noise"} <= set(table)
-    assert {"cost 0", "limit of cost 1"} <= set(report_tables.outcome_table(summary, Measure.STOCHASTIC))
+    assert {"cost 0", "limit of cost 1"} <= set(table_formats.outcome_table(summary, Measure.STOCHASTIC))
 
 
 @pytest.mark.parametrize(
@@ -69,4 +69,4 @@ def test_a_verdict_names_the_cost_that_is_over_its_limit(
 ) -> None:
     row = {"seeds": seeds, "solved": 0, "feasible": seeds - infeasible, "infeasible": infeasible}
     worst = {"worst_excess": 0.22, "worst_share": 0.11, "worst_cost": cost}
-    assert report_verdicts.verdict_text(pd.Series(row | worst)) == text
+    assert verdict_texts.verdict_text(pd.Series(row | worst)) == text

@@ -17,7 +17,7 @@ from recrl.orchestrator.cli.arguments import COMMANDS
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid, read_grid
+from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.trial.speed import measured_speed
 

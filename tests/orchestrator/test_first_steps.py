@@ -15,7 +15,7 @@ from recrl.environments.registry import TASKS
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.cli.requests import TEMPLATES
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.json_schema import grid_schema
 from recrl.teachers.registry import TEACHERS
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import GridError
-from recrl.orchestrator.grid.grid import parse_grid, read_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid, read_grid
 
 SMALL = """\
 name: small

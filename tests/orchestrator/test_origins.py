@@ -9,23 +9,23 @@ from pathlib import Path
 
 import pytest
 
-from recrl.analysis import report
 from recrl.analysis.data import sweep_data
-from recrl.analysis.data.validity import curriculum_flags
+from recrl.analysis.data.sweep_warnings import curriculum_flags
+from recrl.analysis.report import drawing
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files import code_changes
-from recrl.orchestrator.files.code_changes import (
+from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.grid.checking import read_grid
+from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.provenance import code_changes
+from recrl.orchestrator.provenance.code_changes import (
     code_of,
     has_other_code,
     other_code,
     other_code_sentence,
 )
-from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
-from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.sweep import LaunchSettings, launch
 
 TASK = """\
@@ -102,7 +102,7 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert SENTENCE in capsys.readouterr().out.splitlines()
     assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
     assert f"{SENTENCE}; these evaluations use the installed code" in capsys.readouterr().out.splitlines()
-    assert SENTENCE.removeprefix("warning: ") in report.missing(sweep_data.load(store))
+    assert SENTENCE.removeprefix("warning: ") in drawing.missing(sweep_data.load(store))
 
     assert main(["launch", "grid.yaml", *INLINE, "--rerun-changed"]) == ExitCode.OK
     assert "small: 2 trials: 1 to run again on the present code, 1 complete\n" in capsys.readouterr().out
@@ -119,7 +119,7 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
 
     class Stopping(InlineExecutor):
         def run(self, specs: object, place: SweepPlace, stop: threading.Event) -> None:
-            from recrl.orchestrator.trial.runner import run_recorded  # noqa: PLC0415
+            from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415
 
             answers = iter([False])
             run_recorded(spec, place.store.trial(spec), should_stop=lambda: next(answers, True))
@@ -229,7 +229,7 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
         "two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
-    assert sentence in report.missing(sweep_data.load(store))
+    assert sentence in drawing.missing(sweep_data.load(store))
     assert json.loads(store.trials()[0].provenance_path.read_text())["attempts"][0]["attempt"] == 1
 
 
@@ -252,7 +252,7 @@ def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert f"warning: {sentence}" in launched
     sweep = sweep_data.load(SweepStore(folder / "runs", "small"))
-    assert sentence in report.missing(sweep)
+    assert sentence in drawing.missing(sweep)
     flags = curriculum_flags(sweep)
     assert flags["hard_landing"].tolist() == [method == "dynamic" for method in flags["method"]]
     assert not flags["no_curriculum"].any()

@@ -11,7 +11,7 @@ from rich.console import Console
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import make_plan
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import (

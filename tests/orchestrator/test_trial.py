@@ -21,7 +21,7 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
@@ -127,7 +127,7 @@ def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path
         "import json, sys; from pathlib import Path\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
         "from recrl.orchestrator.files.sweep_store import SweepStore\n"
-        "from recrl.orchestrator.trial.runner import run_recorded\n"
+        "from recrl.orchestrator.trial.attempt import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
         "store = SweepStore(Path(sys.argv[1]), 'sweep').trial(spec)\n"
         "run_recorded(spec, store, should_stop=lambda: False, commit_seconds=0.0)\n"
