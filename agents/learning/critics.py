@@ -29,7 +29,7 @@ class Critics:
         self, num_observations: int, num_costs: int, form: NetworkForm, generator: torch.Generator
     ) -> None:
         self.parameters, self._stack = make_stack(
-            form, 1 + num_costs, num_observations, 1, last_scale=1.0, generator=generator
+            form, 1 + num_costs, num_observations, 1, last_scale=1.0, generator=generator, role="critic"
         )
 
     def values(self, rows: Tensor) -> npt.NDArray[np.float64]:

@@ -70,6 +70,7 @@ class StochasticPolicy:
             num_outputs,
             last_scale=last_scale,
             generator=generator,
+            role="policy",
             others=[] if self.is_categorical else [(num_outputs,)],
         )
         if isinstance(action_space, Box):

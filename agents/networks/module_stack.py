@@ -195,13 +195,14 @@ class _Scaled(nn.Module):
         return outputs
 
 
-def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int) -> nn.Module:
+def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int, *, role: str = "") -> nn.Module:
     """Make a network and test it on two rows.
 
     Args:
         factory: the user's, or ``perceptron``'s.
         num_inputs: n.
         num_outputs: actions, action components, or 1.
+        role: of the network, for errors: ``policy`` or ``critic``.
 
     Raises:
         NetworkError: it is no module, has buffers or no parameters, fails, returns another shape or type, or
@@ -232,8 +233,8 @@ def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int) ->
     if not isinstance(outputs, Tensor) or outputs.shape != (2, num_outputs) or outputs.dtype != torch.float32:
         found = f"{outputs.dtype} {list(outputs.shape)}" if isinstance(outputs, Tensor) else type(outputs)
         raise NetworkError(
-            f"the network maps 2 rows of {num_inputs} numbers to {found}: it must return float32 "
-            f"[2, {num_outputs}]"
+            f"the network{f' of the {role}' if role else ''} maps 2 rows of {num_inputs} numbers to {found}: "
+            f"it must return float32 [2, {num_outputs}]"
         )
     if not torch.allclose(outputs[1:], alone, rtol=1e-3, atol=1e-5):
         raise NetworkError(

@@ -50,6 +50,7 @@ def make_stack(
     *,
     last_scale: float,
     generator: torch.Generator,
+    role: str,
     others: Sequence[tuple[int, ...]] = (),
 ) -> tuple[FlatParameters, Stack]:
     """Make C networks with their parameters.
@@ -61,6 +62,7 @@ def make_stack(
         num_outputs: of each.
         last_scale: factor on the initial outputs.
         generator: the initialisation's randomness.
+        role: of the networks, for errors: ``policy`` or ``critic``.
         others: shapes of further parameters at the end of the block.
 
     Raises:
@@ -75,7 +77,7 @@ def make_stack(
     factory = form.factory or perceptron(form.hidden_sizes, form.activation, form.initialiser)(generator)
     with torch.random.fork_rng(devices=[]):  # a user's module draws from PyTorch's global generator
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
-        modules = [checked_module(factory, num_inputs, num_outputs) for _ in range(num_networks)]
+        modules = [checked_module(factory, num_inputs, num_outputs, role=role) for _ in range(num_networks)]
     parameters = FlatParameters([*ModuleStack.shapes(modules), *others])
     of_modules = ModuleStack(modules, parameters)
     of_modules.initialise(last_scale)

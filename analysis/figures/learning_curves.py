@@ -17,6 +17,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.labels import occurring
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
@@ -47,6 +48,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN)
     num_costs = int(trials["num_costs"].max())
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     columns = 2 + 2 * num_costs
+    suffixes = [cost_suffix(sweep, i) for i in range(num_costs)]
     with styles.context():
         figure = Figure(
             figsize=(TEXT_WIDTH * max(1.0, columns / 4), ROW_HEIGHT * len(tasks) + 0.8), layout="constrained"
@@ -62,7 +64,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN)
                 look,
                 averaging=averaging,
             )
-        for axes, title in zip(grid[0], _column_titles(num_costs), strict=True):
+        for axes, title in zip(grid[0], _column_titles(suffixes), strict=True):
             axes.set_title(title)
         for axes in grid[-1]:
             axes.set_xlabel("environment steps")
@@ -108,7 +110,8 @@ def curricula(sweep: Sweep) -> Figure:
             row[0].set_ylim(bottom=0.0)
             limits = sweep.trials.loc[sweep.trials["task"] == task, f"deploy_limit_{i}"]
             _shade(list(row), float(limits.iloc[0]))
-            row[0].set_ylabel("cost limit" if sweep.num_costs == 1 else f"limit of cost {i + 1}")
+            suffix = cost_suffix(sweep, i, task)
+            row[0].set_ylabel(f"limit of cost{suffix}" if suffix else "cost limit")
         for axes, agent in zip(grid[0], agents, strict=True):
             axes.set_title(f"{agent}\n{axes.get_title(loc='left')}", loc="left", pad=3.0)
         for axes in grid[-1]:
@@ -231,10 +234,10 @@ def _curriculum_panel(
     panels.phase_boundary(axes, boundary, total)
 
 
-def _column_titles(num_costs: int) -> list[str]:
+def _column_titles(suffixes: Sequence[str]) -> list[str]:
     titles = ["return", "return in deployment"]
-    for i in range(num_costs):
-        name = "episode cost" if num_costs == 1 else f"episode cost {i + 1}"
+    for suffix in suffixes:
+        name = f"episode cost{suffix}"
         titles += [name, f"{name.removeprefix('episode ')} in deployment"]
     return titles
 

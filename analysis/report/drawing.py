@@ -236,7 +236,7 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Calla
         made[f"policies_{_safe(agent)}"] = partial(policy_maps, sweep, agent)
     for agent in agents:
         for i in range(sweep.num_costs):
-            which = f"_cost-{i + 1}" if i else ""
+            which = f"_cost-{i}" if i else ""  # the number of the CSV files
             made[f"bounds_{_safe(agent)}{which}"] = partial(cumulative_bounds, sweep, agent, cost=i)
     made["performance-profiles"] = partial(performance_profiles, sweep, Measure.STOCHASTIC)
     return made

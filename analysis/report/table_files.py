@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
@@ -80,15 +81,16 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     compared = metrics.comparisons(rows, generator)
     weighed = claims.weigh(rows)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
-    judged = count_verdicts(rows, compared, curriculum_flags(sweep))
-    outcomes = _outcome_tables(averaged)
+    judged = count_verdicts(rows, compared, curriculum_flags(sweep), cost_names(sweep))
+    suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
+    outcomes = _outcome_tables(averaged, suffixes)
     latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
-    shown = [*outcomes, *_comparison_tables(compared)]
+    shown = [*outcomes, *_comparison_tables(compared, suffixes)]
     if len(weighed):
         written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
         shown.append(ShownTable("What the paper says of these maps", claims.claims_table(weighed)))
     for i, costs in enumerate(bounds):
-        which = "" if sweep.num_costs == 1 else f" (cost {i + 1})"
+        which = f" (cost{suffixes[i]})" if suffixes[i] else ""
         if len(costs):
             heading = f"Cumulative cost of training against its bounds{which}"
             shown.append(ShownTable(heading, bound_table(costs)))
@@ -103,19 +105,23 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     return written, Tables(judged, shown)
 
 
-def _outcome_tables(averaged: pd.DataFrame) -> list[ShownTable]:
+def _outcome_tables(averaged: pd.DataFrame, suffixes: Sequence[str]) -> list[ShownTable]:
     """Return the outcomes, those of the final policy first."""
-    tables = [(measure, table_formats.outcome_table(averaged, measure)) for measure in SHOWN_MEASURES]
+    tables = [
+        (measure, table_formats.outcome_table(averaged, measure, suffixes)) for measure in SHOWN_MEASURES
+    ]
     return [ShownTable(_heading(measure), table) for measure, table in tables if len(table)]
 
 
-def _comparison_tables(compared: pd.DataFrame) -> list[ShownTable]:
+def _comparison_tables(compared: pd.DataFrame, suffixes: Sequence[str]) -> list[ShownTable]:
     """Return differences to the agent without a curriculum, those of the final policy first."""
     if not len(compared):
         return []
     return [
         ShownTable(
-            f"{_heading(measure)}, minus none", table_formats.comparison_table(compared, measure), TIES
+            f"{_heading(measure)}, minus none",
+            table_formats.comparison_table(compared, measure, suffixes),
+            TIES,
         )
         for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     ]

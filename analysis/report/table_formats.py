@@ -36,7 +36,7 @@ LATEX = {
 }
 
 
-def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[str] = ()) -> pd.DataFrame:
     """Format return, costs, regret and fractions of feasible and solved seeds.
 
     The regret, J*(d_d) minus the return, is left out if a seed is infeasible, because its return may be above
@@ -45,6 +45,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
     Args:
         summary: of ``metrics.summary``.
         measure: which of the three outcomes.
+        suffixes: of ``cost_suffix`` for each cost; the numbers of the CSV files by default.
     """
     rows = summary[summary["measure"] == measure.value]
     costs = [name for name in map(str, rows) if f"{name}_se" in rows and name.startswith("cost_")]
@@ -53,7 +54,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
         line = {name: str(row[name]) for name in GROUP} | {"seeds": str(row["seeds"])}
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         for name in costs:
-            title = "cost" if len(costs) == 1 else f"cost {int(name[5:]) + 1}"
+            title = _cost_title(suffixes, name, len(costs))
             line[title] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
             line[f"limit of {title}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["optimum"] = number(row["optimal_return"])
@@ -66,12 +67,15 @@ def outcome_table(summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def comparison_table(comparisons: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+def comparison_table(
+    comparisons: pd.DataFrame, measure: Measure, suffixes: Sequence[str] = ()
+) -> pd.DataFrame:
     """Format paired differences to the agent without a curriculum.
 
     Args:
         comparisons: of ``metrics.comparisons``.
         measure: which of the three outcomes.
+        suffixes: as for ``outcome_table``.
     """
     rows = comparisons[comparisons["measure"] == measure.value]
     costs = [name for name in map(str, rows) if name.startswith("cost_") and name.endswith("_difference")]
@@ -80,12 +84,17 @@ def comparison_table(comparisons: pd.DataFrame, measure: Measure) -> pd.DataFram
         line = {name: str(row[name]) for name in GROUP} | {"pairs of seeds": str(row["pairs"])}
         line["return gained"] = with_interval(row, "return_difference")
         for name in costs:
-            title = "cost added" if len(costs) == 1 else f"cost {int(name.split('_')[1]) + 1} added"
+            title = f"{_cost_title(suffixes, name, len(costs))} added"
             line[title] = with_interval(row, name)
         mark = TOO_FEW if row["too_few_seeds"] else ""
         line["P(higher return)"] = with_interval(row, "improvement") + mark
         lines.append(line)
     return pd.DataFrame(lines)
+
+
+def _cost_title(suffixes: Sequence[str], column: str, num_costs: int) -> str:
+    i = int(column.split("_")[1])
+    return f"cost{suffixes[i]}" if i < len(suffixes) else "cost" if num_costs == 1 else f"cost {i}"
 
 
 def number(value: float) -> str:

@@ -71,7 +71,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
         line["difference to none"] = DASH if all_infeasible else with_interval(row, "return_difference")
         line["optimum"] = number(row["optimal_return"])
         for name in costs:
-            title = "cost" if len(costs) == 1 else f"cost {int(name[5:]) + 1}"
+            title = "cost" if len(costs) == 1 else f"cost {_label(verdicts, name[5:])}"
             line[title] = with_error(row[name], row[f"{name}_se"], digits=3)
             line[f"limit of {title}" if len(costs) > 1 else "limit"] = number(row[f"deploy_limit_{name[5:]}"])
         line["n"] = str(row["seeds"])
@@ -102,18 +102,28 @@ def verdict_text(row: pd.Series) -> str:
     seeds = int(row["seeds"])
     share = "" if math.isnan(row["worst_share"]) else f" ({row['worst_share']:.0%})"
     excess = f"{number(row['worst_excess'])}{share}"
+    cost = row.get("worst_cost", "")
+    cost = f"cost {cost}" if cost.isdigit() else cost
     counts = {
         SOLVED: int(row["solved"]),
         FEASIBLE: int(row["feasible"] - row["solved"]),
         INFEASIBLE: int(row["infeasible"]),
     }
     if counts[INFEASIBLE] == seeds:
-        return f"infeasible by {'' if row['seeds'] == 1 else 'up to '}{excess}"
+        head = f"infeasible: {cost}" if cost else "infeasible"
+        return f"{head} by {'' if row['seeds'] == 1 else 'up to '}{excess}"
     if seeds in (counts[SOLVED], counts[FEASIBLE]):
         return SOLVED if counts[SOLVED] else FEASIBLE
     names = {FEASIBLE: "feasible, not solved" if counts[SOLVED] else FEASIBLE}
     texts = [f"{names.get(kind, kind)} {count} of {seeds}" for kind, count in counts.items() if count]
-    return "; ".join(texts) + (f", by up to {excess}" if counts[INFEASIBLE] else "")
+    return "; ".join(texts) + (f", {f'{cost} ' * bool(cost)}by up to {excess}" if counts[INFEASIBLE] else "")
+
+
+def _label(verdicts: pd.DataFrame, i: str) -> str:
+    """Return the name of cost i if all rows with a name agree, else its number, as in CSV files."""
+    column = f"cost_name_{i}"
+    found = set(verdicts[column]) - {""} if column in verdicts else set()
+    return str(found.pop()) if len(found) == 1 else i
 
 
 def warning_text(row: pd.Series) -> str:

@@ -51,7 +51,7 @@ Exit codes:
   2    the grid or the arguments are wrong; nothing was started
   3    another process is running this sweep
   4    Ray, MLflow or the storage could not be reached, or files could not be written
-  5    plan --check: a launch would have something to do
+  5    plan --check: trials are left to run, or come from other code
   130  stopped by Ctrl-C or SIGTERM; the same launch continues"""
 
 # Each command and the function that does it, in the order of the help. The function's module is imported when

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short, show
-from recrl.orchestrator.cli.plan import say_plan
+from recrl.orchestrator.cli.plan import say_other_code, say_plan
 from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
 from recrl.orchestrator.cli.status import say_failures
 from recrl.orchestrator.errors import RecrlError
@@ -92,6 +92,7 @@ class _Printer(LaunchListener):
     def planned(self, plan: Plan, *, at_once: int, where: str) -> Iterator[None]:
         """Print the plan; show the progress while trials run."""
         say_plan(plan, self._grid, self._console, at_once=at_once, where=where)
+        say_other_code(plan, self._console)
         if not plan.to_do:
             yield
             return

@@ -68,7 +68,8 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
         say(console, f"damaged: {problem}")
     for orphan in plan.orphans:
         say(console, f"no longer in the grid, not touched: {short(orphan.folder)}")
-    return ExitCode.TRIALS_LEFT if request.check and plan.to_do else ExitCode.OK
+    is_left = plan.to_do or plan.other_code
+    return ExitCode.TRIALS_LEFT if request.check and is_left else ExitCode.OK
 
 
 def _measured(plan: Plan, console: Console) -> dict[str, float]:

@@ -125,7 +125,10 @@ class PlanRequest(GridRequest):
     cores: int | None = by_flag(
         group="room", type=types.at_least_one, metavar="N", help="estimate for this number of cores"
     )
-    check: bool = by_flag(action="store_true", help="exit with code 5 if a launch would have something to do")
+    check: bool = by_flag(
+        action="store_true",
+        help="exit with code 5 if a launch would have something to do, or trials come from other code",
+    )
     measure: bool = by_flag(
         action="store_true",
         help="run about a second of each task and agent without a known speed, to estimate the time",
@@ -348,7 +351,8 @@ class OptionsRequest(Request):
 
     name: str = by_place(
         metavar="NAME",
-        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits",
+        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits, "
+        "tasks, agents, methods",
     )
     trust: bool = by_flag(**_TRUST)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import pandas as pd
 
+from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
@@ -28,15 +30,15 @@ def result_table(sweep: Sweep) -> pd.DataFrame:
     """
     if sweep.evaluations.empty:
         return pd.DataFrame()
-    rows = count_verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep))
-    return pd.DataFrame([_line(row, sweep.num_costs) for _, row in rows.iterrows()])
+    rows = count_verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), cost_names(sweep))
+    suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
+    return pd.DataFrame([_line(row, suffixes) for _, row in rows.iterrows()])
 
 
-def _line(row: pd.Series, num_costs: int) -> dict[str, str]:
+def _line(row: pd.Series, suffixes: Sequence[str]) -> dict[str, str]:
     line = {name: str(row[name]) for name in GROUP} | {"n": str(row["seeds"])}
     line["return"] = with_error(row["episode_return"], row["episode_return_se"])
-    for i in range(num_costs):
-        which = "" if num_costs == 1 else f" {i + 1}"
+    for i, which in enumerate(suffixes):
         line[f"cost{which}"] = with_error(row[f"cost_{i}"], math.nan, digits=3)
         line[f"limit{which}"] = number(row[f"deploy_limit_{i}"])
     return line | {"verdict": verdict_text(row)}

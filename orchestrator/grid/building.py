@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -13,9 +13,11 @@ from recrl.environments.registry import make_vector
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.located_yaml import Place
-from recrl.orchestrator.spec import Choice
+from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, make_teacher
-from recrl.teachers.teacher import checked_answer
+from recrl.teachers.teacher import check_limits_fall, checked_answer
+
+TASK_MARK = "\0"  # stands for a task in a sentence, after "on" or "of"
 
 
 class BuildError(Exception):
@@ -44,29 +46,38 @@ def cmdp_of(task: Choice) -> CMDPSpec:
     return envs.cmdp
 
 
-def build_own(grid: GridSpec) -> Iterator[tuple[Place, str]]:
+def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[Place, str, str]]:
     """Build the user's own agents, networks and curricula once on each task that they meet.
 
+    Args:
+        grid: the grid.
+        cmdps: of its tasks, by label.
+
     Yields:
-        The place and a sentence of each that cannot be built.
+        Of each that cannot be built: its place, a sentence with ``TASK_MARK``, and the task's label.
     """
     trials = grid.trials()
-    cells = {cell.task.label: cell.task for cell in grid.tasks}
     agents = {(it.task.label, it.agent.label): it for it in trials if _is_own_agent(it.agent)}
     methods = {(it.task.label, it.method.label): it for it in trials if it.method.name not in TEACHERS}
     for (task, label), spec in agents.items():
-        cmdp = make_vector(cells[task].name, 1, options=cells[task].options).cmdp
         place = ("agents", [agent.label for agent in grid.agents].index(label))
         try:
-            make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
+            make_agent(spec.agent.name, cmdps[task], spec.agent.options, np.random.SeedSequence(0))
         except USERS_ERRORS as error:
-            yield place, f"{label} cannot be built on {task}: {described(error)}"
+            yield place, f"{label} cannot be built on {TASK_MARK}: {described(error)}", task
     for (task, label), spec in methods.items():
         place = ("methods", [method.label for method in grid.methods].index(label))
         try:
-            checked_answer(make_teacher(spec.teacher).start(), label, len(spec.deploy_limits))
+            _check_start(spec, cmdps[task])
         except USERS_ERRORS as error:
-            yield place, f"{label} cannot be started on {task}: {described(error)}"
+            yield place, f"{label} cannot be started on {TASK_MARK}: {described(error)}", task
+
+
+def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
+    """Check the first step of a trial's curriculum, and its state."""
+    label = spec.method.label
+    step, _ = checked_answer(make_teacher(spec.teacher).start(), label, cmdp.num_costs)
+    check_limits_fall(step, None, spec.train_limits, curriculum=label, cost_names=cmdp.cost_names, update=0)
 
 
 def _is_own_agent(agent: Choice) -> bool:

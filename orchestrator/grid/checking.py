@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,7 +32,7 @@ from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.plugins import UnknownNameError, UntrustedNameError, trusted_attribute
 from recrl.environments.registry import task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
-from recrl.orchestrator.grid.building import BuildError, build_own, cmdp_of
+from recrl.orchestrator.grid.building import TASK_MARK, BuildError, build_own, cmdp_of
 from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
 from recrl.orchestrator.grid.file_models import (
     Entry,
@@ -86,10 +86,11 @@ def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
     check = _Check(data)
     grid = check.grid()
     if grid is not None and build:
-        for place, sentence in build_own(grid):
-            check.add(place, sentence)
+        for place, sentence, task in build_own(grid, check.cmdps):
+            check.add_of_task(place, sentence, task)
     if check.problems:
-        ordered = sorted(set(check.problems), key=lambda problem: (problem.line, str(problem.place)))
+        unique = dict.fromkeys(check.problems)
+        ordered = sorted(unique, key=lambda problem: (problem.line, str(problem.place)))
         raise GridError([f"{source}:{problem}" for problem in ordered])
     if grid is None:
         raise UncalledError(source, check.uncalled)
@@ -139,6 +140,8 @@ class _Check:
         self._document = parse(data)
         self.problems = list(self._document.problems)
         self.uncalled: list[str] = []
+        self._of_tasks: dict[tuple[Place, str], list[str]] = {}  # tasks with the same mistake
+        self.cmdps: dict[str, CMDPSpec] = {}  # of the tasks that can be built, by label
         raw = self._document.value
         self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
 
@@ -201,6 +204,7 @@ class _Check:
             except BuildError as error:
                 self.add(("tasks", index), str(error))
                 continue
+            self.cmdps[task.label] = cmdp
             limits = self._both_limits(index, task.label, cmdp)
             rollout_steps = self._rollout_steps(run, task.label, cmdp)
             if limits is not None and rollout_steps is not None:
@@ -288,10 +292,10 @@ class _Check:
     def _limits(self, index: int, key: str, label: str, cmdp: CMDPSpec) -> tuple[CostLimits | None, Place]:
         """Return one kind of a task's limits, its own or the grid's, and their place in the file."""
         place: Place = ("tasks", index, key)
-        entry = _valid(TaskEntry, self._raw["tasks"][index])
-        values = getattr(entry, key)
+        raw = self._raw["tasks"][index]
+        values = getattr(_valid(TaskEntry, raw), key)
         if values is None:
-            place = (key,)
+            place, raw = (key,), self._raw
             shared = _valid(Limits, {key: self._raw.get(key)})
             if shared is None:  # the schema check has reported it
                 return None, place
@@ -299,9 +303,11 @@ class _Check:
         if values is None:
             self.add(("tasks", index), f"{key} is required, here or for all tasks")
             return None, place
-        if len(values) not in (1, cmdp.num_costs):
+        is_listed = isinstance(raw, dict) and isinstance(raw.get(key), list)
+        if len(values) != cmdp.num_costs and (is_listed or len(values) > 1):
             costs = f"{cmdp.num_costs} cost{'s' * (cmdp.num_costs > 1)} ({', '.join(cmdp.cost_names)})"
-            self.add(place, f"{label} has {costs}, got {len(values)} limits")
+            got = f"{len(values)} limits" if len(values) > 1 else "1 limit; one for all is a plain number"
+            self.add(place, f"{label} has {costs}, got {got}")
             return None, place
         return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
 
@@ -312,10 +318,11 @@ class _Check:
         default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
         steps, num_envs = run.rollout_steps or default, run.num_envs
         if run.total_steps < num_envs * steps:
-            self.add(
+            self.add_of_task(
                 ("run", "total_steps"),
-                f"must be at least one update of {label}, "
+                f"must be at least one update of {TASK_MARK}, "
                 f"{num_envs} environments x {steps} steps = {num_envs * steps}, got {run.total_steps}",
+                label,
             )
         else:
             return steps
@@ -332,7 +339,39 @@ class _Check:
 
     def add(self, place: Place, sentence: str) -> None:
         """Add a problem, with the line of its place."""
-        self.problems.append(Problem(self._document.line(place), place, sentence))
+        self.problems.append(self._problem(place, sentence))
+
+    def add_of_task(self, place: Place, sentence: str, task: str) -> None:
+        """Add a mistake on a task; the same mistake on further tasks stays one problem, which names them.
+
+        Args:
+            place: of the mistake.
+            sentence: with ``TASK_MARK`` in place of the task, after a preposition.
+            task: its label.
+        """
+        tasks = self._of_tasks.setdefault((place, sentence), [])
+        if tasks:
+            self.problems.remove(self._problem(place, _of_tasks(sentence, tasks)))
+        tasks.append(task)
+        self.add(place, _of_tasks(sentence, tasks))
+
+    def _problem(self, place: Place, sentence: str) -> Problem:
+        return Problem(self._document.line(place), place, sentence)
+
+
+def _of_tasks(sentence: str, tasks: Sequence[str]) -> str:
+    """Return the sentence of a mistake with its task, or with several in brackets at the end.
+
+    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a"])
+    'mine cannot be built on a: no'
+    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a", "b"])
+    'mine cannot be built: no (on a, b)'
+    """
+    before, after = sentence.split(TASK_MARK, 1)
+    if len(tasks) == 1:
+        return f"{before}{tasks[0]}{after}"
+    head = before.removesuffix(" on ").removesuffix(" of ")
+    return f"{head}{after} (on {', '.join(tasks)})"
 
 
 def _valid(model: type[Model], value: Any) -> Model | None:

@@ -12,6 +12,7 @@ from io import TextIOWrapper
 
 import torch
 
+from recrl.environments.registry import make_vector
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
     LostLeaseError,
@@ -154,6 +155,7 @@ def run_recorded(
     provenance = {
         **collect_provenance(),
         "code": code_of(spec),
+        **_cost_names(spec),
     }  # waits for git without a heartbeat, so before the trial begins
     try:
         writer = store.begin(spec)
@@ -184,6 +186,18 @@ def run_recorded(
             text = shown(f"{described(error)}{notes}")
             return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))
         return store.record().status
+
+
+def _cost_names(spec: TrialSpec) -> dict[str, list[str]]:
+    """Return the names of a task's costs for titles, if it has several and can be built."""
+    if len(spec.deploy_limits) == 1:
+        return {}
+    try:
+        environments = make_vector(spec.task.name, 1, options=spec.task.options)
+        environments.close()
+    except USERS_ERRORS:  # the trial itself will say so
+        return {}
+    return {"cost_names": list(environments.cmdp.cost_names)}
 
 
 def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:

@@ -26,7 +26,7 @@ from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded, FinalPoli
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import CurriculumStep, EpisodeStats, Floats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Floats, Phase
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
@@ -35,7 +35,13 @@ from recrl.orchestrator.files.curriculum_warnings import HARD_LANDING
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.rollout_check import check_rollout
-from recrl.teachers.teacher import ProgressReport, Teacher, TeacherState, checked_answer
+from recrl.teachers.teacher import (
+    ProgressReport,
+    Teacher,
+    TeacherState,
+    check_limits_fall,
+    checked_answer,
+)
 
 LOGGED_UPDATES = 50
 """Approximate number of log lines of a trial."""
@@ -93,8 +99,8 @@ class Trial:
         tree = writer.restore()
         if tree is None:
             self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
-            self._step, self._teacher_state = self._checked(teacher.start())
             self.update = self.env_steps = self._episodes = 0
+            self._step, self._teacher_state = self._checked(teacher.start(), before=None)
             logger.info("started: %s", spec.title)
         else:
             self._load(tree)
@@ -199,7 +205,8 @@ class Trial:
             return
         before = self._step
         report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
-        self._step, self._teacher_state = self._checked(self._teacher.step(self._teacher_state, report))
+        answer = self._teacher.step(self._teacher_state, report)
+        self._step, self._teacher_state = self._checked(answer, before=before.limits)
         if self._step.start_limits is not None and self._step.start_limits != before.start_limits:
             limits = self._step.start_limits.to_json()
             self._event("start limits measured", limits=limits)
@@ -215,8 +222,19 @@ class Trial:
                 "not support; choose another of the two"
             )
 
-    def _checked(self, answer: object) -> tuple[CurriculumStep, TeacherState]:
-        return checked_answer(answer, self.spec.method.label, self._cmdp.num_costs)
+    def _checked(self, answer: object, *, before: CostLimits | None) -> tuple[CurriculumStep, TeacherState]:
+        """Check the curriculum's answer; ``before`` has the limits before it, None at the start."""
+        label = self.spec.method.label
+        step, state = checked_answer(answer, label, self._cmdp.num_costs)
+        check_limits_fall(
+            step,
+            before,
+            self.spec.train_limits,
+            curriculum=label,
+            cost_names=self._cmdp.cost_names,
+            update=self.update,
+        )
+        return step, state
 
     def _warn_of_hard_landing(self) -> None:
         """Record an event if deployment begins with limits far below the last training limits."""

@@ -163,6 +163,12 @@ def test_what_is_wrong_with_a_network_is_said(factory: Callable[[int, int], Any]
         checked_module(factory, 4, 2)
 
 
+@pytest.mark.parametrize("role", ["policy", "critic"])
+def test_a_wrong_shape_says_of_which_network(role: str) -> None:
+    with pytest.raises(NetworkError, match=rf"^the network of the {role} maps 2 rows of 4 numbers to "):
+        checked_module(of_another_shape, 4, 2, role=role)
+
+
 def test_a_file_of_somebody_else_runs_no_network() -> None:
     with refuse_import_paths(), pytest.raises(UntrustedNameError):
         trained("ppo-lag", "two-state", {"network": "os:system"}, updates=0)

@@ -67,6 +67,11 @@ def test_the_worst_cost_is_the_one_that_is_furthest_over_its_limit() -> None:
     others = {"cost_1": 3.0, "deploy_limit_1": 1.0, "feasible": False}
     row = judged([outcome("none", 0, 9.5, 5.5, **others)]).iloc[0]
     assert (row["worst_excess"], row["worst_share"]) == (2.0, 2.0)
+    assert (row["worst_cost"], row["cost_name_0"], row["cost_name_1"]) == ("1", "0", "1")
+    table = verdict_texts.verdict_table(
+        judged([outcome("none", 0, 9.5, 5.5, **others)]).assign(cost_1_se=0.0)
+    )
+    assert {"cost 0", "limit of cost 1"} <= set(table)
 
 
 def test_the_table_says_the_verdict_in_words() -> None:

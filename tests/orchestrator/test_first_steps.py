@@ -107,6 +107,19 @@ def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize(
+    ("section", "command"), [("tasks", "tasks"), ("agents", "agents"), ("methods", "curricula")]
+)
+def test_options_of_a_list_of_a_grid_say_what_it_takes(
+    section: str, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = " ".join(output(capsys, "options", section).split())
+    assert out.startswith(f"{section}, a section of a grid: a list; each entry is a name, or a mapping with ")
+    assert f"Names: recrl-sweep list {command}; options of one: recrl-sweep options " in out
+    assert ("deploy_limits" in out) == (section == "tasks")
+    assert "label" in out
+
+
+@pytest.mark.parametrize(
     ("name", "sentence"),
     [
         ("cpoo", "no task, agent or curriculum is called 'cpoo'; did you mean 'cpo'?; see recrl-sweep list"),

@@ -19,9 +19,11 @@ from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.provenance import code_changes
 from recrl.orchestrator.provenance.code_changes import (
     code_of,
     has_other_code,
+    other_code,
     other_code_sentence,
 )
 from recrl.orchestrator.sweep import LaunchSettings, launch
@@ -86,6 +88,10 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert not has_other_code(trial, trial.spec)
     before = trial.episodes_path.read_bytes()
     change(folder)
+    capsys.readouterr()
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK  # nothing to do, but not without a word
+    assert SENTENCE in capsys.readouterr().out.splitlines()
+    assert main(["plan", "grid.yaml", "--trust", "--check"]) == ExitCode.TRIALS_LEFT
     (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1"))
     capsys.readouterr()
     assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
@@ -137,6 +143,41 @@ def test_the_code_of_a_task_is_found_without_running_it(folder: Path) -> None:
     sys.modules.pop("my_scaled_task", None)
     assert set(code_of(spec)) == {"recrl", "my_scaled_task"}
     assert "my_scaled_task" not in sys.modules
+
+
+def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    own = "import json\nimport numpy as np\nfrom my_physics import GRAVITY\n" + TASK
+    (folder / "my_scaled_task.py").write_text(own)
+    (folder / "my_physics.py").write_text("def late():\n    import my_units.lengths\n")
+    (folder / "my_units").mkdir()
+    (folder / "my_units" / "lengths.py").write_text("import my_scaled_task  # a circle\n")
+    (folder / "my_other.py").write_text("")  # nobody imports it
+    importlib.invalidate_caches()
+    before = code_of(spec)
+    assert list(before) == ["recrl", "my_scaled_task", "my_physics", "my_units"]
+    (folder / "my_units" / "lengths.py").write_text("METRE = 2\n")
+    after = code_of(spec)
+    assert {name for name in before if before[name] != after[name]} == {"my_units"}
+    assert other_code([{"code": before}], spec)
+    old = {name: before[name] for name in ("recrl", "my_scaled_task")}  # what earlier versions wrote
+    assert not other_code([{"code": old}], spec)
+    assert not {"my_physics", "my_units"} & set(sys.modules)
+
+
+def test_the_imports_of_a_plug_in_are_followed_within_its_project_and_bounds(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    (folder / "my_scaled_task.py").write_text(f"import my_a, my_b, my_elsewhere\n{TASK}")
+    for name in ("my_a", "my_b"):
+        (folder / f"{name}.py").write_text("")
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (elsewhere / "my_elsewhere.py").write_text("")
+    monkeypatch.syspath_prepend(elsewhere)
+    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a", "my_b"]
+    monkeypatch.setattr(code_changes, "MOST_FILES", 2)
+    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a"]
 
 
 def test_of_a_package_that_is_not_here_nothing_is_said(folder: Path) -> None:
