@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.constraints.cost_measures import standard_errors
+from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.learning.advantages import reward_spread, scaled_advantages
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Distribution
@@ -27,10 +27,10 @@ class Constraints:
 
     Attributes:
         limits: d, [k], possibly infinite.
-        gaps: constrained value of the episodes (their mean undiscounted cost, or its CVaR) minus limit, [k];
-            -inf where the limit is infinite, NaN where it is finite and no episode finished.
-        standard_errors: of the episodes' mean costs, [k], at least 0; 0 of fewer than two episodes.
-        episode_length: mean steps of these episodes, at least 1; NaN if none finished.
+        gaps: constrained value (the mean undiscounted episode cost, or its CVaR) minus limit, [k]; -inf where
+            the limit is infinite, NaN where it is finite and the value is unknown.
+        standard_errors: of the mean episode costs, [k], at least 0; 0 if they are unknown.
+        episode_length: mean steps of recent episodes, at least 1; NaN if none has finished yet.
     """
 
     limits: Floats
@@ -39,24 +39,17 @@ class Constraints:
     episode_length: float
 
     @classmethod
-    def measure(
-        cls,
-        costs: Floats,
-        lengths: npt.NDArray[np.int64],
-        values: Floats,
-        limits: Floats,
-    ) -> Constraints:
-        """Compare the constrained values of E episodes with the limits.
+    def of(cls, measured: MeasuredCosts, lengths: npt.NDArray[np.int64], limits: Floats) -> Constraints:
+        """Compare the constrained values with the limits.
 
         Args:
-            costs: undiscounted costs of the episodes, [E, k].
-            lengths: their steps, [E].
-            values: the constrained values, [k]; NaN if E is 0.
+            measured: the constrained values.
+            lengths: steps of recent episodes, [E].
             limits: d, [k].
         """
-        gaps = np.where(np.isfinite(limits), values - limits, -np.inf)
+        gaps = np.where(np.isfinite(limits), measured.values - limits, -np.inf)
         length = float(lengths.mean()) if len(lengths) else float("nan")
-        return cls(limits, gaps, standard_errors(costs), length)
+        return cls(limits, gaps, measured.standard_errors, length)
 
     @property
     def known(self) -> bool:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from recrl.agents.encoding import CLIP, Encoder
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.observation_features import CLIP, Encoder
 
 
 class PolicyModule(nn.Module):

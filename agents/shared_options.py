@@ -134,8 +134,9 @@ class ActorCriticConfig(BaseModel):
     )
     constraint_window: Count = Field(
         default=16,
-        description="Least number of episodes for a mean cost. If fewer finish in an update, "
-        "those of earlier updates are included (ours).",
+        description="Least number of episodes for a mean cost. If fewer finish in an update, the "
+        "mean cost of the rollout's steps times the mean episode length is used; with "
+        "fewer environments than this, episodes of earlier updates are included (ours).",
     )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",
@@ -225,7 +226,7 @@ class LagrangianConfig(BaseModel):
         default=0.1,
         description="Step of the dual ascent, K_I, or Adam's learning rate, without unit (ours; paper 0.05).",
     )
-    multiplier_proportional: NonNegative = Field(default=0.2, description="K_P of the PID rule (ours).")
+    multiplier_proportional: NonNegative = Field(default=1.0, description="K_P of the PID rule (ours).")
     multiplier_derivative: NonNegative = Field(default=0.0, description="K_D of the PID rule (ours).")
     multiplier_maximum: Positive = Field(
         default=1000.0,

@@ -23,9 +23,10 @@ environment, and checks that the last observation is the same.
 from __future__ import annotations
 
 import copy
+import difflib
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -255,9 +256,10 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if self._costless:
             return np.zeros(self.cmdp.num_costs)
         if "cost" not in info:
+            others = f", only {', '.join(map(repr, info))}" if info else ""
             raise ValueError(
-                f"{self.cmdp.name}: the environment must report info['cost'] at every step, got only "
-                f"{sorted(info)} (for zero costs: the task gymnasium with costless: true)"
+                f"{self.cmdp.name}: the environment must report info['cost'] at every step: info has no "
+                f"'cost'{others} (for zero costs: the task gymnasium with costless: true)"
             )
         try:
             costs = np.asarray(info["cost"], np.float64).reshape(-1)
@@ -320,8 +322,14 @@ def make_gymnasium(name: str, num_envs: int, options: GymnasiumOptions) -> SyncC
 def make_from_callable(
     factory: Callable[..., Environment], name: str, num_envs: int, options: BaseModel
 ) -> SyncCMDPVectorEnv:
-    """B environments of a user's callable, which takes the options as keywords."""
-    return SyncCMDPVectorEnv(name, [functools.partial(factory, **options.model_dump())] * num_envs)
+    """B environments of a user's callable, which takes the options as keywords.
+
+    Raises:
+        ValueError: the callable does not take an option.
+    """
+    keywords = options.model_dump()
+    _check_keywords(factory, name, keywords)
+    return SyncCMDPVectorEnv(name, [functools.partial(factory, **keywords)] * num_envs)
 
 
 def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
@@ -338,6 +346,23 @@ def draw_from_callable(factory: Callable[..., Environment], name: str, options: 
     if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
         keywords["render_mode"] = "rgb_array"
     return factory(**keywords)
+
+
+def _check_keywords(factory: Callable[..., Environment], name: str, keywords: Mapping[str, Any]) -> None:
+    """Check that a callable takes the keywords; its signature has the known ones."""
+    try:
+        parameters = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError):  # a callable without a signature
+        return
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return
+    known = [each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
+    for key in keywords:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            options = f"its options: {', '.join(known)}" if known else "it has no options"
+            raise ValueError(f"{name} takes no option {key!r}{hint} ({options})")
 
 
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -3,7 +3,8 @@
     gymnasium.make("recrl.environments.registration:recrl/CarGoal2-v0")
 
 Gymnasium imports the module before the colon, which registers all tasks. The tasks themselves are imported
-when one of them is made.
+when one of them is made. The name of this module is part of every id, in users' code and in grids, so it must
+not change. ``registry.py`` beside it has the tasks by the names that a grid uses.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A name is one of ``TASKS``, an entry point in the group ``recrl.tasks``, or an i
 ``package.module:attribute``. The last two refer to a ``Task`` or to a callable. A callable takes the task's
 options as keywords and returns one scalar Gymnasium environment with ``info["cost"]``.
 
-A task's module is imported only when that task is requested.
+The module that simulates a task is imported only when that task is requested.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from pydantic import BaseModel, ConfigDict
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.plugins import load_attribute, resolve
+from recrl.environments.safety_gym.tasks import SAFETY_TASKS
 from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.velocity.tasks import VELOCITY_TASKS
 
 if TYPE_CHECKING:
     import gymnasium
@@ -56,68 +58,57 @@ SAFETY_GYM = {
     "Button": "touches the right one of four buttons",
     "Push": "pushes a box to one goal after another",
 }
-VELOCITY = {
-    "Ant": 2.6222,
-    "HalfCheetah": 3.2096,
-    "Hopper": 0.7402,
-    "Humanoid": 1.4149,
-    "Swimmer": 0.2282,
-    "Walker2d": 2.3415,
-}
 OBSTACLES = ("", ", past a few obstacles", ", past many obstacles")
 
+
+def _two_state(costs: str) -> Task:
+    module = "recrl.environments.finite.two_state"
+    return Task(
+        summary=f"A camp and a mine, {costs}, closed-form optimum: for testing learners.",
+        options=f"{module}:TwoStateOptions",
+        make=f"{module}:make_two_state",
+        optimum=f"{module}:two_state_optimum",
+        sample_options={"arrival": 0.5},
+    )
+
+
+def _river_grid(summary: str, options: str = "RiverGridOptions", **sample: Any) -> Task:
+    module = "recrl.environments.rivergrid.grid_world"
+    return Task(
+        summary=summary,
+        options=f"{module}:{options}",
+        make=f"{module}:make_river_grid",
+        optimum=f"{module}:river_grid_optimum",
+        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
+        sample_options={"horizon": 20, **sample},
+    )
+
+
 TASKS: dict[str, Task] = {
-    "two-state": Task(
-        summary="A camp and a mine, one cost, closed-form optimum: for testing learners.",
-        options="recrl.environments.finite.two_state:TwoStateOptions",
-        make="recrl.environments.finite.two_state:make_two_state",
-        optimum="recrl.environments.finite.two_state:two_state_optimum",
-        sample_options={"arrival": 0.5},
-    ),
-    "two-state-2": Task(
-        summary="A camp and a mine, two costs, closed-form optimum: for testing learners.",
-        options="recrl.environments.finite.two_state:TwoStateOptions",
-        make="recrl.environments.finite.two_state:make_two_state",
-        optimum="recrl.environments.finite.two_state:two_state_optimum",
-        sample_options={"arrival": 0.5},
-    ),
+    "two-state": _two_state("one cost"),
+    "two-state-2": _two_state("two costs"),
     "continuous-bandit": Task(
         summary="One continuous action, one cost, closed-form optimum: for testing Gaussian policies.",
         options="recrl.environments.continuous_bandit:ContinuousBanditOptions",
         make="recrl.environments.continuous_bandit:make_continuous_bandit",
         optimum="recrl.environments.continuous_bandit:continuous_bandit_optimum",
     ),
-    "rivergrid-1a": Task(
-        summary="The paper's RiverGrid 1a: the goal is only reached through the river, at a cost of 5.",
-        options="recrl.environments.rivergrid.grid_world:RiverGridOptions",
-        make="recrl.environments.rivergrid.grid_world:make_river_grid",
-        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
-        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
-        sample_options={"horizon": 20, "costs": ("river", "turns")},
+    "rivergrid-1a": _river_grid(
+        "The paper's RiverGrid 1a: the goal is only reached through the river, at a cost of 5.",
+        costs=("river", "turns"),
     ),
-    "rivergrid-1b": Task(
-        summary="The paper's RiverGrid 1b: through the river at a cost of 5, or round it at a cost of 0.",
-        options="recrl.environments.rivergrid.grid_world:RiverGridOptions",
-        make="recrl.environments.rivergrid.grid_world:make_river_grid",
-        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
-        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
-        sample_options={"horizon": 20},
+    "rivergrid-1b": _river_grid(
+        "The paper's RiverGrid 1b: through the river at a cost of 5, or round it at a cost of 0."
     ),
-    "rivergrid": Task(
-        summary="RiverGrid on a map of your own or on a random solvable one.",
-        options="recrl.environments.rivergrid.grid_world:RiverGridMapOptions",
-        make="recrl.environments.rivergrid.grid_world:make_river_grid",
-        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
-        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
-        sample_options={"horizon": 20, "generate": {"seed": 3}},
+    "rivergrid": _river_grid(
+        "RiverGrid on a map of your own or on a random solvable one.",
+        "RiverGridMapOptions",
+        generate={"seed": 3},
     ),
-    "rivergrid-generated": Task(
-        summary="RiverGrid on a random instance with the properties of the paper's two.",
-        options="recrl.environments.rivergrid.grid_world:RiverGridGeneratedOptions",
-        make="recrl.environments.rivergrid.grid_world:make_river_grid",
-        optimum="recrl.environments.rivergrid.grid_world:river_grid_optimum",
-        drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
-        sample_options={"horizon": 20, "map_seed": 0},
+    "rivergrid-generated": _river_grid(
+        "RiverGrid on a random instance with the properties of the paper's two.",
+        "RiverGridGeneratedOptions",
+        map_seed=0,
     ),
     "gymnasium": Task(
         summary="Any environment that is registered with Gymnasium, by its id.",
@@ -127,26 +118,25 @@ TASKS: dict[str, Task] = {
         sample_options={"id": "CartPole-v1", "costless": True},
     ),
     **{
-        f"{robot}{goal}{level}": Task(
-            summary=f"Safety Gym: the {robot} {what}{OBSTACLES[level]}.",
+        name: Task(
+            summary=f"Safety Gym: the {task.robot} {SAFETY_GYM[task.goal]}{OBSTACLES[task.level]}.",
             options="recrl.environments.safety_gym.environments:SafetyGymOptions",
             make="recrl.environments.safety_gym.environments:make_safety_gym",
             drawn="recrl.environments.safety_gym.environments:draw_safety_gym",
             sample_options={"horizon": 12},
         )
-        for robot in ("Car", "Point")
-        for goal, what in SAFETY_GYM.items()
-        for level in (0, 1, 2)
+        for name, task in SAFETY_TASKS.items()
     },
     **{
-        f"Safety{robot}Velocity": Task(
-            summary=f"Safety-Gymnasium: {robot} runs, at a cost of 1 in each step above {threshold} m/s.",
+        name: Task(
+            summary=f"Safety-Gymnasium: {task.robot} runs, at a cost of 1 in each step "
+            f"above {task.threshold} m/s.",
             options="recrl.environments.velocity.environments:VelocityOptions",
             make="recrl.environments.velocity.environments:make_velocity",
             drawn="recrl.environments.velocity.environments:draw_velocity",
             sample_options={"horizon": 12},
         )
-        for robot, threshold in VELOCITY.items()
+        for name, task in VELOCITY_TASKS.items()
     },
 }
 
@@ -169,15 +159,16 @@ def find_task(name: str) -> Task:
         return found
     if not callable(found):
         raise ValueError(f"task {name!r} must be a Task or return an environment, got {type(found).__name__}")
+    from recrl.environments.gymnasium_adapter import (  # noqa: PLC0415  # only if a task needs it
+        draw_from_callable,
+        make_from_callable,
+    )
+
     return Task(
         summary=f"The environment that {name} returns.",
         options=KeywordOptions,
-        make=functools.partial(
-            load_attribute("recrl.environments.gymnasium_adapter:make_from_callable"), found
-        ),
-        drawn=functools.partial(
-            load_attribute("recrl.environments.gymnasium_adapter:draw_from_callable"), found
-        ),
+        make=functools.partial(make_from_callable, found),
+        drawn=functools.partial(draw_from_callable, found),
     )
 
 

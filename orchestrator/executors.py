@@ -32,7 +32,7 @@ class InlineExecutor:
 
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """See ``Executor.run``."""
-        from recrl.orchestrator.trial.runner import run_recorded  # noqa: PLC0415  (imports torch)
+        from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch)
 
         for spec in specs:
             if stop.is_set():

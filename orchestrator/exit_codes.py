@@ -13,5 +13,5 @@ class ExitCode(IntEnum):
     WRONG_INPUT = 2  # the grid or the arguments are wrong; nothing was started
     BUSY = 3  # another process is running this sweep
     CANNOT_RUN = 4  # Ray, MLflow or the storage could not be started or reached
-    TRIALS_LEFT = 5  # plan --check: a launch would have something to do
+    TRIALS_LEFT = 5  # plan --check: trials are left to run, or come from other code
     STOPPED = 130  # Ctrl-C or SIGTERM; the same command continues

@@ -1,7 +1,7 @@
 """Storage of a sweep: its folder, or an object store of which the folder is a copy.
 
 A launch, its executors and the commands use a ``SweepPlace`` for both. That of an object store is
-``remote.remote_sweep.RemoteSweep``; ``remote.opening`` chooses.
+``remote.remote_sweep.RemoteSweep``; ``sweep_place`` there chooses.
 """
 
 from __future__ import annotations

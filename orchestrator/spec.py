@@ -16,10 +16,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.untrusted import checked_spec
+from recrl.orchestrator.untrusted import ChoiceFile, LimitValues, check_json, file_model
 from recrl.teachers.teacher import TeacherSpec
 
 
@@ -65,6 +67,8 @@ class Choice:
 class TrialSpec:
     """One trial of a sweep.
 
+    The bounds are checked where a spec is read from JSON; a grid has narrower ones.
+
     Attributes:
         task: the CMDP.
         agent: the agent.
@@ -85,12 +89,12 @@ class TrialSpec:
     method: Choice
     train_limits: CostLimits
     deploy_limits: CostLimits
-    train_steps: int
-    deploy_steps: int
-    num_envs: int
-    rollout_steps: int
-    evaluation_episodes: int
-    seed: int
+    train_steps: Annotated[int, Field(ge=1, le=10**13)]
+    deploy_steps: Annotated[int, Field(ge=0, le=10**13)]
+    num_envs: Annotated[int, Field(ge=1, le=10**6)]
+    rollout_steps: Annotated[int, Field(ge=1, le=10**9)]
+    evaluation_episodes: Annotated[int, Field(ge=0, le=10**9)]
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
 
     @property
     def total_steps(self) -> int:
@@ -164,7 +168,9 @@ class TrialSpec:
         Raises:
             ValueError: the values are invalid; the message is one line.
         """
-        value = checked_spec(value)
+        check_json(value, _SPEC_FILE)
+        if len(value["train_limits"]) != len(value["deploy_limits"]):
+            raise ValueError("train_limits and deploy_limits: must have the same length")
         return cls(
             **{
                 **value,
@@ -175,6 +181,9 @@ class TrialSpec:
                 "deploy_limits": CostLimits.from_json(value["deploy_limits"]),
             }
         )
+
+
+_SPEC_FILE = file_model(TrialSpec, {Choice: ChoiceFile, CostLimits: LimitValues})
 
 
 def _digest(value: Mapping[str, Any]) -> str:

@@ -20,11 +20,12 @@ from typing import Protocol
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.executors import Executor
-from recrl.orchestrator.files.provenance import collect
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan, select
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan
+from recrl.orchestrator.grid.selection import select
 from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.provenance.versions import collect
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
 
@@ -36,7 +37,7 @@ REQUEST_SECONDS = 0.5  # between two checks for a stop request
 logger = logging.getLogger("recrl.sweep")
 
 
-class BackgroundSync(Protocol):
+class RunningSync(Protocol):
     """A process that copies the sweep to MLflow while it runs."""
 
     def stop(self, timeout: float) -> bool:
@@ -78,7 +79,7 @@ class LaunchSettings:
         grid: the checked grid.
         place: of the sweep's files.
         executor: runs the trials.
-        only: the selected trials, see ``plan.select``; all by default.
+        only: the selected trials, see ``selection.select``; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again.
         rerun_changed: whether trials that ran other code than is installed now are run again.
@@ -94,7 +95,7 @@ class LaunchSettings:
     retry_failed: bool = False
     rerun_damaged: bool = False
     rerun_changed: bool = False
-    start_sync: Callable[[SweepStore], BackgroundSync] | None = None
+    start_sync: Callable[[SweepStore], RunningSync] | None = None
     watch: Callable[[Plan], None] = lambda plan: None
     finish: Callable[[SweepProgress], None] = lambda after: None
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from recrl.orchestrator.redaction import printable
-from recrl.orchestrator.validation import sentences, shown
+from recrl.orchestrator.validation import as_written, sentences
 
 LONGEST_NAME = 200
 _NAME = re.compile(r"[^\W_.-][^/\\\x00-\x1f]{0,127}")
@@ -30,7 +30,7 @@ def checked_name(value: Any) -> str:
     'demo'
     """
     if not isinstance(value, str) or not _NAME.fullmatch(value) or printable(value) != value:
-        raise ValueError(f"the sweep's name must be a name for a folder, got {shown(value)}")
+        raise ValueError(f"the sweep's name must be a name for a folder, got {as_written(value)}")
     return value
 
 
@@ -48,57 +48,47 @@ def plain_text(text: str) -> str:
 def _limits(values: list[float | str]) -> list[float | str]:
     for value in values:
         if not (value == "inf" or (isinstance(value, float | int) and math.isfinite(value) and value >= 0)):
-            raise ValueError(f"must be numbers of at least 0, or 'inf', got {shown(value)}")
+            raise ValueError(f"must be numbers of at least 0, or 'inf', got {as_written(value)}")
     return values
 
 
 PlainText = Annotated[str, AfterValidator(plain_text)]
 ShortText = Annotated[PlainText, Field(min_length=1, max_length=LONGEST_NAME)]
 LimitValues = Annotated[list[float | str], Field(min_length=1, max_length=64), AfterValidator(_limits)]
-Steps = Annotated[int, Field(ge=0, le=10**13)]
 
 
 class _Written(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 
-class _Choice(_Written):
+class ChoiceFile(_Written):
+    """A task, agent or curriculum as JSON values."""
+
     name: ShortText
     options: dict[str, Any]
     label: ShortText
 
 
-class SpecFile(_Written):
-    """A TrialSpec as JSON values."""
+def file_model(of: type, written: Mapping[Any, Any]) -> type[BaseModel]:
+    """Return the model of a dataclass as JSON values.
 
-    task: _Choice
-    agent: _Choice
-    method: _Choice
-    train_limits: LimitValues
-    deploy_limits: LimitValues
-    train_steps: Annotated[int, Field(ge=1, le=10**13)]
-    deploy_steps: Steps
-    num_envs: Annotated[int, Field(ge=1, le=10**6)]
-    rollout_steps: Annotated[int, Field(ge=1, le=10**9)]
-    evaluation_episodes: Annotated[int, Field(ge=0, le=10**9)]
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    Args:
+        of: the dataclass; its fields' annotations may contain bounds.
+        written: the JSON form of each type of field that is no JSON value itself.
+    """
+    hints = get_type_hints(of, include_extras=True)
+    fields: dict[str, Any] = {name: (written.get(hint, hint), ...) for name, hint in hints.items()}
+    return create_model(f"{of.__name__}File", __base__=_Written, **fields)
 
 
-_SPEC = TypeAdapter(SpecFile)
-
-
-def checked_spec(value: Any) -> Mapping[str, Any]:
-    """Return the unchanged JSON value of a TrialSpec, if it is valid.
+def check_json(value: Any, model: type[BaseModel]) -> None:
+    """Check a JSON value against a model.
 
     Raises:
         ValueError: it is invalid; the message is one line with the first mistake.
     """
     try:
-        _SPEC.validate_python(value)
+        model.model_validate(value)
     except ValidationError as error:
         place, sentence = next(sentences(error, None))
         raise ValueError(f"{'.'.join(map(str, place)) or 'the spec'}: {sentence}") from error
-    if len(value["train_limits"]) != len(value["deploy_limits"]):
-        raise ValueError("train_limits and deploy_limits: must have the same length")
-    checked: Mapping[str, Any] = value
-    return checked

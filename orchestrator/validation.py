@@ -61,7 +61,7 @@ def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator
         if kind == "extra_forbidden":
             yield place, _unknown_key(str(place[-1]), known_keys(model, place[:-1]))
             continue
-        values = {**item.get("ctx", {}), "given": shown(item["input"])}
+        values = {**item.get("ctx", {}), "given": as_written(item["input"])}
         if kind in _SENTENCES:
             yield place, _SENTENCES[kind].format(**values)
         else:
@@ -78,7 +78,7 @@ def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
     return list(model.model_fields) if model else []
 
 
-def shown(value: Any) -> str:
+def as_written(value: Any) -> str:
     """Return a value as the user wrote it, cut to a readable length."""
     try:
         text = json.dumps(value, ensure_ascii=False)

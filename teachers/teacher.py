@@ -11,8 +11,9 @@ steps / B in [0, 1] the progress, k the number of costs.
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -110,7 +111,8 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
         num_costs: k.
 
     Raises:
-        TypeError: it is not a pair of a CurriculumStep and a mapping.
+        TypeError: it is not a pair of a CurriculumStep and a mapping, or the mapping has other values than
+            JSON.
         ValueError: the number of its limits is not that of the costs.
     """
     match answer:
@@ -120,6 +122,8 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
                     f"curriculum {curriculum}: a step must have one limit per cost, {num_costs}, "
                     f"got {len(step.limits)}"
                 )
+            if problem := _not_json(dict(state), "state"):
+                raise TypeError(f"curriculum {curriculum}: {problem}; a state holds JSON values only")
             return step, state
     got = (
         ", ".join(type(one).__name__ for one in answer)
@@ -129,6 +133,77 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
     raise TypeError(
         f"curriculum {curriculum}: must return a CurriculumStep and its state, a mapping, got {got}"
     )
+
+
+def _not_json(value: object, path: str) -> str:
+    """Describe the first part of a state that is no JSON value; empty if there is none.
+
+    Tuples are not allowed: a checkpoint gives back a list. Infinite numbers are, because checkpoints keep
+    them.
+
+    >>> _not_json({"update": 1, "seen": {3}}, "state")
+    "state['seen'] is a set"
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return ""
+    if isinstance(value, list):
+        parts = ((f"{path}[{index}]", part) for index, part in enumerate(value))
+    elif isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str):
+                return f"{path} has the key {key!r}, {_with_article(key)}, and keys must be text"
+        parts = ((f"{path}[{key!r}]", part) for key, part in value.items())
+    else:
+        return f"{path} is {_with_article(value)}"
+    return next((problem for name, part in parts if (problem := _not_json(part, name))), "")
+
+
+def _with_article(value: object) -> str:
+    kind = type(value).__name__
+    return f"an {kind}" if kind[0].lower() in "aeiou" or kind == "ndarray" else f"a {kind}"
+
+
+def check_limits_fall(
+    step: CurriculumStep,
+    before: CostLimits | None,
+    train_limits: CostLimits,
+    *,
+    curriculum: str,
+    cost_names: Sequence[str],
+    update: int,
+) -> None:
+    """Check that no limit of a step has risen, and that no finite limit is above d_t.
+
+    An infinite limit may start above a finite d_t: it constrains nothing, as in the control
+    ``unconstrained``. Differences by rounding are allowed.
+
+    Args:
+        step: the step to be checked.
+        before: the limits before it, [k]; None for the first step.
+        train_limits: d_t, [k].
+        curriculum: its label, for the error.
+        cost_names: of the task, [k].
+        update: the last policy update before the step; 0 for the first step.
+
+    Raises:
+        ValueError: a limit has risen, or is above d_t.
+    """
+    when = f"after update {update}" if update else "at the start"
+    for i, (name, limit, highest) in enumerate(zip(cost_names, step.limits, train_limits, strict=True)):
+        if before is not None and _exceeds(limit, before[i]):
+            raise ValueError(
+                f"curriculum {curriculum}: the limit of {name} rose from {before[i]:g} to {limit:g} {when}; "
+                "limits may only fall"
+            )
+        if math.isfinite(limit) and _exceeds(limit, highest):
+            raise ValueError(
+                f"curriculum {curriculum}: the limit of {name} is {limit:g} {when}, above its train_limits "
+                f"of {highest:g}; limits may only fall"
+            )
+
+
+def _exceeds(limit: float, other: float) -> bool:
+    return limit > other and not math.isclose(limit, other, rel_tol=1e-9, abs_tol=1e-9)
 
 
 # The rest is common to the teachers of this package. Their states hold at least ``update``, the last update

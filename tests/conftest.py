@@ -18,7 +18,7 @@ from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
 
 STEPS_PER_UPDATE = 400

@@ -30,8 +30,9 @@ from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.learning.surrogates import surrogate
 from recrl.agents.shared_options import TrustRegionConfig
+from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
-from recrl.agents.trust_region.line_search import conjugate_gradient, line_search
+from recrl.agents.trust_region.line_search import line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 NAN = float("nan")

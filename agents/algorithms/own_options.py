@@ -22,16 +22,19 @@ from recrl.agents.shared_options import (
     TrustRegionConfig,
 )
 
+ClipRange = Annotated[
+    float, Field(gt=0.0, lt=1.0, description="Clip range of the probability ratio: 1 +- clip (paper).")
+]
+EntropyBonus = Annotated[
+    NonNegative, Field(description="Weight of the mean entropy, nats, in the objective (paper: none).")
+]
+
 
 class PPOConfig(AscentConfig):
     """Settings of ``ppo``, an agent without constraints."""
 
-    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
-    )
-    entropy_bonus: NonNegative = Field(
-        default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
-    )
+    clip: ClipRange = 0.2
+    entropy_bonus: EntropyBonus = 0.0
 
 
 class PPOLagConfig(LagrangianConfig, AscentConfig):
@@ -44,12 +47,8 @@ class PPOLagConfig(LagrangianConfig, AscentConfig):
         "penalty": "separate",
     }
 
-    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
-    )
-    entropy_bonus: NonNegative = Field(
-        default=0.0, description="Weight of the mean entropy, nats, in the objective (paper: none)."
-    )
+    clip: ClipRange = 0.2
+    entropy_bonus: EntropyBonus = 0.0
     penalty: Literal["combined", "separate"] = Field(
         default="combined",
         description="Clip the surrogate of the whole Lagrangian (combined, ours) or of the reward "
@@ -93,9 +92,7 @@ class FOCOPSConfig(LagrangianConfig, AscentConfig):
 class P3OConfig(AscentConfig):
     """Settings of ``p3o``, penalised proximal policy optimisation."""
 
-    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
-    )
+    clip: ClipRange = 0.2
     penalty_factor: Positive = Field(
         default=20.0,
         description="kappa, reward per unit of cost; must exceed every multiplier of the task "
@@ -113,9 +110,7 @@ class IPOConfig(AscentConfig):
         "cost_surrogate": "plain",
     }
 
-    clip: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.2, description="Clip range of the probability ratio: 1 +- clip (paper)."
-    )
+    clip: ClipRange = 0.2
     barrier_sharpness: Positive = Field(
         default=2000.0,
         description="t of the barrier log(slack) / t. At the optimum each binding constraint "

@@ -22,7 +22,8 @@ from recrl.agents.learning.advantages import scaled_advantages
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.shared_options import TrustRegionConfig
-from recrl.agents.trust_region.line_search import conjugate_gradient, line_search
+from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
+from recrl.agents.trust_region.line_search import line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,42 @@ def standard_errors(costs: Floats) -> Floats:
     return errors
 
 
+def cost_of_steps(costs: Floats, episode_length: float) -> tuple[Floats, Floats]:
+    """Estimate the mean episode cost from steps: the mean cost per step times the mean episode length.
+
+    The environments are at different stages of their episodes, so their steps are a sample of whole episodes
+    under the current policy. Episodes that finish in a rollout shorter than they are were begun many updates
+    ago.
+
+    Args:
+        costs: of each step, [T, B, k].
+        episode_length: mean number of steps of an episode.
+
+    Returns:
+        The estimate and its standard error over the B environments, [k] each; the error is 0 if B is 1.
+
+    >>> cost_of_steps(np.array([[[0.0], [1.0]], [[0.0], [1.0]]]), 10.0)
+    (array([5.]), array([5.]))
+    """
+    of_environments = episode_length * costs.mean(axis=0)
+    return of_environments.mean(axis=0), standard_errors(of_environments)
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Episodes that finished lately.
+
+    Attributes:
+        costs: undiscounted, [E, k].
+        lengths: steps, [E].
+        finished: number of them that finished in the newest update, at most E.
+    """
+
+    costs: Floats
+    lengths: npt.NDArray[np.int64]
+    finished: int
+
+
 class RecentEpisodes:
     """Window of the last finished episodes: of the newest update, and of earlier ones until it is full.
 
@@ -121,24 +158,19 @@ class RecentEpisodes:
         self._updates: list[tuple[Floats, npt.NDArray[np.int64]]] = []
         self._nothing = np.empty((0, num_costs)), np.empty(0, np.int64)
 
-    def add(self, costs: Floats, lengths: npt.NDArray[np.int64]) -> tuple[Floats, npt.NDArray[np.int64]]:
+    def add(self, costs: Floats, lengths: npt.NDArray[np.int64]) -> Episodes:
         """Include the episodes that finished in an update, and return those of the window.
 
         Args:
-            costs: undiscounted, [E, k].
-            lengths: steps, [E].
-
-        Returns:
-            Costs and lengths of all episodes of the window; empty if E is 0, since then nothing is new.
+            costs: undiscounted, [F, k].
+            lengths: steps, [F].
         """
-        if not len(costs):
-            return self._nothing
-        self._updates.append((costs, lengths))
+        if len(costs):
+            self._updates.append((costs, lengths))
         while sum(len(each) for each, _ in self._updates[1:]) >= self._window:
             del self._updates[0]
-        return np.concatenate([each for each, _ in self._updates]), np.concatenate(
-            [each for _, each in self._updates]
-        )
+        state = self.state_dict()
+        return Episodes(state["costs"], state["lengths"], len(costs))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the window's episodes, and the number of episodes of each of its updates."""
@@ -156,16 +188,52 @@ class RecentEpisodes:
         self._updates = list(zip(costs, lengths, strict=True)) if len(state["episodes"]) else []
 
 
-class MeanCost:
-    """Constraint on the mean episode cost; it has no state."""
+@dataclass(frozen=True, eq=False)
+class MeasuredCosts:
+    """What an agent constrains after a rollout.
 
-    def constraint_costs(
-        self, rollout: Rollout, episode_costs: Floats, limits: Floats
-    ) -> tuple[Floats, Floats]:
-        """See ``TailCost.constraint_costs``."""
-        if not len(episode_costs):
-            return rollout.costs, np.full(rollout.costs.shape[2], np.nan)
-        return rollout.costs, episode_costs.mean(axis=0)
+    Attributes:
+        step_costs: per step, whose sums over an episode are constrained, [T, B, k].
+        values: for comparison with the limits, [k]; NaN if unknown.
+        standard_errors: of the mean episode costs, [k], at least 0.
+    """
+
+    step_costs: Floats
+    values: Floats
+    standard_errors: Floats
+
+
+class MeanCost:
+    """Constraint on the mean episode cost; it has no state.
+
+    Args:
+        window: the least number of episodes for an estimate.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._window = window
+
+    def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
+        """Estimate the mean cost, preferably from what the current policy did.
+
+        That is the mean of the episodes that finished in the rollout, if there are as many as the window
+        needs. Else it is the cost of the rollout's steps (``cost_of_steps``), if they belong to as many
+        episodes. Else the window includes episodes of earlier updates. If no episode finished, the last is
+        unknown.
+
+        Args:
+            rollout: the steps.
+            episodes: of the window.
+            limits: d, [k], possibly infinite; the mean does not need them.
+        """
+        enough_environments = rollout.costs.shape[1] >= self._window
+        if episodes.finished < self._window and enough_environments and len(episodes.lengths):
+            values, errors = cost_of_steps(rollout.costs, float(episodes.lengths.mean()))
+        elif episodes.finished:
+            values, errors = episodes.costs.mean(axis=0), standard_errors(episodes.costs)
+        else:
+            values, errors = np.full_like(limits, np.nan), np.zeros_like(limits)
+        return MeasuredCosts(rollout.costs, values, errors)
 
     def state_dict(self) -> dict[str, Any]:
         """Return an empty state."""
@@ -187,27 +255,22 @@ class TailCost:
         self._level = level
         self._value_at_risk = np.zeros(num_costs)
 
-    def constraint_costs(
-        self, rollout: Rollout, episode_costs: Floats, limits: Floats
-    ) -> tuple[Floats, Floats]:
-        """Return the costs to learn from, and the values to compare with the limits.
+    def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
+        """Return the tail costs, and the CVaR if it is within the limit, else a bound on it.
+
+        If no episode finished, the value at risk does not change and the CVaR is unknown.
 
         Args:
             rollout: the steps.
-            episode_costs: of the last finished episodes, [E, k]; with E = 0 the value at risk does not
-                change.
+            episodes: of the window.
             limits: d, [k], possibly infinite.
-
-        Returns:
-            Costs per step whose sums are constrained, [T, B, k]; and the values for comparison, [k]: the CVaR
-            if it is within the limit, else a bound on it; NaN if no episode finished.
         """
         values = np.full_like(limits, np.nan)
-        if len(episode_costs):
-            self._value_at_risk = value_at_risk(episode_costs, self._level)
+        if episodes.finished:
+            self._value_at_risk = value_at_risk(episodes.costs, self._level)
         threshold = np.minimum(self._value_at_risk, limits)
-        if len(episode_costs):
-            values = tail_bound(episode_costs, threshold, self._level)
+        if episodes.finished:
+            values = tail_bound(episodes.costs, threshold, self._level)
         costs = tail_costs(
             rollout.costs,
             carried=rollout.carried_costs,
@@ -215,7 +278,7 @@ class TailCost:
             threshold=threshold,
             level=self._level,
         )
-        return costs, values
+        return MeasuredCosts(costs, values, standard_errors(episodes.costs))
 
     def state_dict(self) -> dict[str, Any]:
         """The value at risk, [k]."""

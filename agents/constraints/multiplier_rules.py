@@ -118,21 +118,21 @@ def pid(
     """Take a step of a PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
 
     I <- clip(I + K_I min(gap, largest), 0, maximum);
-    lambda = clip(K_P gap + I + K_D max(0, gap - last gap), 0, maximum).
+    lambda = clip(K_P min(gap, largest) + I + K_D max(0, gap - last gap), 0, maximum).
 
     The derivative acts only on growing violations, as in the source. The integral is clipped to the
     multiplier's range, so that neither a long satisfied nor a long infeasible constraint winds it up. It
     includes the gain K_I, so that changing K_I does not make lambda jump.
 
-    The gap in the integral is bounded, too. An episode costs at least 0, so the gap is at least -d, but an
-    untrained policy may exceed the limit by any amount. Ten updates with a cost of 50 under a limit of 1
-    would add more than 400 later ones can subtract. So a violation counts no more than the largest possible
-    slack.
+    The gap is bounded, too. An episode costs at least 0, so the gap is at least -d, but an untrained policy
+    may exceed the limit by any amount. Ten updates with a cost of 50 under a limit of 1 would add more to the
+    integral than 400 later ones can subtract. A proportional term without bound would stop all learning of
+    rewards until the limit is nearly kept. So a violation counts no more than the largest possible slack.
 
     Args:
         state: ``multipliers``, ``integral``, ``last_gap``.
         gaps: J - d in any unit, [k]; -inf where there is no constraint.
-        largest: the largest violation in the integral, in that unit, one number or [k].
+        largest: the largest violation that counts, in that unit, one number or [k].
         proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k]; likewise the
             next two.
         integral: K_I.
@@ -142,8 +142,9 @@ def pid(
     active = np.isfinite(gaps)
     gap = np.where(active, gaps, 0.0)
     rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
-    summed = np.clip(state["integral"] + integral * np.minimum(gap, largest), 0.0, maximum)
-    output = np.clip(proportional * gap + summed + derivative * rise, 0.0, maximum)
+    bounded = np.minimum(gap, largest)
+    summed = np.clip(state["integral"] + integral * bounded, 0.0, maximum)
+    output = np.clip(proportional * bounded + summed + derivative * rise, 0.0, maximum)
     return {
         "multipliers": np.where(active, output, 0.0),
         "integral": np.where(active, summed, state["integral"]),

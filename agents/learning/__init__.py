@@ -1,1 +1,1 @@
-"""Common parts of all algorithms: actor and critics, networks, policies, advantages, batches, surrogates."""
+"""Common parts of all algorithms: actor and critics, policies, advantages, batches, surrogates."""

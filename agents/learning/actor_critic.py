@@ -25,7 +25,6 @@ from torch import Tensor
 
 from recrl.agents.agent import Rollout
 from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, TailCost
-from recrl.agents.encoding import Encoder
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import generalised_advantages, next_values
@@ -33,10 +32,12 @@ from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.estimates import Estimates, row_targets
 from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
-from recrl.agents.learning.networks import INITIALISERS, Adam, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
 from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
+from recrl.agents.networks.flat_parameters import Adam
+from recrl.agents.observation_features import Encoder
 from recrl.agents.shared_options import ActorCriticConfig
 from recrl.agents.spaces import observation_size, unbounded_numbers
 from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
@@ -83,8 +84,10 @@ class ActorCritic:
         self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
-        self._form = (
-            TailCost(config.cvar_level, cmdp.num_costs) if config.constraint == "cvar" else MeanCost()
+        self._measure = (
+            TailCost(config.cvar_level, cmdp.num_costs)
+            if config.constraint == "cvar"
+            else MeanCost(config.constraint_window)
         )
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,
@@ -92,7 +95,7 @@ class ActorCritic:
             "critic_optimiser": self._critic_optimiser,
             "value_scale": self._value_scale,
             "recent_episodes": self._recent,
-            "constraint": self._form,
+            "constraint": self._measure,
             **rule.parts,
         }
 
@@ -140,11 +143,11 @@ class ActorCritic:
             compact=config.compaction,
             most_observations=config.minibatch_size,
         )
-        recent_costs, lengths = self._recent.add(episode_costs, rollout.finished_lengths())
-        costs, constrained = self._form.constraint_costs(rollout, recent_costs, limits)
-        estimates = self._estimate(rollout, costs, batch)
+        episodes = self._recent.add(episode_costs, rollout.finished_lengths())
+        measured = self._measure.measure(rollout, episodes, limits)
+        estimates = self._estimate(rollout, measured.step_costs, batch)
         advantages = estimates.advantages
-        constraints = Constraints.measure(recent_costs, lengths, constrained, limits)
+        constraints = Constraints.of(measured, episodes.lengths, limits)
         experience = Experience.of(self._policy, batch, advantages, constraints)
         if step.entropy_coefficient:
             experience = experience.with_entropy(step.entropy_coefficient)

@@ -10,8 +10,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.learning.networks import NetworkForm, blocks
-from recrl.agents.learning.stacks import make_stack
+from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.network_stack import make_stack
+from recrl.agents.networks.tanh_stack import blocks
 
 
 class Critics:
@@ -28,7 +29,7 @@ class Critics:
         self, num_observations: int, num_costs: int, form: NetworkForm, generator: torch.Generator
     ) -> None:
         self.parameters, self._stack = make_stack(
-            form, 1 + num_costs, num_observations, 1, last_scale=1.0, generator=generator
+            form, 1 + num_costs, num_observations, 1, last_scale=1.0, generator=generator, role="critic"
         )
 
     def values(self, rows: Tensor) -> npt.NDArray[np.float64]:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recrl.agents.encoding import Encoder
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.observation_features import Encoder
 from recrl.agents.policy_module import PolicyModule
 from recrl.environments.cmdp import Floats
 

@@ -22,9 +22,9 @@ from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Distribution, mean_divergence
-from recrl.agents.learning.networks import Adam
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful
+from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.shared_options import AscentConfig
 
 # An objective: a differentiable scalar of the policy's distributions at the rows of some samples, and of the

@@ -22,9 +22,10 @@ from torch import Tensor
 
 from recrl.agents.learning.batch import find_repeated
 from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
-from recrl.agents.learning.networks import NetworkForm, Scratch, TanhStack, blocks
 from recrl.agents.learning.noise import matching_log_std, matching_scale, off_greedy_mass
-from recrl.agents.learning.stacks import make_stack
+from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.network_stack import make_stack
+from recrl.agents.networks.tanh_stack import Scratch, TanhStack, blocks
 from recrl.agents.spaces import action_size
 from recrl.environments.cmdp import Floats
 
@@ -69,6 +70,7 @@ class StochasticPolicy:
             num_outputs,
             last_scale=last_scale,
             generator=generator,
+            role="policy",
             others=[] if self.is_categorical else [(num_outputs,)],
         )
         if isinstance(action_space, Box):

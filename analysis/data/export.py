@@ -39,9 +39,9 @@ from recrl.analysis.data.sweep_data import (
 from recrl.environments.registry import TASKS, task_options
 from recrl.orchestrator.errors import DamagedError, RecrlError, missing
 from recrl.orchestrator.files.archives import UNREADABLE, unpacked
+from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.row_files import Extent
-from recrl.orchestrator.files.small_files import write_atomically
-from recrl.orchestrator.files.trial_tables import EVALUATION_COLUMNS, UPDATE_COLUMNS
+from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.untrusted import LimitValues, checked_name
 from recrl.orchestrator.validation import sentences

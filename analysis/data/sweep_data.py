@@ -17,9 +17,9 @@ that a task lacks are NaN. All returns and costs are undiscounted sums over an e
                  KEY, phase, episodes, steps, episode_return and cost_i (means), episode_return_std and
                  cost_i_std (over episodes, NaN for one), cost_i_total, excess_i_total: the sum of
                  max(0, C_i - d_d,i), the cost above the deployment limit
-    updates      one row per policy update: KEY, store.UPDATE_COLUMNS, cost_i, limit_i (in force when the
+    updates      one row per policy update: KEY, UPDATE_COLUMNS, cost_i, limit_i (in force when the
                  batch was collected), then the agents' own metrics
-    evaluations  one row per episode of the final policy: KEY, store.EVALUATION_COLUMNS, cost_i
+    evaluations  one row per episode of the final policy: KEY, EVALUATION_COLUMNS, cost_i
     events       one row per event: KEY, update, end_step, event
     policies     one row per state of a finite task: KEY, state, action_j, the final policy's pi(j | state)
 
@@ -51,8 +51,8 @@ from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.files.trial_tables import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.phase_totals import phase_totals
 from recrl.orchestrator.untrusted import checked_name
@@ -212,7 +212,7 @@ def load(store: SweepStore) -> Sweep:
 def load_episodes(
     store: SweepStore, *, columns: Sequence[str] | None = None, phase: Phase | None = None
 ) -> pd.DataFrame:
-    """Read all episodes: KEY, store.EPISODE_COLUMNS, cost_i, limit_i; one row per episode.
+    """Read all episodes: KEY, EPISODE_COLUMNS, cost_i, limit_i; one row per episode.
 
     Args:
         store: the sweep's folder.

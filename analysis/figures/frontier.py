@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.labels import occurring
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
@@ -64,7 +65,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
                     axes.axvline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED)
                     axes.axvspan(limit, far, **panels.INFEASIBLE)
                 axes.set_title(f"{task}, {agent}", loc="left", pad=3.0)
-                axes.set_xlabel("episode cost" if sweep.num_costs == 1 else f"episode cost {i + 1}")
+                axes.set_xlabel(f"episode cost{cost_suffix(sweep, i, task)}")
             line[0].set_ylabel("return")
         present = [method for method in look if (rows["method"] == method).any()]
         _legend(figure, look, present)
@@ -178,5 +179,5 @@ def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str]) ->
         ncols=min(len(handles), panels.METHODS_A_LINE),
         columnspacing=1.2,
         handletextpad=0.5,
-        title="final policies, one mark per run: filled if feasible, hollow if not (at the right edge: beyond)",
+        title="final policies, one mark per run: filled if feasible, hollow if not (at the edge: beyond)",
     )

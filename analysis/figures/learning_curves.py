@@ -17,23 +17,24 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.labels import occurring
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.curves import MEAN, Averaging, mean_curve, step_grid
-from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
+from recrl.analysis.statistics.curves import MEAN, CurveAverage, mean_curve, step_grid
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
 
 BINS = 100
 DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
 LEAST_SHOWN = 0.2  # of a limit, above and below it
-LEAST_SHOWN_RETURN = 2.0 * OPTIMAL_GAP  # above and below J*(d_d)
+LEAST_SHOWN_RETURN = 2.0 * SOLVED_GAP  # above and below J*(d_d)
 WORTH_MARKING = 0.03  # of a trial: shorter periods of infinite limits (the measurement of d_t) are not marked
 
 
-def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) -> Figure:
+def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN) -> Figure:
     """Draw the paper's Figures 3 and 4: one row per task, return and cost over training and deployment.
 
     Args:
@@ -47,6 +48,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) ->
     num_costs = int(trials["num_costs"].max())
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     columns = 2 + 2 * num_costs
+    suffixes = [cost_suffix(sweep, i) for i in range(num_costs)]
     with styles.context():
         figure = Figure(
             figsize=(TEXT_WIDTH * max(1.0, columns / 4), ROW_HEIGHT * len(tasks) + 1.1), layout="constrained"
@@ -62,7 +64,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: Averaging = MEAN) ->
                 look,
                 averaging=averaging,
             )
-        for axes, title in zip(grid[0], _column_titles(num_costs), strict=True):
+        for axes, title in zip(grid[0], _column_titles(suffixes), strict=True):
             axes.set_title(title)
         for axes in grid[-1]:
             axes.set_xlabel("environment steps")
@@ -108,7 +110,8 @@ def curricula(sweep: Sweep) -> Figure:
             row[0].set_ylim(bottom=0.0)
             limits = sweep.trials.loc[sweep.trials["task"] == task, f"deploy_limit_{i}"]
             _shade(list(row), float(limits.iloc[0]))
-            row[0].set_ylabel("cost limit" if sweep.num_costs == 1 else f"limit of cost {i + 1}")
+            suffix = cost_suffix(sweep, i, task)
+            row[0].set_ylabel(f"limit of cost{suffix}" if suffix else "cost limit")
         for axes, agent in zip(grid[0], agents, strict=True):
             axes.set_title(f"{agent}\n{axes.get_title(loc='left')}", loc="left", pad=3.0)
         for axes in grid[-1]:
@@ -130,7 +133,7 @@ def _task_row(
     updates: pd.DataFrame,
     look: dict[str, MethodStyle],
     *,
-    averaging: Averaging,
+    averaging: CurveAverage,
 ) -> None:
     """Draw one task's panels: return, return in deployment, then the same for each cost."""
     boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
@@ -184,7 +187,7 @@ def _curves(
     edges: Floats,
     look: dict[str, MethodStyle],
     *,
-    averaging: Averaging,
+    averaging: CurveAverage,
 ) -> None:
     """Draw every method's line with its band; markers are staggered so that equal lines remain visible."""
     for position, (method, style) in enumerate(look.items()):
@@ -231,10 +234,10 @@ def _curriculum_panel(
     panels.phase_boundary(axes, boundary, total)
 
 
-def _column_titles(num_costs: int) -> list[str]:
+def _column_titles(suffixes: Sequence[str]) -> list[str]:
     titles = ["return", "return in deployment"]
-    for i in range(num_costs):
-        name = "episode cost" if num_costs == 1 else f"episode cost {i + 1}"
+    for suffix in suffixes:
+        name = f"episode cost{suffix}"
         titles += [name, f"{name.removeprefix('episode ')} in deployment"]
     return titles
 

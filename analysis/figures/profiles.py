@@ -18,9 +18,9 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.styles import OPTIMUM_COLOUR, TEXT_WIDTH
 from recrl.analysis.statistics import metrics
-from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
 from recrl.analysis.statistics.intervals import performance_profile
 from recrl.analysis.statistics.metrics import Measure
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
 
 THRESHOLDS = 400
@@ -87,5 +87,5 @@ def _thresholds(rows: pd.DataFrame) -> Floats:
     shown = rows[rows["feasible"]] if rows["feasible"].any() else rows
     values = np.concatenate([shown["episode_return"], rows["optimal_return"]])
     values = values[np.isfinite(values)]
-    room = max(0.05 * float(values.max() - values.min()), OPTIMAL_GAP)
+    room = max(0.05 * float(values.max() - values.min()), SOLVED_GAP)
     return np.linspace(values.min() - room, values.max() + room, THRESHOLDS)

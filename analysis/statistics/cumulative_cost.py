@@ -48,7 +48,7 @@ import pandas as pd
 from recrl.analysis.data.exact_values import finite_model
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report_tables import number
+from recrl.analysis.report.table_formats import number
 from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.report_tables import number
+from recrl.analysis.report.table_formats import number
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.trial_store import TrialStore

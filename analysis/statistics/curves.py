@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from recrl.analysis.statistics.feasibility import is_cost
 from recrl.analysis.statistics.intervals import CONFIDENCE, ENOUGH_RUNS, interquartile_mean
+from recrl.analysis.statistics.verdicts import is_cost
 from recrl.environments.cmdp import Floats
 
 BAND_REPLICATIONS = 500  # a band has a hundred intervals
@@ -37,7 +37,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Averaging:
+class CurveAverage:
     """Method that turns several runs into a line with a band.
 
     Attributes:
@@ -154,16 +154,16 @@ def interquartile_curve(
     return Curve(_centres(edges), centre, low, high, present.sum(axis=0).astype(np.int64))
 
 
-MEAN = Averaging("mean ± standard error over seeds", mean_curve)
+MEAN = CurveAverage("mean ± standard error over seeds", mean_curve)
 
 
-def interquartile(generator: np.random.Generator) -> Averaging:
+def interquartile(generator: np.random.Generator) -> CurveAverage:
     """Interquartile means with bootstrap bands.
 
     Args:
         generator: draws the resamples.
     """
-    return Averaging(
+    return CurveAverage(
         "interquartile mean and its 95% bootstrap band over seeds",
         lambda updates, column, edges: interquartile_curve(updates, column, edges, generator),
         ENOUGH_RUNS,

@@ -4,7 +4,7 @@ A trial's outcome has three separate measures (``Measure``). Learning goes on in
 phase averages over policies. The final policy is the result of training. Its values are exact if the task is
 finite and its table was recorded; otherwise they are means over episodes.
 
-``recrl.analysis.statistics.feasibility`` defines feasible and solved.
+``recrl.analysis.statistics.verdicts`` defines feasible and solved.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.statistics.feasibility import costs_of, is_cost, optimal, tie, within_limits
 from recrl.analysis.statistics.intervals import (
     Interval,
     improvement_interval,
@@ -27,6 +26,7 @@ from recrl.analysis.statistics.intervals import (
     stratified_bootstrap,
     wilson_interval,
 )
+from recrl.analysis.statistics.verdicts import costs_of, is_cost, solved, tie, within_limits
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialState
 
@@ -70,7 +70,7 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
         {i: rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"] for i in costs_of(rows)}
     ).max(axis=1)
     rows["feasible"] = within_limits(rows)
-    rows["optimal"] = optimal(rows)
+    rows["optimal"] = solved(rows)
     order = {measure.value: position for position, measure in enumerate(Measure)}
     by_measure = rows["measure"].map(order).rename("_order")
     rows = rows.assign(_order=by_measure).sort_values([*KEY, "_order"], kind="stable", ignore_index=True)
@@ -172,7 +172,7 @@ def comparisons(
         GROUP, measure, pairs (seeds that both have), then mean paired differences to the baseline with
         Student's 95% interval: return_difference, _low, _high, and the same for cost_i_difference; then
         improvement, the probability that a run returns more than a run of the baseline (ties count half:
-        ``feasibility.tie``), with its bootstrap interval _low, _high; and too_few_seeds (that interval is
+        ``verdicts.tie``), with its bootstrap interval _low, _high; and too_few_seeds (that interval is
         then too short).
     """
     costs = [str(name) for name in rows if is_cost(str(name))]

@@ -27,7 +27,7 @@ from recrl.agents.registry import AGENTS
 from recrl.environments.plugins import load_attribute
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.cli.arguments import parser
-from recrl.orchestrator.grid.grid_file import Entry, Exclusion, GridFile, Resources, Run, TaskEntry
+from recrl.orchestrator.grid.file_models import Entry, Exclusion, GridFile, Resources, Run, TaskEntry
 from recrl.teachers.registry import TEACHERS
 
 NOTE = "<!-- made from the code by docs/_ext/generated_reference.py; changes here are lost -->\n\n"

@@ -4,7 +4,7 @@
     :methods: none, linear, dynamic
     ```
 
-``recrl.analysis.statistics.feasibility`` defines "solved" and its tolerance.
+``recrl.analysis.statistics.verdicts`` defines "solved" and its tolerance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from recrl.analysis.statistics.feasibility import optimal
+from recrl.analysis.statistics.verdicts import solved
 
 ROOT = Path(__file__).resolve().parents[2]
 MEASURES = {
@@ -37,7 +37,7 @@ def solved_table(path: Path, methods: list[str]) -> str:
         methods: the curricula to show, in this order; all if empty.
     """
     rows = pd.read_csv(path)
-    rows["solved"] = optimal(rows)
+    rows["solved"] = solved(rows)
     shown = methods or list(dict.fromkeys(rows["method"]))
     lines = [f"| task | agent | curriculum | {' | '.join(MEASURES.values())} |", "|---|---|---|---|---|---|"]
     for (task, agent), cell in rows.groupby(["task", "agent"], sort=False):
@@ -47,7 +47,7 @@ def solved_table(path: Path, methods: list[str]) -> str:
                 continue
             counts = [of.loc[of["measure"] == measure, "solved"] for measure in MEASURES]
             texts = " | ".join(f"{int(each.sum())} of {len(each)}" for each in counts)
-            lines.append(f"| {task} | {agent} | {method} | {texts} |")
+            lines.append(f"| `{task}` | `{agent}` | `{method}` | {texts} |")
     return "\n".join(lines)
 
 
@@ -64,6 +64,8 @@ class SolvedTable(SphinxDirective):
         methods = [it.strip() for it in self.options.get("methods", "").split(",") if it.strip()]
         table = nodes.container()
         self.state.nested_parse(StringList(solved_table(path, methods).split("\n")), 0, table)
+        for each in table.findall(nodes.table):
+            each["classes"].append("names")  # recrl.css keeps names on one line
         return list(table.children)
 
 

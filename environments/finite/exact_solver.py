@@ -1,13 +1,12 @@
 """The constrained optimum J*(d) of a finite CMDP, and the exact return and costs of any policy.
 
-Two independent solvers of
+``solve_by_lagrangian`` solves
 
     J*(d) = max_pi J(pi)    such that    C_i(pi) <= d_i for all i,
 
-over all policies, time-dependent and random ones included, undiscounted over a finite horizon.
-``solve_by_linear_program`` optimises over occupation measures (Altman 1999, chapter 3); it is for small
-horizons and for tests. ``solve_by_lagrangian`` solves RiverGrid's 200 steps in about 0.1 s. A test checks
-that they agree.
+over all policies, time-dependent and random ones included, undiscounted over a finite horizon. RiverGrid's
+200 steps take about 0.1 s. A test compares it with an independent solution over occupation measures (Altman
+1999, chapter 3).
 
 J* is an upper bound on an agent's return, because an agent's policy does not see the time.
 
@@ -18,15 +17,13 @@ multipliers [k].
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linprog
-from scipy.sparse import coo_array
 
 from recrl.environments.cmdp import CostLimits, Floats
-from recrl.environments.finite.finite_cmdp import FiniteCMDP, InfeasibleLimitsError, Integers
+from recrl.environments.finite.finite_cmdp import FiniteCMDP, InfeasibleLimitsError
 
 TOLERANCE = 1e-9  # relative; on returns and costs
 MAX_POLICIES = 10_000
@@ -132,41 +129,6 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
     )
 
 
-def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOptimum:
-    """Solve for J*(d) by linear programming over occupation measures x_t(s, a) >= 0 (HiGHS).
-
-    maximise    sum_{t, s, a} x_t(s, a) R(s, a)
-    subject to  sum_a x_0(s, a) = start(s),
-                sum_a x_t(s', a) = sum_{s, a} x_{t-1}(s, a) T(s' | s, a)    for every s' that is not terminal,
-                sum_{t, s, a} x_t(s, a) C_i(s, a) <= d_i,
-
-    and pi_t(a | s) is proportional to x_t(s, a). Only states that are reachable at time t have variables.
-
-    Raises:
-        InfeasibleLimitsError: no policy keeps the limits.
-    """
-    constrained = np.array(limits.finite)
-    bounds = _checked_limits(model, limits)[constrained]
-    times, states, flow, inflow = _flow_constraints(model)
-    solution = _minimise(
-        -model.rewards[states].reshape(-1),
-        at_most=(model.costs[states].reshape(-1, model.num_costs)[:, constrained].T, bounds),
-        equal=(flow, inflow),
-    )
-    if solution is None:
-        raise InfeasibleLimitsError(f"no policy keeps the limits {limits.to_json()}")
-    occupation = np.zeros((model.horizon, model.num_states, model.num_actions))
-    occupation[times, states] = np.maximum(solution.x, 0.0).reshape(-1, model.num_actions)
-    multipliers = np.zeros(model.num_costs)
-    multipliers[constrained] = solution.multipliers
-    return ConstrainedOptimum(
-        episode_return=float(np.sum(occupation * model.rewards)),
-        costs=np.einsum("tsa,sak->k", occupation, model.costs),
-        multipliers=multipliers,
-        policy=_conditional(occupation),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _DeterministicPolicy:
     """One vertex of the set of attainable (return, costs); ``actions`` is [H, S]."""
@@ -241,9 +203,9 @@ class _LinearSolution:
 
 
 def _minimise(
-    objective: Floats, *, at_most: tuple[Floats, Floats], equal: tuple[Any, Floats]
+    objective: Floats, *, at_most: tuple[Floats, Floats], equal: tuple[Floats, Floats]
 ) -> _LinearSolution | None:
-    """Minimise c . x over x >= 0 with A x <= b, A' x = b' (A' may be sparse); None if infeasible."""
+    """Minimise c . x over x >= 0 with A x <= b, A' x = b'; None if infeasible."""
     (upper_matrix, upper), (equal_matrix, right_hand_side) = at_most, equal
     solution = linprog(objective, upper_matrix, upper, equal_matrix, right_hand_side, method="highs")
     if solution.status == 2:
@@ -276,37 +238,6 @@ def _conditional(occupation: Floats) -> Floats:
     policy: Floats = np.full_like(occupation, 1.0 / occupation.shape[2])
     np.divide(occupation, mass, out=policy, where=mass > 1e-12)
     return policy
-
-
-def _flow_constraints(model: FiniteCMDP) -> tuple[Integers, Integers, coo_array, Floats]:
-    """Return the times and states of the variables (each with A actions), and their flow equations."""
-    reachable = np.zeros((model.horizon, model.num_states), np.bool_)
-    reachable[0] = model.start > 0.0
-    for step in range(1, model.horizon):
-        previous = reachable[step - 1]
-        possible = model.successors[previous][model.probabilities[previous] > 0.0]
-        reachable[step, possible] = True
-        reachable[step, model.terminal] = False
-    times, states = np.nonzero(reachable)
-    row_of = np.full((model.horizon + 1, model.num_states), -1)
-    row_of[times, states] = np.arange(len(times))
-    columns = np.arange(len(times) * model.num_actions)
-    own_rows = np.repeat(np.arange(len(times)), model.num_actions)
-    num_successors = model.successors.shape[2]
-    next_rows = row_of[times[:, None, None] + 1, model.successors[states]].reshape(-1)
-    flowing = model.probabilities[states].reshape(-1)
-    counted = (next_rows >= 0) & (flowing > 0.0)
-    flow = coo_array(
-        (
-            np.concatenate([np.ones(len(columns)), -flowing[counted]]),
-            (
-                np.concatenate([own_rows, next_rows[counted]]),
-                np.concatenate([columns, np.repeat(columns, num_successors)[counted]]),
-            ),
-        ),
-        shape=(len(times), len(columns)),
-    )
-    return times, states, flow, np.where(times == 0, model.start[states], 0.0)
 
 
 def _checked_limits(model: FiniteCMDP, limits: CostLimits) -> Floats:

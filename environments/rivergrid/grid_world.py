@@ -29,7 +29,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError, Integers
-from recrl.environments.plugins import load_attribute
 from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance
 from recrl.environments.rivergrid.maps import (
     GOAL,
@@ -205,7 +204,9 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
         """Render one RGB frame per environment, uint8 [height * 32, width * 32, 3], with MiniGrid."""
-        render_frame = load_attribute("recrl.environments.rivergrid.minigrid_env:render_frame")
+        # MiniGrid takes long to import, and minigrid_env imports this module.
+        from recrl.environments.rivergrid.minigrid_env import render_frame  # noqa: PLC0415
+
         frames = []
         for state in self.states.tolist():
             cell, heading = divmod(state, HEADINGS)
@@ -227,10 +228,11 @@ def make_river_grid(name: str, num_envs: int, options: RiverGridOptions) -> Rive
 
 def river_grid_optimum(name: str, options: RiverGridOptions, limits: CostLimits) -> float:
     """Return J*(d), exact to about 1e-9; -inf if no policy keeps the limits."""
-    # Imported here because SciPy takes half a second to import and trials do not use it.
-    solve = load_attribute("recrl.environments.finite.exact_solver:solve_by_lagrangian")
+    # SciPy takes half a second to import, and trials do not use it.
+    from recrl.environments.finite.exact_solver import solve_by_lagrangian  # noqa: PLC0415
+
     model = river_cmdp(task_map(name, options), costs=options.costs, horizon=options.horizon)
     try:
-        return float(solve(model, limits).episode_return)
+        return float(solve_by_lagrangian(model, limits).episode_return)
     except InfeasibleLimitsError:
         return -math.inf

@@ -124,11 +124,6 @@ class RiverMap:
             frontier, steps = reached, steps + 1
         return None
 
-    @property
-    def has_dry_route(self) -> bool:
-        """Whether a goal can be reached without entering the river."""
-        return self.shortest_route(through=DRY) is not None
-
 
 def parse_map(text: str, *, source: str = "map") -> RiverMap:
     """Parse a map; a common indentation and empty lines around it are ignored.

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from recrl.environments.cmdp import ObservationComponent
 from recrl.environments.safety_gym.tasks import HORIZON, LIDAR_RANGE, SAFETY_TASKS, SUBSTEPS, SafetyTask
 from recrl.environments.simulation.camera import Renderer
-from recrl.environments.simulation.environments import Description, MujocoEnv, MujocoVectorEnv
+from recrl.environments.simulation.environments import Description, MujocoEnv, MujocoVectorEnv, TaskFamily
 
 if TYPE_CHECKING:
     from recrl.environments.safety_gym.batch import Outcome, SafetyGymBatch
@@ -65,12 +65,6 @@ def cost_names(task: SafetyTask, options: SafetyGymOptions) -> tuple[str, ...]:
     return task.cost_terms
 
 
-def _find(task: str) -> SafetyTask:
-    if task not in SAFETY_TASKS:
-        raise ValueError(f"task must be one of {', '.join(SAFETY_TASKS)}, got {task!r}")
-    return SAFETY_TASKS[task]
-
-
 def observation_components(task: SafetyTask) -> tuple[ObservationComponent, ...]:
     """Return the parts of a task's observation: the robot's sensors, and a lidar for each kind of object."""
     return tuple(
@@ -99,67 +93,42 @@ def frames_per_second(task: SafetyTask) -> int:
     return round(1.0 / (task.timestep * SUBSTEPS))
 
 
-def _made(task: str, number: int, options: SafetyGymOptions) -> tuple[Description, SafetyGymBatch]:
-    """Description and batch of a task; only this function imports MuJoCo and Numba."""
+def _make(task: SafetyTask, number: int, options: SafetyGymOptions) -> tuple[Description, SafetyGymBatch]:
+    """Make the description and the batch of a task; only this function imports MuJoCo and Numba."""
     from recrl.environments.safety_gym.batch import SafetyGymBatch  # noqa: PLC0415
 
-    found = _find(task)
     description = Description(
-        name=task,
-        observed=found.observation_size,
+        name=task.name,
+        observed=task.observation_size,
         action_size=2,
         action_bound=1.0,
         out_of_range=options.out_of_range,
-        cost_names=cost_names(found, options),
+        cost_names=cost_names(task, options),
         horizon=options.horizon,
-        frames_per_second=frames_per_second(found),
-        info=partial(_info, tuple(f"cost_{term}" for term in found.cost_terms), options.cost),
+        frames_per_second=frames_per_second(task),
+        info=partial(_info, tuple(f"cost_{term}" for term in task.cost_terms), options.cost),
         make_renderer=_renderer,
-        components=observation_components(found),
+        components=observation_components(task),
     )
-    return description, SafetyGymBatch(
-        found, number, horizon=options.horizon, num_threads=options.num_threads
-    )
+    return description, SafetyGymBatch(task, number, horizon=options.horizon, num_threads=options.num_threads)
+
+
+SAFETY_GYM = TaskFamily(SAFETY_TASKS, SafetyGymOptions, _make)
 
 
 class SafetyGymVectorEnv(MujocoVectorEnv):
-    """B environments of one Safety Gym task, stepped together.
+    """B environments of one Safety Gym task, for example ``CarGoal2``, stepped together."""
 
-    Args:
-        task: for example ``CarGoal2``.
-        num_envs: B, at least 1.
-        render_mode: None or ``rgb_array``.
-        options: the fields of ``SafetyGymOptions``.
-    """
-
+    family = SAFETY_GYM
     batch: SafetyGymBatch
-
-    def __init__(self, task: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> None:
-        self.options = SafetyGymOptions(**options)
-        super().__init__(*_made(task, num_envs, self.options), render_mode)
 
 
 class SafetyGymEnv(MujocoEnv):
-    """One environment of a Safety Gym task.
+    """One environment of a Safety Gym task, for example ``CarGoal2``."""
 
-    Args:
-        task: for example ``CarGoal2``.
-        render_mode: None or ``rgb_array``.
-        options: the fields of ``SafetyGymOptions``.
-    """
-
+    family = SAFETY_GYM
     batch: SafetyGymBatch
 
-    def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
-        self.options = SafetyGymOptions(**options)
-        super().__init__(*_made(task, 1, self.options), render_mode)
 
-
-def make_safety_gym(name: str, num_envs: int, options: SafetyGymOptions) -> SafetyGymVectorEnv:
-    """Make B environments of a task by its name, for the registry of tasks."""
-    return SafetyGymVectorEnv(name, num_envs, **options.model_dump())
-
-
-def draw_safety_gym(name: str, options: SafetyGymOptions) -> SafetyGymEnv:
-    """Make a rendering environment of a task by its name, for the registry of tasks."""
-    return SafetyGymEnv(name, render_mode="rgb_array", **options.model_dump())
+make_safety_gym = SafetyGymVectorEnv.from_options
+draw_safety_gym = SafetyGymEnv.rendering

@@ -18,7 +18,7 @@ from recrl.environments.safety_gym.batch import SafetyGymBatch
 from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.scene import rotation_matrices, scene_xml, upright
 from recrl.environments.safety_gym.tasks import GOAL_HEIGHT, LIDAR_BINS
-from recrl.environments.simulation.camera import Frame, make_context
+from recrl.environments.simulation.rendering import MujocoRenderer
 
 Colour = tuple[float, float, float]
 
@@ -37,8 +37,7 @@ SHADE = 0.25
 HAZARD_HEIGHT = 0.02
 LIDAR_RADIUS, LIDAR_HEIGHT, LIDAR_RISE, LIDAR_SPHERE = 0.15, 0.5, 0.06, 0.025
 FAINTEST = 0.1
-MAX_GEOMS = 1000
-CAMERA_DISTANCE, CAMERA_ELEVATION, CAMERA_AZIMUTH = 6.5, -50.0, 90.0
+CAMERA_DISTANCE, CAMERA_ELEVATION = 6.5, -50.0
 
 # Without a graphics card, smoothed edges and finer spheres take four fifths of the time of a frame.
 _ROOM = """
@@ -56,61 +55,23 @@ _ROOM = """
 """
 
 
-class SafetyRenderer:
-    """Renderer for single environments of a batch.
+class SafetyRenderer(MujocoRenderer[SafetyGymBatch]):
+    """Renderer for single environments of a batch; see ``MujocoRenderer``.
 
     Args:
         batch: the environments.
         width: of a frame, pixels, at most 1,920.
         height: of a frame, pixels, at most 1,080.
-
-    Raises:
-        RenderingUnavailableError: EGL and OSMesa are missing, or the library in MUJOCO_GL is.
     """
 
     def __init__(self, batch: SafetyGymBatch, width: int = 480, height: int = 360) -> None:
-        self._batch = batch
-        self._model = _coloured_model(batch)
-        self._data = mujoco.MjData(self._model)
-        self._context = make_context(width, height)
-        self._drawing = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawing)
-        self._scene = mujoco.MjvScene(self._model, maxgeom=MAX_GEOMS)
-        self._look = mujoco.MjvOption()
-        self._area = mujoco.MjrRect(0, 0, width, height)
-        self._camera = mujoco.MjvCamera()
-        self._camera.distance = CAMERA_DISTANCE
-        self._camera.elevation, self._camera.azimuth = CAMERA_ELEVATION, CAMERA_AZIMUTH
+        model = _coloured_model(batch)
+        super().__init__(batch, model, width, height, distance=CAMERA_DISTANCE, elevation=CAMERA_ELEVATION)
 
-    def frame(self, index: int) -> Frame:
-        """Render the present state of environment ``index``, [height, width, 3]."""
-        batch = self._batch
-        row = batch.simulations.rows[index]
-        mujoco.mj_setState(self._model, self._data, row, mujoco.mjtState.mjSTATE_INTEGRATION.value)
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
-        mujoco.mjv_updateScene(
-            self._model,
-            self._data,
-            self._look,
-            None,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            self._scene,
-        )
+    def _add_objects(self, index: int) -> None:
         self._add_areas(index)
         self._add_gremlins(index)
         self._add_lidar(index)
-        picture = np.empty((self._area.height, self._area.width, 3), np.uint8)
-        self._context.make_current()
-        mujoco.mjr_render(self._area, self._scene, self._drawing)
-        mujoco.mjr_readPixels(picture, None, self._area, self._drawing)
-        return np.flipud(picture).copy()  # OpenGL counts rows from below
-
-    def close(self) -> None:
-        """Free the memory of the graphics driver."""
-        self._drawing.free()
-        self._context.free()
 
     def _add_areas(self, index: int) -> None:
         batch, task = self._batch, self._batch.task

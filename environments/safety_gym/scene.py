@@ -11,7 +11,7 @@ Optimisations that do not change the tasks' statistics:
 - Button: only the gremlin near the robot is a body
 (``recrl.environments.safety_gym.gremlins``).
 - The sensors of the robots are computed from the state
-(``recrl.environments.safety_gym.native.environment_step``).
+(``recrl.environments.safety_gym.compiled_step``).
 
 MuJoCo's newer colliders (``nativeccd``, ``multiccd``) are off: Safety Gym used the older ones.
 

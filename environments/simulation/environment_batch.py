@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+
+if TYPE_CHECKING:
+    from recrl.environments.simulation.mujoco_batch import Simulations
 
 Booleans = npt.NDArray[np.bool_]
 Observations = npt.NDArray[np.float32]
@@ -68,11 +71,14 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
 
     Attributes:
         task, number, horizon: as given.
+        simulations: the physics, made by each family of tasks.
         generators: one generator for each environment; none before ``seed``.
 
     Raises:
         ValueError: there are no environments.
     """
+
+    simulations: Simulations
 
     def __init__(self, task: TaskT, number: int, *, horizon: int, num_threads: int = 1) -> None:
         if number < 1:

@@ -1,15 +1,16 @@
 """Environments of MuJoCo tasks: one for Gymnasium, and a batch for agents.
 
-A family of tasks provides a ``Description`` and a batch (``EnvironmentBatch``); the rest is here.
+A family of tasks provides a ``TaskFamily``, which makes a ``Description`` and a batch (``EnvironmentBatch``);
+the rest is here.
 
 Notation: B environments, n observation components, m action components, k costs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import gymnasium
 import numpy as np
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from pydantic import BaseModel
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
 from recrl.environments.simulation.actions import give_actions
@@ -83,22 +85,53 @@ class Description:
         give_actions(self.name, batch, actions, shape=shape, bound=bound, out_of_range=out_of_range)
 
 
-class MujocoVectorEnv(CMDPVectorEnv):
-    """B environments of one task, stepped together.
-
-    Args:
-        description: of the task.
-        batch: the environments.
-        render_mode: None or ``rgb_array``.
+@dataclass(frozen=True)
+class TaskFamily:
+    """Tasks with the same options and the same code.
 
     Attributes:
-        batch: as given.
+        tasks: their definitions, by name.
+        options: the pydantic model of their options.
+        make: (definition, number of environments B, options) -> a description and the batch.
     """
 
-    def __init__(self, description: Description, batch: Batch, render_mode: str | None) -> None:
+    tasks: Mapping[str, Any]
+    options: type[BaseModel]
+    make: Callable[[Any, int, Any], tuple[Description, Batch]]
+
+    def make_batch(self, task: str, number: int, options: BaseModel) -> tuple[Description, Batch]:
+        """Make the batch of a task by name.
+
+        Raises:
+            ValueError: there is no such task.
+        """
+        if task not in self.tasks:
+            raise ValueError(f"task must be one of {', '.join(self.tasks)}, got {task!r}")
+        return self.make(self.tasks[task], number, options)
+
+
+class MujocoVectorEnv(CMDPVectorEnv):
+    """B environments of one task, stepped together; a subclass for each family of tasks.
+
+    Args:
+        task: name of the task, for example ``CarGoal2``.
+        num_envs: B, at least 1.
+        render_mode: None or ``rgb_array``.
+        options: the options of the family's tasks.
+
+    Attributes:
+        family: the tasks.
+        options: as given, with defaults.
+        batch: the environments.
+    """
+
+    family: ClassVar[TaskFamily]
+
+    def __init__(self, task: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> None:
+        self.options = self.family.options(**options)
+        description, self.batch = self.family.make_batch(task, num_envs, self.options)
         self._description = description
-        self.batch = batch
-        self.num_envs = batch.number
+        self.num_envs = num_envs
         self.render_mode = render_mode
         self._camera = Camera(render_mode, description.make_renderer)
         self.metadata = {
@@ -117,6 +150,11 @@ class MujocoVectorEnv(CMDPVectorEnv):
             description.horizon,
             description.components,
         )
+
+    @classmethod
+    def from_options(cls, name: str, num_envs: int, options: BaseModel) -> Self:
+        """Make B environments of a task by its name, for the registry of tasks."""
+        return cls(name, num_envs, **options.model_dump())
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -170,30 +208,39 @@ class MujocoVectorEnv(CMDPVectorEnv):
 
 
 class MujocoEnv(gymnasium.Env[Any, Any]):
-    """One environment of a task.
+    """One environment of a task; a subclass for each family of tasks.
 
     Args:
-        description: of the task.
-        batch: a batch of one environment.
+        task: name of the task, for example ``CarGoal2``.
         render_mode: None or ``rgb_array``.
+        options: the options of the family's tasks.
 
     Attributes:
+        family: the tasks.
+        options: as given, with defaults.
         cost_names: names of the k costs in ``info["cost"]``, an array [k].
         observation_components: the parts of an observation, in their order.
-        batch: as given.
+        batch: a batch of one environment.
     """
 
+    family: ClassVar[TaskFamily]
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
 
-    def __init__(self, description: Description, batch: Batch, render_mode: str | None) -> None:
+    def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
+        self.options = self.family.options(**options)
+        description, self.batch = self.family.make_batch(task, 1, self.options)
         self._description = description
-        self.batch = batch
         self.render_mode = render_mode
         self._camera = Camera(render_mode, description.make_renderer)
         self.metadata = {**self.metadata, **description.rendering}
         self.cost_names = description.cost_names
         self.observation_components = description.components
         self.observation_space, self.action_space = description.spaces
+
+    @classmethod
+    def rendering(cls, name: str, options: BaseModel) -> Self:
+        """Make a rendering environment of a task by its name, for the registry of tasks."""
+        return cls(name, render_mode="rgb_array", **options.model_dump())
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.simulation.camera import Renderer
-from recrl.environments.simulation.environments import Description, MujocoEnv, MujocoVectorEnv
+from recrl.environments.simulation.environments import Description, MujocoEnv, MujocoVectorEnv, TaskFamily
 from recrl.environments.velocity.tasks import HORIZON, VELOCITY_TASKS, VelocityTask
 
 if TYPE_CHECKING:
@@ -44,12 +44,6 @@ class VelocityOptions(BaseModel):
     )
 
 
-def _find(task: str) -> VelocityTask:
-    if task not in VELOCITY_TASKS:
-        raise ValueError(f"task must be one of {', '.join(VELOCITY_TASKS)}, got {task!r}")
-    return VELOCITY_TASKS[task]
-
-
 def _info(outcome: Outcome) -> dict[str, Any]:
     info: dict[str, Any] = {"cost": outcome.costs[:, None], "velocity": outcome.velocities}
     if outcome.broken is not None:
@@ -63,13 +57,13 @@ def _renderer(batch: VelocityBatch) -> Renderer:
     return VelocityRenderer(batch)
 
 
-def _made(task: str, number: int, options: VelocityOptions) -> tuple[Description, VelocityBatch]:
-    """Description and batch of a task; only this function imports MuJoCo and Numba."""
+def _make(task: VelocityTask, number: int, options: VelocityOptions) -> tuple[Description, VelocityBatch]:
+    """Make the description and the batch of a task; only this function imports MuJoCo and Numba."""
     from recrl.environments.velocity.batch import VelocityBatch  # noqa: PLC0415
 
-    batch = VelocityBatch(_find(task), number, horizon=options.horizon, num_threads=options.num_threads)
+    batch = VelocityBatch(task, number, horizon=options.horizon, num_threads=options.num_threads)
     description = Description(
-        name=task,
+        name=task.name,
         observed=batch.observed,
         action_size=batch.model.nu,
         action_bound=batch.bound,
@@ -83,44 +77,22 @@ def _made(task: str, number: int, options: VelocityOptions) -> tuple[Description
     return description, batch
 
 
+VELOCITY = TaskFamily(VELOCITY_TASKS, VelocityOptions, _make)
+
+
 class VelocityVectorEnv(MujocoVectorEnv):
-    """B environments of one velocity task, stepped together.
+    """B environments of one velocity task, for example ``SafetyAntVelocity``, stepped together."""
 
-    Args:
-        task: for example ``SafetyAntVelocity``.
-        num_envs: B, at least 1.
-        render_mode: None or ``rgb_array``.
-        options: the fields of ``VelocityOptions``.
-    """
-
+    family = VELOCITY
     batch: VelocityBatch
-
-    def __init__(self, task: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> None:
-        self.options = VelocityOptions(**options)
-        super().__init__(*_made(task, num_envs, self.options), render_mode)
 
 
 class VelocityEnv(MujocoEnv):
-    """One environment of a velocity task.
+    """One environment of a velocity task, for example ``SafetyAntVelocity``."""
 
-    Args:
-        task: for example ``SafetyAntVelocity``.
-        render_mode: None or ``rgb_array``.
-        options: the fields of ``VelocityOptions``.
-    """
-
+    family = VELOCITY
     batch: VelocityBatch
 
-    def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
-        self.options = VelocityOptions(**options)
-        super().__init__(*_made(task, 1, self.options), render_mode)
 
-
-def make_velocity(name: str, num_envs: int, options: VelocityOptions) -> VelocityVectorEnv:
-    """Make B environments of a task by its name, for the registry of tasks."""
-    return VelocityVectorEnv(name, num_envs, **options.model_dump())
-
-
-def draw_velocity(name: str, options: VelocityOptions) -> VelocityEnv:
-    """Make a rendering environment of a task by its name, for the registry of tasks."""
-    return VelocityEnv(name, render_mode="rgb_array", **options.model_dump())
+make_velocity = VelocityVectorEnv.from_options
+draw_velocity = VelocityEnv.rendering

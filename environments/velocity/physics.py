@@ -20,7 +20,7 @@ from recrl.environments.simulation.machine_code import (
     mj_rnePostConstraint,
     mj_step,
 )
-from recrl.environments.simulation.mujoco_layout import structure
+from recrl.environments.simulation.struct_offsets import structure
 
 MAX_FIELDS = 5
 """Maximum number of fields of ``mjData`` that are copied."""
@@ -37,7 +37,7 @@ PHYSICS = np.dtype(
     align=True,
 )
 
-_physics = array_at(PHYSICS)
+physics_at = array_at(PHYSICS)
 _doubles = array_at(np.float64)
 _addresses = array_at(np.int64)
 
@@ -73,7 +73,7 @@ def copy_fields(physics: Any, data: int, index: int) -> None:
 @compiled_for_batch
 def advance(model: int, data: int, index: int, argument: int) -> None:
     """Take the physics steps of one step; the controls are in the state."""
-    physics = _physics(argument, 1)[0]
+    physics = physics_at(argument, 1)[0]
     for _step in range(physics.frame_skip):
         mj_step(model, data)
     if physics.forces:
@@ -85,12 +85,4 @@ def advance(model: int, data: int, index: int, argument: int) -> None:
 def derive(model: int, data: int, index: int, argument: int) -> None:
     """Compute and copy what follows from the state, except contact forces, which stay as they were."""
     mj_forward(model, data)
-    copy_fields(_physics(argument, 1)[0], data, index)
-
-
-@compiled_for_batch
-def derive_with_forces(model: int, data: int, index: int, argument: int) -> None:
-    """Compute and copy what follows from the state, contact forces included."""
-    mj_forward(model, data)
-    mj_rnePostConstraint(model, data)
-    copy_fields(_physics(argument, 1)[0], data, index)
+    copy_fields(physics_at(argument, 1)[0], data, index)

@@ -70,6 +70,11 @@ class VelocityTask:
     healthy: Callable[[Floats, Floats], Booleans] | None = None
     camera_distance: float = 4.0
 
+    @property
+    def robot(self) -> str:
+        """For example ``Ant``."""
+        return self.name.removeprefix("Safety").removesuffix("Velocity")
+
 
 def ant_is_healthy(qpos: Floats, qvel: Floats) -> Booleans:
     """Torso between 0.2 m and 1 m high, everything finite."""

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
-import re
 from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
 from recrl.orchestrator.cli import requests
-from recrl.orchestrator.cli.requests import VIDEOS, Request
+from recrl.orchestrator.cli.argument_fields import Request
+from recrl.orchestrator.cli.requests import VIDEOS
+from recrl.orchestrator.grid.selection import number_of_pairs
 
 DESCRIPTION = """\
 Run constrained reinforcement learning under cost-limit curricula: every task x agent x method x seed of a
@@ -50,7 +51,7 @@ Exit codes:
   2    the grid or the arguments are wrong; nothing was started
   3    another process is running this sweep
   4    Ray, MLflow or the storage could not be reached, or files could not be written
-  5    plan --check: a launch would have something to do
+  5    plan --check: trials are left to run, or come from other code
   130  stopped by Ctrl-C or SIGTERM; the same launch continues"""
 
 # Each command and the function that does it, in the order of the help. The function's module is imported when
@@ -77,7 +78,6 @@ COMMANDS: Mapping[type[Request], str] = {
     requests.SyncRequest: "tracking:run_sync",
 }
 LISTS = ("--only", "--option")  # each takes several KEY=VALUE
-PAIR = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*=.*(?<!\.yaml)(?<!\.yml)")
 LONGEST_LINE = 1000  # characters of an error
 
 
@@ -141,9 +141,8 @@ def spread(given: Sequence[str]) -> list[str]:
         if argument == "--video":
             plain.append(f"--video={rest.pop(0) if rest and rest[0] in VIDEOS else VIDEOS[0]}")
         elif argument in LISTS and rest:
-            plain += [argument, rest.pop(0)]
-            while rest and PAIR.fullmatch(rest[0]):
-                plain += [argument, rest.pop(0)]
+            pairs = [rest.pop(0) for _ in range(number_of_pairs(rest))]
+            plain += [it for pair in pairs for it in (argument, pair)]
         else:
             plain.append(argument)
     return plain

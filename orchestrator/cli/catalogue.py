@@ -13,7 +13,7 @@ from recrl.orchestrator.cli.output import print_table, say
 from recrl.orchestrator.cli.requests import ListRequest, OptionsRequest, SchemaRequest
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.grid.catalogue import KINDS, SECTIONS, Kind, kinds_of, listed, options_of
+from recrl.orchestrator.grid.catalogue import KINDS, LISTS, SECTIONS, Kind, kinds_of, listed, options_of
 from recrl.orchestrator.grid.json_schema import grid_schema
 
 
@@ -32,6 +32,15 @@ def run_options(request: OptionsRequest, console: Console) -> ExitCode:
         where = "at a grid's top level, or at a task" if name == "limits" else "a section of a grid"
         say(console, f"{name}, {where}: {SECTIONS[name].__doc__}\n")
         _print_options(SECTIONS[name], console)
+        return ExitCode.OK
+    if name in LISTS:
+        kind = next(it for it in KINDS.values() if it.section == name)
+        say(
+            console,
+            f"{name}, a section of a grid: a list; each entry is a name, or a mapping with these keys. "
+            f"Names: recrl-sweep list {kind.plural}; options of one: recrl-sweep options {kind.ours[0]}\n",
+        )
+        _print_options(LISTS[name], console)
         return ExitCode.OK
     for kind in _kinds(name):
         say(console, f"{name}, in a grid's {kind.section}: {kind.summary(name)}\n")

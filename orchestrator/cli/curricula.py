@@ -13,11 +13,11 @@ from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import BoundRequest, ReplayRequest
 from recrl.orchestrator.cli.results import say_warnings, source
-from recrl.orchestrator.cli.sweeps import open_store, wanted
+from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.plan import select
+from recrl.orchestrator.grid.selection import parse_only, select
 from recrl.orchestrator.spec import Choice, TrialState
 from recrl.teachers.registry import teacher_config
 
@@ -51,11 +51,11 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
 
     from recrl.analysis.figures import styles  # noqa: PLC0415
     from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits  # noqa: PLC0415
-    from recrl.analysis.report_tables import write_csv  # noqa: PLC0415
+    from recrl.analysis.report.table_formats import write_csv  # noqa: PLC0415
     from recrl.analysis.statistics.curriculum_replay import replay, replay_summary  # noqa: PLC0415
 
     store = open_store(request)
-    specs = select(store.specs(), wanted(request.only))
+    specs = select(store.specs(), parse_only(request.only))
     method = _teacher(store, request)
     called = re.sub("[^A-Za-z0-9.+-]+", "-", method.label)
     folder, runs, summaries = store.folder / "replays", [], []

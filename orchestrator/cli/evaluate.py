@@ -6,15 +6,15 @@ from rich.console import Console
 
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import EvaluateRequest
-from recrl.orchestrator.cli.sweeps import open_store, wanted
+from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.code_changes import has_other_code, other_code_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.plan import select
+from recrl.orchestrator.grid.selection import parse_only, select
+from recrl.orchestrator.provenance.code_changes import has_other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 
@@ -69,7 +69,7 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
     """Return the trials on disk by the beginning of their names and by ``--only``."""
     text = " ".join(request.trial)
     found = store.find(text)
-    only = wanted(request.only)
+    only = parse_only(request.only)
     specs, damaged = [], set()
     for trial in found:
         try:

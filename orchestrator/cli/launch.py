@@ -2,154 +2,139 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import shlex
-import threading
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short, show
-from recrl.orchestrator.cli.plan import room, say_plan
+from recrl.orchestrator.cli.plan import say_other_code, say_plan
 from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
-from recrl.orchestrator.cli.results import draw
 from recrl.orchestrator.cli.status import say_failures
-from recrl.orchestrator.cli.sweeps import wanted
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.plan import Plan
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.grid.selection import parse_only
+from recrl.orchestrator.launching import LaunchListener, LaunchOptions, LaunchOutcome, launch_grid
 from recrl.orchestrator.redaction import redacted
-from recrl.orchestrator.remote.opening import sweep_place
-from recrl.orchestrator.report_refresh import refreshing
-from recrl.orchestrator.sweep import BackgroundSync, LaunchSettings, SweepResult, launch, stopping_on_signals
-from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, progress
-from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.background_sync import start_sync
+from recrl.orchestrator.sweep import SweepResult
+from recrl.orchestrator.sweep_progress import DisplayStatus, progress
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep
 
-SYNC_INTERVAL_SECONDS = 5.0
-
-logger = logging.getLogger("recrl.sweep")
-
 
 def run_launch(request: LaunchRequest, console: Console) -> ExitCode:
     """Run the incomplete trials of a grid file."""
-    return launch_grid(read_grid(request.grid), request, console)
-
-
-def launch_grid(grid: GridSpec, request: LaunchRequest, console: Console) -> ExitCode:
-    """Run the incomplete trials of a checked grid; ``request.grid`` is not read."""
-    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
-
-    store = SweepStore(request.root, grid.name)
-    only = wanted(request.only)
-    place = sweep_place(store, request.storage)
-    place.prepare()
-    executor = _executor(grid, place, request)
-    at_once, where = room(grid, request)
-    uri = tracking_uri(store, request.tracking_uri) if request.mlflow else None
-    stop = threading.Event()
-    read: list[Sweep] = []  # at the end, if any trial is complete
-
-    def watch(plan: Plan) -> None:
-        say_plan(plan, grid, console, at_once=at_once, where=where)
-        if plan.to_do:
-            if request.executor == "ray":
-                _say_starting(request, console)
-            chosen = [trial.spec for trial in plan.trials]
-            shown.enter_context(display.live_progress(lambda: progress(chosen, store), console))
-            if request.figures:
-                shown.enter_context(refreshing(store))
-
-    def finish(after: SweepProgress) -> None:
-        shown.close()
-        if not stop.is_set() and after.counts[DisplayStatus.COMPLETE]:
-            read.append(sweep_data.load(store))
-            if request.figures:
-                _draw_at_end(read[0], store, console)
-        if not stop.is_set():
-            _film(grid, after, store, stop, console)
-
-    def say_stopping() -> None:
-        say(console, "Stopping: running trials save their state. Press again to stop at once.")
-
-    with contextlib.ExitStack() as shown, _listening(stop, say_stopping):
-        settings = LaunchSettings(
-            grid,
-            place,
-            executor,
-            only=only,
-            retry_failed=request.retry_failed,
-            rerun_damaged=request.rerun_damaged,
-            rerun_changed=request.rerun_changed,
-            start_sync=_sync_to(uri) if uri else None,
-            watch=watch,
-            finish=finish,
-        )
-        result = launch(settings, stop=stop)
-    kept = f", a local copy of {place.address}" if place.address else ""
-    say(console, f"Results    {short(store.folder)}{kept}")
-    if uri:
-        _say_synced(result, store, uri, request, console)
-    for sweep in read:
-        _say_results(sweep, console)
-    report = store.figures_folder / "report.html"
-    if read and request.figures and report.exists():
-        say(console, f"Report     {short(report)}")
-    return _say_result(result, store, request, console)
-
-
-def _listening(stop: threading.Event, say_stopping: Callable[[], None]) -> AbstractContextManager[None]:
-    """Stop on signals; only the main thread of a process can."""
-    is_main = threading.current_thread() is threading.main_thread()
-    return stopping_on_signals(stop, say_stopping) if is_main else contextlib.nullcontext()
-
-
-def _executor(grid: GridSpec, place: SweepPlace, request: LaunchRequest) -> Executor:
-    if request.ship_package and not request.address:
-        raise RecrlError("--ship-package: needs an --address to ship to")
-    if request.executor == "inline":
-        return InlineExecutor()
-    if place.uri.startswith("memory://"):
-        raise RecrlError(f"{place.uri}: is memory of a single process; use --executor inline")
-    from recrl.orchestrator.ray.executor import RayExecutor  # noqa: PLC0415  (imports ray)
-
-    return RayExecutor(
+    grid = read_grid(request.grid)
+    options = LaunchOptions(
+        root=request.root,
+        storage=request.storage,
+        only=parse_only(request.only),
+        retry_failed=request.retry_failed,
+        rerun_damaged=request.rerun_damaged,
+        rerun_changed=request.rerun_changed,
+        max_concurrent=request.max_concurrent,
         address=request.address,
         ship_package=request.ship_package,
-        cpus_per_trial=grid.resources.cpus_per_trial,
-        gpus_per_trial=grid.resources.gpus_per_trial,
-        custom_per_trial=grid.resources.custom_per_trial,
-        max_concurrent=request.max_concurrent or grid.resources.max_concurrent,
-        teacher=grid.resources.teacher,
-        silence_seconds=grid.resources.silence_seconds,
+        executor=request.executor,
+        mlflow=request.mlflow,
+        tracking_uri=request.tracking_uri,
+        figures=request.figures,
     )
+    return launch_and_print(grid, options, console, given=request.given)
 
 
-def _sync_to(uri: str) -> Callable[[SweepStore], BackgroundSync]:
-    return lambda store: start_sync(store, uri, interval_seconds=SYNC_INTERVAL_SECONDS)
+def launch_and_print(
+    grid: GridSpec, options: LaunchOptions, console: Console, *, given: Sequence[str]
+) -> ExitCode:
+    """Run the incomplete trials of a checked grid, and print progress and results.
+
+    Args:
+        grid: the grid.
+        options: of the launch.
+        console: where to print.
+        given: the arguments of ``recrl-sweep`` that continue the launch.
+    """
+    outcome = launch_grid(grid, options, _Printer(grid, options, console))
+    place, store = outcome.place, outcome.place.store
+    kept = f", a local copy of {place.address}" if place.address else ""
+    say(console, f"Results    {short(store.folder)}{kept}")
+    if outcome.tracking_uri:
+        _say_synced(outcome, outcome.tracking_uri, options, console)
+    if outcome.sweep:
+        _say_results(outcome.sweep, console)
+    report = store.figures_folder / "report.html"
+    if outcome.sweep and options.figures and report.exists():
+        say(console, f"Report     {short(report)}")
+    return _say_result(outcome.result, store, options, given, console)
 
 
-def _say_starting(request: LaunchRequest, console: Console) -> None:
-    where = f"Connecting to the Ray cluster at {request.address}" if request.address else "Starting Ray"
-    say(console, f"{where} ...")
+class _Printer(LaunchListener):
+    """Listener that prints what a launch does."""
+
+    def __init__(self, grid: GridSpec, options: LaunchOptions, console: Console) -> None:
+        self._grid = grid
+        self._options = options
+        self._console = console
+        self._store = SweepStore(options.root, grid.name)
+
+    @contextmanager
+    def planned(self, plan: Plan, *, at_once: int, where: str) -> Iterator[None]:
+        """Print the plan; show the progress while trials run."""
+        say_plan(plan, self._grid, self._console, at_once=at_once, where=where)
+        say_other_code(plan, self._console)
+        if not plan.to_do:
+            yield
+            return
+        if self._options.executor == "ray":
+            address = self._options.address
+            doing = f"Connecting to the Ray cluster at {address}" if address else "Starting Ray"
+            say(self._console, f"{doing} ...")
+        chosen = [trial.spec for trial in plan.trials]
+        with display.live_progress(lambda: progress(chosen, self._store), self._console):
+            yield
+
+    def stopping(self) -> None:
+        """Print that trials save their state."""
+        say(self._console, "Stopping: running trials save their state. Press again to stop at once.")
+
+    def drawing(self) -> None:
+        """Print that figures are being drawn: it takes long."""
+        say(self._console, "Drawing figures ...")
+
+    def drawn(self, folder: Path) -> None:
+        """Print the place of the figures."""
+        say(self._console, f"Figures    {short(folder)}")
+
+    def failed_to_draw(self, error: Exception) -> None:
+        """Print the error, and how to see its traceback."""
+        reason = f"({type(error).__name__}: {error}), because of a bug in recrl"
+        say(self._console, f"Figures    not all are drawn {reason}")
+        say(self._console, f"           for its traceback: recrl-sweep figures {self._grid.name}")
+
+    def filming(self, trials: Sequence[TrialStore]) -> None:
+        """Print the place of the videos."""
+        folder = short(self._store.trials_folder)
+        say(self._console, f"Videos     {folder}/*/{trials[0].videos_folder.name}")
+
+    def failed_to_film(self, error: RecrlError) -> None:
+        """Print the error."""
+        say(self._console, f"           no video: {error}")
 
 
 def _say_results(sweep: Sweep, console: Console) -> None:
     """Print return and cost of the final policies."""
-    from recrl.analysis.data.validity import curriculum_warnings  # noqa: PLC0415
+    from recrl.analysis.data.sweep_warnings import curriculum_warnings  # noqa: PLC0415
     from recrl.orchestrator.cli.result_table import result_table  # noqa: PLC0415
 
     table, caption = result_table(sweep)
@@ -162,69 +147,31 @@ def _say_results(sweep: Sweep, console: Console) -> None:
         say(console, "")
 
 
-def _draw_at_end(sweep: Sweep, store: SweepStore, console: Console) -> None:
-    """Draw a launch's figures. If that fails, log the error and continue: MLflow must still be updated."""
-    say(console, "Drawing figures ...")
-    try:
-        draw(sweep, store.figures_folder, console)
-    except (RecrlError, OSError):
-        raise
-    except Exception as error:
-        logger.debug("figures of %s", store.name, exc_info=True)
-        say(
-            console,
-            f"Figures    not all are drawn ({type(error).__name__}: {error}), because of a bug in recrl",
-        )
-        say(console, f"           for its traceback: recrl-sweep figures {store.name}")
-
-
-def _film(
-    grid: GridSpec, after: SweepProgress, store: SweepStore, stop: threading.Event, console: Console
-) -> None:
-    """Film complete trials without a video, if the grid requests it."""
-    seeds = {"none": (), "first-seed": grid.seeds[:1], "all": grid.seeds}[grid.run.videos]
-    complete = [trial.spec for trial in after.with_status(DisplayStatus.COMPLETE) if trial.spec.seed in seeds]
-    unseen = [store.trial(spec) for spec in complete if not any(store.trial(spec).videos_folder.glob("*"))]
-    if not unseen:
-        return
-    from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
-    from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415  (imports torch)
-    from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
-
-    say(console, f"Videos     {short(store.trials_folder)}/*/{unseen[0].videos_folder.name}")
-    for trial in unseen:
-        if stop.is_set():
-            return
-        try:
-            SavedTrial.load(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
-        except RecrlError as error:  # a failed video is no failure of the sweep
-            say(console, f"           no video: {error}")
-
-
-def _say_synced(
-    result: SweepResult, store: SweepStore, uri: str, request: LaunchRequest, console: Console
-) -> None:
+def _say_synced(outcome: LaunchOutcome, uri: str, options: LaunchOptions, console: Console) -> None:
     """Print the address of the sweep in MLflow, the command to open it, and whether it is up to date."""
+    store = outcome.place.store
     place = [store.name]
-    if request.root != DEFAULT_ROOT:
-        place += ["--root", str(request.root)]
-    if request.tracking_uri:
-        place += ["--tracking-uri", redacted(request.tracking_uri)]
-    where = redacted(uri) if request.tracking_uri else short(store.mlflow_database)
+    if options.root != DEFAULT_ROOT:
+        place += ["--root", str(options.root)]
+    if options.tracking_uri:
+        place += ["--tracking-uri", redacted(options.tracking_uri)]
+    where = redacted(uri) if options.tracking_uri else short(store.mlflow_database)
     say(console, f"MLflow     {where}")
     say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
-    if not result.synced:  # a sync that was killed leaves the report of an earlier pass
+    if not outcome.result.synced:  # a sync that was killed leaves the report of an earlier pass
         report = last_report(store, uri)
         problem = f" ({report.problem})" if report and report.problem else ""
         again = shlex.join(["recrl-sweep", "sync", *place])
         say(console, f"           MLflow is not up to date{problem}; nothing is lost: {again}")
 
 
-def _say_result(result: SweepResult, store: SweepStore, request: LaunchRequest, console: Console) -> ExitCode:
+def _say_result(
+    result: SweepResult, store: SweepStore, options: LaunchOptions, given: Sequence[str], console: Console
+) -> ExitCode:
     """Print the result of a launch, and how to continue."""
     say(console, f"{store.name}: {display.status_sentence(result.progress)}")
     say_failures(result.progress, store, console)
-    again = shlex.join(["recrl-sweep", *request.given])
+    again = shlex.join(["recrl-sweep", *given])
     if result.progress.is_complete:
         return ExitCode.OK
     if result.stopped:
@@ -232,10 +179,10 @@ def _say_result(result: SweepResult, store: SweepStore, request: LaunchRequest, 
         return ExitCode.STOPPED
     if damaged := result.progress.with_status(DisplayStatus.DAMAGED):
         them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
-        rerun = again if request.rerun_damaged else f"{again} --rerun-damaged"
+        rerun = again if options.rerun_damaged else f"{again} --rerun-damaged"
         say(console, f"{them} left alone; to move the damaged files aside and run again: {rerun}")
     if result.failed:
-        retry = again if request.retry_failed else f"{again} --retry-failed"
+        retry = again if options.retry_failed else f"{again} --retry-failed"
         say(console, f"Try what failed again with: {retry}")
     elif not damaged:
         say(console, f"Not everything could be finished. Continue with: {again}")

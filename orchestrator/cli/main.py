@@ -12,8 +12,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse, readable
-from recrl.orchestrator.cli.requests import LaunchRequest, Request
+from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.errors import (
     ClusterError,
     GridError,

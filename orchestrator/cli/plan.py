@@ -8,16 +8,17 @@ from rich.console import Console
 
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import print_table, say, short
-from recrl.orchestrator.cli.requests import GridRequest, LaunchRequest, PlanRequest, ValidateRequest
-from recrl.orchestrator.cli.sweeps import wanted
+from recrl.orchestrator.cli.requests import PlanRequest, ValidateRequest
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.code_changes import other_code_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
-from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, trials_at_once, unmeasured
-from recrl.orchestrator.remote.opening import sweep_place
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import read_grid
+from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, unmeasured
+from recrl.orchestrator.grid.selection import parse_only
+from recrl.orchestrator.launching import room
+from recrl.orchestrator.provenance.code_changes import other_code_sentence
+from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialState
 
 
@@ -46,12 +47,14 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     plan = make_plan(
         grid.trials(),
         store,
-        only=wanted(request.only),
+        only=parse_only(request.only),
         retry_failed=request.retry_failed,
         rerun_damaged=request.rerun_damaged,
         rerun_changed=request.rerun_changed,
     )
-    at_once, where = room(grid, request)
+    at_once, where = room(
+        grid.resources, address=request.address, max_concurrent=request.max_concurrent, cores=request.cores
+    )
     print_table(display.plan_table(plan), console)
     say(console, "")
     speeds = _measured(plan, console) if request.measure else {}
@@ -65,20 +68,8 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
         say(console, f"damaged: {problem}")
     for orphan in plan.orphans:
         say(console, f"no longer in the grid, not touched: {short(orphan.folder)}")
-    return ExitCode.TRIALS_LEFT if request.check and plan.to_do else ExitCode.OK
-
-
-def room(grid: GridSpec, request: GridRequest) -> tuple[int, str]:
-    """Return the number of parallel trials, and where: on a cluster if there is an address."""
-    inline = isinstance(request, LaunchRequest) and request.executor == "inline"
-    most = 1 if inline else request.max_concurrent or grid.resources.max_concurrent
-    if request.address and not inline:
-        from recrl.orchestrator.ray.executor import room_on_cluster  # noqa: PLC0415  (imports ray)
-
-        return most or max(1, room_on_cluster(request.address, grid.resources)), "on the cluster at present"
-    cores = request.cores if isinstance(request, PlanRequest) else None
-    fitting = trials_at_once(cpus_per_trial=grid.resources.cpus_per_trial, max_concurrent=most, cores=cores)
-    return fitting, f"on {cores} cores" if cores else "on this machine"
+    is_left = plan.to_do or plan.other_code
+    return ExitCode.TRIALS_LEFT if request.check and is_left else ExitCode.OK
 
 
 def _measured(plan: Plan, console: Console) -> dict[str, float]:

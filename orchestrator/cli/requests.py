@@ -1,21 +1,19 @@
-"""Requests of ``recrl-sweep``: one frozen, typed value per command, with its arguments.
+"""The commands of ``recrl-sweep``, each as a frozen, typed request with its arguments.
 
-A class is a command: its name is the command's, its docstring the summary, and each field an argument with
-its settings for ``argparse``. ``arguments`` makes the parser. Imports only the standard library, so that
-``--help`` is fast.
+``argument_fields`` says how a class declares them. Imports almost nothing, so that ``--help`` is fast.
 """
 
 # ruff: noqa: RUF009  (what looks like a default is a dataclass field)
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from recrl.orchestrator.cli import argument_types as types
+from recrl.orchestrator.cli.argument_fields import Request, by_flag, by_place
 
 VIDEOS = ("gif", "mp4")
 TEMPLATES = ("demo", "safety-gym", "velocity", "own-task")
@@ -46,68 +44,6 @@ _TRACKING: Mapping[str, Any] = {
     "help": "an MLflow server (http://host:port) or database (sqlite:///file.db); "
     "by default one in the sweep's folder",
 }
-
-
-def by_place(**settings: Any) -> Any:
-    """A field that is given by its place; ``settings`` are those of ``add_argument``."""
-    return field(metadata={"flag": None, "settings": settings})
-
-
-def by_flag(flag: str = "", *, group: str = "", **settings: Any) -> Any:
-    """A field that is given by a flag.
-
-    Args:
-        flag: by default ``--`` and the field's name.
-        group: options of one group exclude each other.
-        settings: those of ``add_argument``.
-    """
-    return field(metadata={"flag": flag, "group": group, "settings": settings})
-
-
-@dataclass(frozen=True)
-class Request:
-    """Common part of all requests.
-
-    Attributes:
-        given: the arguments as they were typed.
-    """
-
-    trusted: ClassVar[bool] = False  # whether the command itself is the permission to follow import paths
-    given: tuple[str, ...]
-
-    @classmethod
-    def of(cls, parsed: argparse.Namespace) -> Self:
-        """Make a request of parsed arguments; lists become tuples."""
-        values = {field.name: getattr(parsed, field.name) for field in fields(cls)}
-        return cls(**{key: tuple(it) if isinstance(it, list) else it for key, it in values.items()})
-
-    @classmethod
-    def add_to(cls, command: argparse.ArgumentParser) -> None:
-        """Add the arguments of all fields."""
-        groups: dict[str, Any] = {"": command}
-        for each in fields(cls):
-            settings = each.metadata.get("settings")
-            if settings is None:
-                continue
-            flag, group = each.metadata["flag"], each.metadata.get("group", "")
-            if flag is None:
-                command.add_argument(each.name, **settings)
-                continue
-            if group not in groups:
-                groups[group] = command.add_mutually_exclusive_group()
-            flag = flag or f"--{each.name.replace('_', '-')}"
-            groups[group].add_argument(flag, dest=each.name, **settings)
-
-    @property
-    def about(self) -> Path | str | None:
-        """The grid, the sweep, or the file to write, as it was typed."""
-        names = (name for name in ("grid", "sweep", "to") if hasattr(self, name))
-        return getattr(self, next(names, ""), None)
-
-    @property
-    def follows_import_paths(self) -> bool:
-        """Whether import paths in files are followed."""
-        return self.trusted or bool(getattr(self, "trust", False))
 
 
 @dataclass(frozen=True)
@@ -189,7 +125,10 @@ class PlanRequest(GridRequest):
     cores: int | None = by_flag(
         group="room", type=types.at_least_one, metavar="N", help="estimate for this number of cores"
     )
-    check: bool = by_flag(action="store_true", help="exit with code 5 if a launch would have something to do")
+    check: bool = by_flag(
+        action="store_true",
+        help="exit with code 5 if a launch would have something to do, or trials come from other code",
+    )
     measure: bool = by_flag(
         action="store_true",
         help="run about a second of each task and agent without a known speed, to estimate the time",
@@ -412,7 +351,8 @@ class OptionsRequest(Request):
 
     name: str = by_place(
         metavar="NAME",
-        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits",
+        help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits, "
+        "tasks, agents, methods",
     )
     trust: bool = by_flag(**_TRUST)
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import pandas as pd
 
+from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.validity import curriculum_flags
-from recrl.analysis.report_tables import number, with_error
-from recrl.analysis.report_verdicts import measured_how, tolerance_sentence, verdict_text
-from recrl.analysis.statistics.feasibility import OPTIMAL_GAP
+from recrl.analysis.data.sweep_warnings import curriculum_flags
+from recrl.analysis.report.table_formats import names_of, number, with_error
+from recrl.analysis.report.verdict_texts import measured_how, tolerance_sentence, verdict_text
 from recrl.analysis.statistics.metrics import outcomes
-from recrl.analysis.statistics.verdict_counts import verdicts
+from recrl.analysis.statistics.verdict_counts import count_verdicts
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
 
 
 def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:
@@ -26,31 +28,30 @@ def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:
     """
     if sweep.evaluations.empty:
         return pd.DataFrame(), ""
-    rows = verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep))
-    return pd.DataFrame([_line(row, sweep.num_costs) for _, row in rows.iterrows()]), caption(rows)
+    rows = count_verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), cost_names(sweep))
+    suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
+    return pd.DataFrame([_line(row, suffixes) for _, row in rows.iterrows()]), caption(rows)
 
 
 def caption(rows: pd.DataFrame) -> str:
     """Return two lines: how the numbers were measured, and what the verdicts allow.
 
     Args:
-        rows: of ``verdicts.verdicts``.
+        rows: of ``verdict_counts.count_verdicts``.
     """
     several = int(rows["seeds"].max()) > 1
     means = "means over n seeds, returns ± standard error" if several else "one seed (n = 1): no intervals"
     return (
         f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"
-        f"Verdicts: solved (feasible, and within {OPTIMAL_GAP} of the optimum), feasible, or infeasible by "
+        f"Verdicts: solved (feasible, and within {SOLVED_GAP} of the optimum), feasible, or infeasible by "
         f"how much. {tolerance_sentence(rows)}"
     )
 
 
-def _line(row: pd.Series, num_costs: int) -> dict[str, str]:
-    line = {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
-    line["n"] = str(row["seeds"])
+def _line(row: pd.Series, suffixes: Sequence[str]) -> dict[str, str]:
+    line = names_of(row) | {"n": str(row["seeds"])}
     line["return"] = with_error(row["episode_return"], row["episode_return_se"])
-    for i in range(num_costs):
-        which = "" if num_costs == 1 else f" {i + 1}"
+    for i, which in enumerate(suffixes):
         line[f"cost{which}"] = with_error(row[f"cost_{i}"], math.nan, digits=3)
         line[f"limit{which}"] = number(row[f"deploy_limit_{i}"])
     return line | {"verdict": verdict_text(row)}

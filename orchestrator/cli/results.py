@@ -12,9 +12,9 @@ from recrl.orchestrator.cli.requests import ExportRequest, FiguresRequest, Merge
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.grid.grid import read_name
+from recrl.orchestrator.grid.checking import read_name
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.tracking.address import checked_uri
+from recrl.orchestrator.tracking.client import checked_uri
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep
@@ -66,7 +66,7 @@ def run_merge(request: MergeRequest, console: Console) -> ExitCode:
 
 def say_warnings(sweep: Sweep, console: Console) -> None:
     """Print the trials that are left out, and other remarks on validity."""
-    from recrl.analysis.data.validity import damages, doubts  # noqa: PLC0415  (imports pandas)
+    from recrl.analysis.data.sweep_warnings import damages, doubts  # noqa: PLC0415  (imports pandas)
 
     for sentence in damages(sweep):
         say(console, f"damaged: {sentence}")
@@ -97,7 +97,7 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
 
 def draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True) -> None:
     """Draw a sweep's figures, tables and report, and print their place."""
-    from recrl.analysis.report import averagings, draw, sketch  # noqa: PLC0415  (imports matplotlib)
+    from recrl.analysis.report.drawing import curve_averages, draw, sketch  # noqa: PLC0415  (imports matplotlib)
 
-    (draw if whole else sketch)(sweep, folder, averaging=averagings()[band])
+    (draw if whole else sketch)(sweep, folder, averaging=curve_averages()[band])
     say(console, f"Figures    {short(folder)}")

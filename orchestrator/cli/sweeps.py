@@ -1,76 +1,15 @@
-"""Find a command's sweep: by its name, folder or grid file, here or in an object store."""
+"""The sweep of a command."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 from recrl.orchestrator.cli.requests import SweepRequest
-from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_name
-from recrl.orchestrator.remote.opening import sweep_place
-from recrl.orchestrator.validation import nearest
-
-EXPORT_SUFFIX = ".zip"
-
-
-def sweep_store(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
-    """Find the sweep of a command.
-
-    Args:
-        root: the folder of all sweeps.
-        sweep: its name, its folder or its grid file; None for the only sweep there.
-        storage: the address of an object store to search; None to search ``root``.
-
-    Raises:
-        RecrlError: there is no such sweep, or more than one.
-    """
-    place: str | Path = storage or root
-    if storage:
-        from recrl.orchestrator.remote.remote_sweep import sweeps_at  # noqa: PLC0415  (imports fsspec)
-
-        names = sweeps_at(storage)
-    else:
-        names = sorted(path.name for path in root.glob("*") if is_sweep(path))
-    if sweep is None:
-        if len(names) == 1:
-            return SweepStore(root, names[0])
-        listed = f"give one: {', '.join(names)}" if names else "launch one first"
-        raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
-    if sweep.endswith((".yaml", ".yml")):
-        sweep = read_name(Path(sweep))
-    if sweep.endswith(EXPORT_SUFFIX) and sweep not in names:
-        raise RecrlError(
-            f"{sweep}: an export has tables but no policies, logs or trials; give the sweep's name or folder"
-        )
-    if sweep not in names:
-        folder = Path(sweep).absolute()
-        if not storage and (is_sweep(folder) or (folder / "trials").is_dir()):
-            return SweepStore(folder.parent, folder.name)
-        listed = f" (there: {', '.join(names)})" if names else ", nothing was launched there yet"
-        raise RecrlError(f"{place}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
-    return SweepStore(root, sweep)
-
-
-def is_sweep(folder: Path) -> bool:
-    """Whether a sweep was launched into this folder."""
-    return (folder / "sweep.json").exists() or (folder / "trials.jsonl").exists()
+from recrl.orchestrator.find_sweep import find_sweep
+from recrl.orchestrator.remote.remote_sweep import sweep_place
 
 
 def open_store(request: SweepRequest, *, checkpoints: bool = False) -> SweepStore:
     """Return the folder of the sweep, brought up to date if it is a local copy."""
-    store = sweep_store(request.root, request.sweep, request.storage)
+    store = find_sweep(request.root, request.sweep, request.storage)
     sweep_place(store, request.storage).refresh(checkpoints=checkpoints)
     return store
-
-
-def wanted(pairs: Sequence[str]) -> dict[str, list[str]]:
-    """Parse ``["method=none,linear", "seed=0"]`` for ``plan.select``."""
-    wanted: dict[str, list[str]] = {}
-    for pair in pairs:
-        key, equals, values = pair.partition("=")
-        if not equals or not values:
-            raise RecrlError(f"--only: must look like method=dynamic or seed=0,1, got {pair!r}")
-        wanted.setdefault(key, []).extend(values.split(","))
-    return wanted

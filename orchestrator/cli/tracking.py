@@ -11,7 +11,7 @@ from recrl.orchestrator.cli.requests import SyncRequest, UIRequest
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.ui import open_ui

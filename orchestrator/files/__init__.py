@@ -1,1 +1,1 @@
-"""Files of a sweep: writing, reading, checking, and provenance."""
+"""Files of a sweep: writing, reading and checking."""

@@ -23,24 +23,17 @@ def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
 
 def no_curriculum_sentence(titles: Sequence[str]) -> str:
     """Return the warning about trials whose measured d_t is not above d_d; empty for none."""
-    if not titles:
-        return ""
-    return (
-        f"the measured d_t is not above d_d, so that the curriculum is none: {_named(titles)}; give a finite "
-        "train_limits above d_d"
-    )
+    what = "the measured d_t is not above d_d, so that the curriculum is none"
+    return _warning(what, titles, "give a finite train_limits above d_d")
 
 
 def hard_landing_sentence(titles: Sequence[str]) -> str:
     """Return the warning about trials that ``landed_hard``; empty for none."""
-    if not titles:
-        return ""
-    return (
-        f"hard landing, the limit was still far above d_d when deployment began: {_named(titles)}; give the "
-        "curriculum more steps, a smaller window or a smaller d_t"
-    )
+    what = "hard landing, the limit was still far above d_d when deployment began"
+    return _warning(what, titles, "give the curriculum more steps, a smaller window or a smaller d_t")
 
 
-def _named(titles: Sequence[str]) -> str:
+def _warning(what: str, titles: Sequence[str], remedy: str) -> str:
+    """Return a warning that names the first trials; empty for none."""
     more = f" and {len(titles) - NAMED} more" if len(titles) > NAMED else ""
-    return ", ".join(titles[:NAMED]) + more
+    return f"{what}: {', '.join(titles[:NAMED])}{more}; {remedy}" if titles else ""

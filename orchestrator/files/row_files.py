@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.errors import DamagedError, RowError
-from recrl.orchestrator.files.small_files import write_atomically
+from recrl.orchestrator.files.atomic_files import write_atomically
 
 PIECE_BYTES = 2**20
 EMPTY_DIGEST = hashlib.sha256().hexdigest()

@@ -56,9 +56,7 @@ from typing import IO, Any
 
 from recrl.orchestrator.errors import DamagedError, StorageError, SweepBusyError
 from recrl.orchestrator.files.aside import move_aside
-from recrl.orchestrator.files.locks import look_at_lock, open_lock
-from recrl.orchestrator.files.row_files import Extent
-from recrl.orchestrator.files.small_files import (
+from recrl.orchestrator.files.atomic_files import (
     read_sealed,
     read_whole,
     sealed,
@@ -66,7 +64,9 @@ from recrl.orchestrator.files.small_files import (
     write_atomically,
     write_sealed,
 )
-from recrl.orchestrator.files.trial_paths import Below
+from recrl.orchestrator.files.locks import look_at_lock, open_lock
+from recrl.orchestrator.files.row_files import Extent
+from recrl.orchestrator.files.trial_files import Below
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 

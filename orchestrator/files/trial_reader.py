@@ -1,4 +1,4 @@
-"""Read a trial's spec, record and committed bytes, and find damage.
+"""Read a trial's spec, record, tables and checkpoints, and find damage.
 
 A file that is shorter than its committed length, or whose committed bytes have changed, is damaged. Then the
 trial's status is DAMAGED and its data are not used.
@@ -6,17 +6,21 @@ trial's status is DAMAGED and its data are not used.
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
+import pandas as pd
+
 from recrl.orchestrator.errors import CheckpointError, DamagedError, OtherFormatError, StorageError
 from recrl.orchestrator.files import checkpoint_format
+from recrl.orchestrator.files.atomic_files import parsed_object, read_sealed
 from recrl.orchestrator.files.row_files import Extent, digest_of, shortage
-from recrl.orchestrator.files.small_files import read_sealed
-from recrl.orchestrator.files.trial_paths import TrialPaths
+from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, TrialFiles
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
@@ -27,7 +31,7 @@ LOOKS = 3  # reads of files that an attempt may be changing, before they are cal
 Found = TypeVar("Found")
 
 
-class TrialReader(TrialPaths):
+class TrialReader(TrialFiles):
     """Reader of a trial's files, checked against their commits."""
 
     @property
@@ -212,6 +216,42 @@ class TrialReader(TrialPaths):
             f"{path.name} is not what was committed: its checksum differs"
         )
         raise DamagedError(f"{self.folder.name}: {self._damaged(stated, wrong).error}")
+
+    def episodes(self) -> pd.DataFrame:
+        """Read the committed episodes: EPISODE_COLUMNS, then cost_i and limit_i for each cost.
+
+        This and the other readers raise DamagedError if a file differs from its commit.
+        """
+        return self._committed_csv(self.episodes_path)
+
+    def updates(self) -> pd.DataFrame:
+        """Read the committed policy updates: UPDATE_COLUMNS, cost_i, limit_i, then the agent's metrics."""
+        return self._committed_csv(self.updates_path)
+
+    def events(self) -> list[dict[str, Any]]:
+        """Read the committed events, in order; each has ``update``, ``end_step`` and ``event``."""
+        return [json.loads(line) for line in self.committed_bytes(self.events_path).splitlines()]
+
+    def evaluation(self) -> pd.DataFrame:
+        """Read the final evaluations: EVALUATION_COLUMNS, then cost_i; empty before the end."""
+        rows = self._committed_csv(self.evaluation_path)
+        return rows if len(rows.columns) else pd.DataFrame(columns=list(EVALUATION_COLUMNS))
+
+    def policy(self) -> pd.DataFrame:
+        """Read the final policy pi(a | s): one row per state, columns action_j; empty if missing."""
+        return self._committed_csv(self.policy_path)
+
+    def provenance(self) -> list[dict[str, Any]]:
+        """Read the provenance of each attempt, the first one first; empty if the trial never began."""
+        data = self.committed_bytes(self.provenance_path)
+        if not data:
+            return []
+        attempts: list[dict[str, Any]] = parsed_object(data, self.provenance_path.name).get("attempts", [])
+        return attempts
+
+    def _committed_csv(self, path: Path) -> pd.DataFrame:
+        data = self.committed_bytes(path)
+        return pd.read_csv(io.BytesIO(data)) if data else pd.DataFrame()
 
     def load_checkpoint(self, path: Path) -> dict[str, Any]:
         """Read a checkpoint of this trial: ``trial``, the trial's state, and the writer's data.

@@ -11,14 +11,18 @@ import os
 import secrets
 import socket
 import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.files.aside import move_aside
+from recrl.orchestrator.files.atomic_files import parsed_object, read_whole, write_sealed
+from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.row_files import Extent, digest_of
-from recrl.orchestrator.files.small_files import parsed_object, read_whole, write_sealed
-from recrl.orchestrator.files.trial_folder import TrialFolder
-from recrl.orchestrator.files.trial_reader import SPEC_FORMAT
+from recrl.orchestrator.files.trial_files import FileKind, files_of
+from recrl.orchestrator.files.trial_reader import RECORD_FORMAT, SPEC_FORMAT, TrialReader
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -28,8 +32,34 @@ RESERVE_BYTES = 16 * 1024  # room for a record and a traceback
 logger = logging.getLogger("recrl.trial")
 
 
-class TrialStore(TrialFolder):
-    """The folder of one trial: methods for readers, and for starting an attempt."""
+class TrialStore(TrialReader):
+    """The folder of one trial: methods for readers, for writers, and for starting an attempt."""
+
+    def write_record(self, record: TrialRecord) -> None:
+        """Write ``state.json``; the caller holds ``locked``."""
+        value = {"trial_id": self.trial_id, **record.to_json()}
+        write_sealed(self.state_path, value, version=RECORD_FORMAT)
+
+    def move_aside(self, path: Path, *, copy: bool = False) -> None:
+        """Keep a file of the trial, or what is in its place, in ``aside/``; nothing if it is not there."""
+        move_aside(path, self.aside_folder, copy=copy)
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Turn what a full or lost disk raises into a StorageError that says how to go on."""
+        try:
+            yield
+        except OSError as error:
+            update = self.saved_update
+            saved = f"it goes on from update {update}" if update else "it starts anew"
+            raise StorageError(
+                f"{self.folder.name}: its files cannot be written ({error.strerror or error}); "
+                f"{saved} when there is room and the sweep is launched again"
+            ) from error
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Exclude other writers of this trial on the same file system, for a moment."""
+        return locked(self.lock_path)
 
     def begin(self, spec: TrialSpec) -> TrialWriter:
         """Take over the trial: from now on only the returned writer may write.
@@ -79,7 +109,7 @@ class TrialStore(TrialFolder):
         Damaged files are moved aside, but row files are copied: an older checkpoint may still need their
         beginning.
         """
-        rows = (self.episodes_path, self.updates_path, self.events_path)
+        rows = files_of(FileKind.ROWS)
         try:
             old = self._stated()
         except DamagedError as error:
@@ -94,7 +124,7 @@ class TrialStore(TrialFolder):
                 whole[name] = extent
                 continue
             logger.warning("%s: %s is not what was committed; it is moved aside", self.folder.name, name)
-            self.move_aside(self.folder / name, copy=self.folder / name in rows)
+            self.move_aside(self.folder / name, copy=name in rows)
         return replace(old, **as_fields(whole))
 
     def _attempts_made(self) -> int:
@@ -116,7 +146,7 @@ class TrialStore(TrialFolder):
         for path in self.folder.glob("*"):
             if path.is_dir() and path.suffix:  # the trial's own folders have none
                 self.move_aside(path)
-        for path in (self.folder / ".lock", self.reserve_path):
+        for path in (self.lock_path, self.reserve_path):
             if path.is_dir():
                 self.move_aside(path)
 
@@ -131,7 +161,7 @@ class TrialStore(TrialFolder):
             if not self.folder.is_dir():
                 return
             with self.locked():
-                kept = {self.aside_folder, self.evaluations_folder, self.videos_folder, self.folder / ".lock"}
+                kept = {self.aside_folder, self.evaluations_folder, self.videos_folder, self.lock_path}
                 number = 1 + len(list(self.aside_folder.glob("run-*")))
                 place = self.aside_folder / f"run-{number:03d}"
                 place.mkdir(parents=True)

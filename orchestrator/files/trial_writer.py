@@ -17,18 +17,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recrl.environments.cmdp import EpisodeStats
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, RowError
 from recrl.orchestrator.files import checkpoint_format
+from recrl.orchestrator.files.atomic_files import write_atomically, write_sealed
 from recrl.orchestrator.files.row_files import Extent, RowFile, rows_text
-from recrl.orchestrator.files.small_files import write_atomically, write_sealed
-from recrl.orchestrator.files.trial_folder import TrialFolder
-from recrl.orchestrator.files.trial_paths import PROVENANCE
+from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
-from recrl.orchestrator.files.trial_tables import EPISODE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialState
+
+if TYPE_CHECKING:
+    from recrl.orchestrator.files.trial_store import TrialStore
 
 KEPT_CHECKPOINTS = 2
 PROVENANCE_FORMAT = 2
@@ -46,7 +47,7 @@ class TrialWriter:
         record: the last record this writer wrote.
     """
 
-    def __init__(self, store: TrialFolder, record: TrialRecord, spec: TrialSpec) -> None:
+    def __init__(self, store: TrialStore, record: TrialRecord, spec: TrialSpec) -> None:
         self.store = store
         self.record = record
         self._agent = f"agent {spec.agent.label}"
@@ -55,7 +56,10 @@ class TrialWriter:
         self._updates = RowFile(store.updates_path)
         self._events = RowFile(store.events_path)
         self._rows = (self._episodes, self._updates, self._events)
-        names = (store.spec_path.name, PROVENANCE)  # other files are written anew, or resumed by ``restore``
+        names = (
+            store.spec_path.name,
+            store.provenance_path.name,
+        )  # other files are written anew, or resumed by ``restore``
         self._whole = {name: extent for name, extent in record.extents.items() if name in names}
         self._cpu_origin = time.process_time()
         self._cpu_before = record.cpu_seconds
@@ -152,13 +156,14 @@ class TrialWriter:
     def add_provenance(self, provenance: Mapping[str, Any]) -> None:
         """Append the provenance of this attempt to that of earlier ones."""
         with self._lease():
-            before = self.store.provenance() if PROVENANCE in self._whole else []
-            if PROVENANCE not in self._whole:
+            name = self.store.provenance_path.name
+            before = self.store.provenance() if name in self._whole else []
+            if name not in self._whole:
                 self.store.move_aside(self.store.provenance_path)
             attempts = [*before, {"attempt": self.record.attempt, **provenance}]
             write_sealed(self.store.provenance_path, {"attempts": attempts}, version=PROVENANCE_FORMAT)
-            self._whole[PROVENANCE] = Extent.of(self.store.provenance_path.read_bytes())
-            committed = {**self.record.extents, PROVENANCE: self._whole[PROVENANCE]}
+            self._whole[name] = Extent.of(self.store.provenance_path.read_bytes())
+            committed = {**self.record.extents, name: self._whole[name]}
             self._write_record(**as_fields(committed))
 
     def commit(self, tree: dict[str, Any], *, update: int, env_steps: int, **changes: Any) -> None:

@@ -20,7 +20,7 @@ from recrl.agents.registry import AGENTS, find_agent
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import TASKS, find_task, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
-from recrl.orchestrator.grid.grid_file import Limits, Resources, Run
+from recrl.orchestrator.grid.file_models import Entry, Limits, Resources, Run, TaskEntry
 from recrl.orchestrator.validation import model_in, nearest
 from recrl.teachers.registry import TEACHERS, find_teacher
 
@@ -107,6 +107,7 @@ KINDS: Mapping[str, Kind] = {
 
 
 SECTIONS: Mapping[str, type[BaseModel]] = {"run": Run, "resources": Resources, "limits": Limits}
+LISTS: Mapping[str, type[BaseModel]] = {"tasks": TaskEntry, "agents": Entry, "methods": Entry}
 
 
 def listed(kind: Kind) -> Iterator[tuple[str, str]]:

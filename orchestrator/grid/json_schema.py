@@ -13,7 +13,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaMode, models_json
 
 from recrl.environments.plugins import IMPORT_PATH
 from recrl.orchestrator.grid.catalogue import KINDS, Kind
-from recrl.orchestrator.grid.grid_file import GridFile
+from recrl.orchestrator.grid.file_models import GridFile
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 MODE: JsonSchemaMode = "validation"

@@ -11,20 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.files.code_changes import has_other_code
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.grid.selection import select
+from recrl.orchestrator.provenance.code_changes import has_other_code
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.validation import nearest
 
 # Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the MLflow
 # sync; rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers are additional.
 GIGABYTES_PER_TRIAL = 0.35
 GIGABYTES_AROUND = 1.2
-
-SELECTABLE = ("task", "agent", "method", "seed")
 
 
 class PlannedAction(StrEnum):
@@ -143,7 +140,7 @@ def make_plan(
     Args:
         specs: the trials of the grid, all of them.
         store: of the sweep; need not exist.
-        only: the selected trials, see ``select``; all by default.
+        only: the selected trials, see ``selection.select``; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again; other damaged ones
             always are. If true, every file is read and its digest checked.
@@ -217,27 +214,6 @@ def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: 
     return min(fitting, max_concurrent or fitting)
 
 
-def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> tuple[TrialSpec, ...]:
-    """Return the trials that match all conditions.
-
-    Args:
-        specs: the trials of the grid.
-        wanted: acceptable labels (or seeds, as text) for some of ``SELECTABLE``.
-
-    Raises:
-        RecrlError: no trial of the grid has a given key or value.
-    """
-    for key, values in wanted.items():
-        if key not in SELECTABLE:
-            raise RecrlError(f"--only: trials are chosen by {', '.join(SELECTABLE)}, got {key!r}")
-        known = list(dict.fromkeys(_label(spec, key) for spec in specs))
-        for value in values:
-            if value not in known:
-                hint = nearest(value, known)
-                raise RecrlError(f"--only: no trial has {key} {value!r}{hint} (known: {', '.join(known)})")
-    return tuple(spec for spec in specs if all(_label(spec, key) in values for key, values in wanted.items()))
-
-
 def _planned_action(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> PlannedAction:
     match record.status:
         case TrialState.COMPLETE:
@@ -255,7 +231,3 @@ def kind_of(spec: TrialSpec) -> str:
     """Return the key of trials with about equal speed: task, agent and number of environments."""
     kind: tuple[Choice | int, ...] = (spec.task, spec.agent, spec.num_envs, spec.rollout_steps)
     return repr(kind)
-
-
-def _label(spec: TrialSpec, key: str) -> str:
-    return str(spec.seed) if key == "seed" else str(getattr(spec, key).label)

@@ -16,8 +16,8 @@ from typing import Any
 import ray
 
 from recrl.orchestrator.errors import ClusterError
-from recrl.orchestrator.files.own_package import copy_package
 from recrl.orchestrator.files.scratch import scratch_folder
+from recrl.orchestrator.provenance.own_package import copy_package
 from recrl.orchestrator.ray.private_api import (
     at_loopback,
     fewer_processes,

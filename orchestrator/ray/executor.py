@@ -52,7 +52,7 @@ from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep_progress import SILENCE_SECONDS
 
 if TYPE_CHECKING:
-    from recrl.orchestrator.grid.grid_file import Resources
+    from recrl.orchestrator.grid.file_models import Resources
 
 logger = logging.getLogger("recrl.sweep")
 

@@ -18,7 +18,7 @@ from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.spec import TrialState
 
-HEARTBEAT_SECONDS = 2.0  # smallest time between two reads of the heartbeats
+HEARTBEAT_READ_SECONDS = 2.0  # smallest time between two reads of the heartbeats
 STARTUP_GRACE_FACTOR = 5  # startup grace period, in multiples of ``silence_seconds``
 
 logger = logging.getLogger("recrl.sweep")
@@ -81,7 +81,7 @@ def _sign_of(record: TrialRecord) -> tuple[int, float]:
 
 def look_seconds(silence_seconds: float) -> float:
     """Return the time until the next read of the heartbeats: each read opens a file per running trial."""
-    return min(max(HEARTBEAT_SECONDS, silence_seconds / 30.0), silence_seconds / 4.0)
+    return min(max(HEARTBEAT_READ_SECONDS, silence_seconds / 30.0), silence_seconds / 4.0)
 
 
 def _end_process(record: TrialRecord | None, actor: Any) -> None:

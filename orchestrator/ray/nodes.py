@@ -119,7 +119,7 @@ def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
             except importlib.metadata.PackageNotFoundError:
                 found[name] = ""
         try:
-            package = importlib.import_module("recrl.orchestrator.files.own_package")
+            package = importlib.import_module("recrl.orchestrator.provenance.own_package")
             found["recrl's source"] = package.source_digest()
         except ImportError:
             found["recrl's source"] = ""

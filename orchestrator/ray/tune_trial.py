@@ -17,7 +17,7 @@ from ray import tune
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
-from recrl.orchestrator.remote.opening import sweep_place
+from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialSpec
 
 
@@ -44,7 +44,7 @@ class TuneTrial(tune.Trainable):
             TeacherUnavailableError: the teacher does not answer; Tune tries the trial again.
             StorageError: the object store was down for too long; Tune tries the trial again.
         """
-        from recrl.orchestrator.trial.runner import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
+        from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
         if not self._stop_sign.is_set():
             with _given_gpu(), self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:

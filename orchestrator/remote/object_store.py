@@ -1,10 +1,10 @@
 """Object stores: read, write, create, list and delete whole objects.
 
-The only module that imports fsspec, which has the protocols of S3, Google, Azure and others. Assumes their
-guarantees: objects are written atomically, and reads and lists see all earlier writes. With ``file://``
-objects are written to a temporary file and renamed. Leaves out credentials: every machine has its own, where
-fsspec finds them (environment, files, role). They are not passed on, stored or printed, and an address that
-contains one is refused.
+The only module that imports fsspec, at its first use. fsspec has the protocols of S3, Google, Azure and
+others. This module assumes their guarantees: objects are written atomically, and reads and lists see all
+earlier writes. With ``file://`` objects are written to a temporary file and renamed. It leaves out
+credentials: every machine has its own, where fsspec finds them (environment, files, role). They are not
+passed on, stored or printed, and an address that contains one is refused.
 """
 
 from __future__ import annotations
@@ -15,9 +15,6 @@ import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
-
-import fsspec
-from fsspec.registry import known_implementations
 
 from recrl.orchestrator.errors import RecrlError, StorageError
 
@@ -39,6 +36,8 @@ class ObjectStore:
         Raises:
             RecrlError: the address is invalid, or the package for its kind of store is missing.
         """
+        import fsspec  # noqa: PLC0415  (sweeps in a folder do not need it)
+
         self.uri = _checked(uri)
         protocol = self.uri.partition("://")[0]
         _require_package(self.uri, protocol)
@@ -193,6 +192,8 @@ def _require_package(uri: str, protocol: str) -> None:
     Raises:
         RecrlError: there is no such kind, or its package is missing.
     """
+    import fsspec  # noqa: PLC0415
+
     try:
         fsspec.get_filesystem_class(protocol)
     except ValueError as error:
@@ -207,6 +208,8 @@ def _require_package(uri: str, protocol: str) -> None:
 
 def _package(protocol: str) -> str:
     """Return the package for a kind of store; empty if it is fsspec itself."""
+    from fsspec.registry import known_implementations  # noqa: PLC0415
+
     package: str = known_implementations[protocol]["class"].partition(".")[0]
     return "" if package == "fsspec" else package
 

@@ -25,8 +25,8 @@ from pathlib import Path
 
 from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
+from recrl.orchestrator.files.atomic_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.locks import locked
-from recrl.orchestrator.files.small_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -281,6 +281,22 @@ class RemoteSweep(SweepPlace):
         self.store.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.store.folder / ".pull"):
             yield
+
+
+def sweep_place(store: SweepStore, given: str | None = None) -> SweepPlace:
+    """Return a sweep's place: the given address, the address stored in its folder, or the folder.
+
+    Args:
+        store: the sweep's folder on this machine.
+        given: the address of an object store, or None.
+
+    Raises:
+        RecrlError: the address is invalid, needs a package that is not installed, or cannot be read.
+    """
+    if not given and not store.storage_path.exists():
+        return SweepPlace(store)
+    uri = given or remembered_uri(store)
+    return RemoteSweep(uri, store) if uri else SweepPlace(store)
 
 
 def remembered_uri(store: SweepStore) -> str | None:

@@ -1,7 +1,7 @@
 """A trial in an object store: its objects, and their download to a folder.
 
     <address>/<sweep>/trials/<trial>/<attempt>-<token>/
-        commit-<number>     record, new rows and checkpoint: see ``commit``
+        commit-<number>     record, new rows and checkpoint: see ``commit_format``
         alive.json          while the attempt works: its record, every few seconds
 
 A trial runs in a folder of its machine, like any trial; ``upload`` sends each commit. Rules. Readers check
@@ -28,17 +28,16 @@ from pathlib import PurePosixPath
 from typing import Self
 
 from recrl.orchestrator.errors import StorageError
-from recrl.orchestrator.files.small_files import write_atomically, write_json
+from recrl.orchestrator.files.atomic_files import write_atomically, write_json
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.remote.commit import APPENDED, CHECKPOINT, COMMIT, Commit, Piece, unpack
+from recrl.orchestrator.remote.commit_format import APPENDED, CHECKPOINT, COMMIT, Commit, Piece, unpack
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.spec import TrialState
 
 LOOKS = 3  # wait for a newer commit, before a damaged one is reported
 
 ALIVE = "alive.json"
-PULLED = ".pulled.json"
 _ATTEMPT = re.compile(r"(\d{6})-[0-9a-f]{16}")
 
 logger = logging.getLogger("recrl.trial")
@@ -181,7 +180,7 @@ class _Pulled:
     def of(cls, trial: TrialStore) -> Self:
         """Read it from the folder."""
         try:
-            value = json.loads((trial.folder / PULLED).read_text())
+            value = json.loads(trial.pulled_path.read_text())
             return cls(value["key"], Commit.from_json(value["commit"]))
         except (OSError, ValueError, KeyError, TypeError):
             return cls("", Commit(TrialRecord(), {}))
@@ -189,7 +188,7 @@ class _Pulled:
     def write(self, trial: TrialStore) -> None:
         """Store it in the folder."""
         trial.folder.mkdir(parents=True, exist_ok=True)
-        write_json(trial.folder / PULLED, {"key": self.key, "commit": self.commit.to_json()})
+        write_json(trial.pulled_path, {"key": self.key, "commit": self.commit.to_json()})
 
 
 def _missing(

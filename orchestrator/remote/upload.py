@@ -17,10 +17,11 @@ from recrl.orchestrator.background import beside
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
+from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.remote import patience
-from recrl.orchestrator.remote.commit import APPENDED, WHOLE, Commit, Piece, pack
+from recrl.orchestrator.remote.commit_format import APPENDED, WHOLE, Commit, Piece, pack
 from recrl.orchestrator.remote.patience import patiently
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial, attempt_of, attempts_in, size_of
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -28,8 +29,6 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 LOOK_SECONDS = 0.5  # between two checks of the trial's folder
 ALIVE_SECONDS = 15.0  # between two signs of life
 KEPT_COMMITS = 2  # a reader may still use the last but one
-
-ROWS = ("episodes.csv", "updates.csv", "events.jsonl")
 
 logger = logging.getLogger("recrl.trial")
 
@@ -60,8 +59,8 @@ class Upload:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
             LostLeaseError: a newer attempt runs the trial.
         """
-        record = self._trial.stated()
-        if not record.token or record.token == self._before:
+        record = self._own_record()
+        if record is None:
             return
         if self._shown is None or time.monotonic() >= self._spoke_at + ALIVE_SECONDS:
             self._speak(record)
@@ -69,18 +68,18 @@ class Upload:
             self.push()
 
     def finish(self) -> None:
-        """Send the remaining commits, after the attempt's end.
-
-        Raises:
-            StorageError: the store cannot be written; nothing is lost, the next call tries again.
-            LostLeaseError: a newer attempt runs the trial.
-        """
-        record = self._trial.stated()
-        if not record.token or record.token == self._before:
+        """Send the remaining commits, after the attempt's end; raise the errors of ``follow``."""
+        record = self._own_record()
+        if record is None:
             return
         self._speak(replace(record, heartbeat=time.time()))  # uploads may take long
         self.push()
         self._remote.objects.delete([f"{attempt_of(record)}/{ALIVE}"])
+
+    def _own_record(self) -> TrialRecord | None:
+        """Return the record of the attempt to upload; None before it has begun."""
+        record = self._trial.stated()
+        return None if record.token in ("", self._before) else record
 
     def push(self) -> None:
         """Send a commit of the present files.
@@ -120,9 +119,10 @@ class Upload:
         with self._trial.locked():
             record = self._trial.stated()
             saved, rows = _newest_checkpoint(self._trial)
-            extents = {**record.extents, **dict.fromkeys(ROWS, Extent()), **rows}
+            extents = {**record.extents, **dict.fromkeys(files_of(FileKind.ROWS), Extent()), **rows}
             committed = {name: extent.length for name, extent in extents.items()}
-            lengths = {**committed, "log.txt": size_of(self._trial, "log.txt")}
+            logs = {name: size_of(self._trial, name) for name in files_of(FileKind.LOG)}
+            lengths = {**committed, **logs}
             kept: dict[str, tuple[Piece, ...]] = {}
             new: dict[str, tuple[int, bytes]] = {}
             for name in APPENDED:

@@ -19,7 +19,7 @@ from pathlib import Path
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import RedactedStream
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
-from recrl.orchestrator.tracking.client import ENVIRONMENT
+from recrl.orchestrator.tracking.client import MLFLOW_SETTINGS
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker
 from recrl.orchestrator.tracking.positions import sync_folder
@@ -69,7 +69,7 @@ def start_sync(store: SweepStore, uri: str, *, interval_seconds: float) -> Backg
         process = subprocess.Popen(
             [*command, "--interval", str(interval_seconds), "--parent", str(os.getpid())],
             # In the environment and not among the arguments, which other users can see.
-            env={**ENVIRONMENT, **os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1"},
+            env={**MLFLOW_SETTINGS, **os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1"},
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,

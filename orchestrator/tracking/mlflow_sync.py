@@ -25,7 +25,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
-from recrl.orchestrator.files.small_files import write_json
+from recrl.orchestrator.files.atomic_files import write_json
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -73,7 +73,7 @@ def sync(
 
     Args:
         store: the sweep.
-        uri: of ``address.tracking_uri``.
+        uri: of ``client.tracking_uri``.
         rebuild: delete the sweep's runs in MLflow and send everything again.
         write_export: writes the sweep's export file, for its upload; None to upload none.
 

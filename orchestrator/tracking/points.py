@@ -31,7 +31,7 @@ from itertools import islice
 import pandas as pd
 
 from recrl.environments.cmdp import Phase
-from recrl.orchestrator.files.trial_tables import UPDATE_COLUMNS
+from recrl.orchestrator.files.trial_files import UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec
 
 POINTS_PER_METRIC = 100

@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from recrl.orchestrator.files.atomic_files import write_json
 from recrl.orchestrator.files.locks import locked
-from recrl.orchestrator.files.small_files import write_json
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.redaction import redacted
-from recrl.orchestrator.tracking.address import sqlite_path
-from recrl.orchestrator.tracking.client import ENVIRONMENT, EXPERIMENTS, connect, one_line
+from recrl.orchestrator.tracking.client import EXPERIMENTS, MLFLOW_SETTINGS, connect, one_line, sqlite_path
 from recrl.orchestrator.tracking.export_file import FILE_NAME, FOLDER, UPLOADED_TAG
 
 if TYPE_CHECKING:
@@ -62,8 +61,8 @@ def _download(uri: str, name: str | None, folder: Path) -> Download:
     path = sqlite_path(uri)
     if path is not None and not path.exists():
         raise TrackingError(f"{path}: no such file; MLflow would make an empty one")
-    environment = ENVIRONMENT | {"MLFLOW_HTTP_REQUEST_TIMEOUT": str(TIMEOUT_SECONDS)}
-    client = connect(uri, environment=environment)
+    settings = MLFLOW_SETTINGS | {"MLFLOW_HTTP_REQUEST_TIMEOUT": str(TIMEOUT_SECONDS)}
+    client = connect(uri, settings=settings)
     parent = _parent(client, uri, name)
     run_id = str(parent.info.run_id)
     sizes = {file.path: file.file_size or 0 for file in client.list_artifacts(run_id, FOLDER)}

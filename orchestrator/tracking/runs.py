@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.tracking.address import is_server
-from recrl.orchestrator.tracking.client import EXPERIMENTS, connect
+from recrl.orchestrator.tracking.client import EXPERIMENTS, connect, is_server
 from recrl.orchestrator.tracking.points import VIEW, VIEW_STATE
 from recrl.orchestrator.tracking.positions import Position, file_mark
 
@@ -44,7 +43,7 @@ class SweepRuns:
 
         Args:
             store: the sweep.
-            uri: of ``address.tracking_uri``.
+            uri: of ``client.tracking_uri``.
             rebuild: first delete existing runs.
         """
         self.client = connect(uri)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -14,7 +14,6 @@ from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.points import Summary, charts_page, note
 from recrl.orchestrator.tracking.positions import Position, read_position, sync_folder
-from recrl.orchestrator.tracking.run_states import sweep_status
 from recrl.orchestrator.tracking.runs import SweepRuns
 
 
@@ -33,7 +32,7 @@ class SweepSync:
 
         Args:
             store: the sweep.
-            uri: of ``address.tracking_uri``.
+            uri: of ``client.tracking_uri``.
             runs: its runs.
             summary: returns the means of a trial that is complete.
             write_export: writes the export file; None to upload none.
@@ -94,3 +93,13 @@ class SweepSync:
         if position != self._position:
             position.write(self._path)
             self._position = position
+
+
+def sweep_status(counts: Mapping[DisplayStatus, int], *, live: bool) -> str:
+    """Return MLflow's state of a sweep with these numbers of trials by status."""
+    if live or counts[DisplayStatus.RUNNING]:
+        return "RUNNING"
+    if counts[DisplayStatus.FAILED]:
+        return "FAILED"
+    complete = counts[DisplayStatus.COMPLETE] == sum(counts.values())
+    return "FINISHED" if complete else "KILLED"

@@ -6,6 +6,7 @@ was damaged), MLflow has points that no longer exist. Then the run is deleted an
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.points import (
     Point,
     Row,
@@ -28,11 +30,12 @@ from recrl.orchestrator.tracking.points import (
     thinned,
 )
 from recrl.orchestrator.tracking.positions import Position, file_mark, read_position, sync_folder
-from recrl.orchestrator.tracking.run_states import mlflow_status, state_tags
 from recrl.orchestrator.tracking.runs import SweepRuns
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric
+
+MAX_ERROR = 5_000  # characters of a failed trial's error
 
 
 class TrialSync:
@@ -197,3 +200,34 @@ def _added_afterwards(trial: TrialStore) -> list[Path]:
     """Return evaluations and videos of the final policy, for artifacts in folders of these names."""
     folders = (trial.evaluations_folder, trial.videos_folder)
     return [path for folder in folders for path in sorted(folder.glob("update-*"))]
+
+
+def mlflow_status(record: TrialRecord, *, live: bool) -> str:
+    """Return MLflow's state of a trial that has begun.
+
+    Args:
+        record: of the trial; ``attempt`` is at least 1.
+        live: whether a launch runs that will resume waiting trials.
+    """
+    match display_status(record, now=time.time()):
+        case DisplayStatus.COMPLETE:
+            return "FINISHED"
+        case DisplayStatus.FAILED | DisplayStatus.DAMAGED:
+            return "FAILED"
+        case DisplayStatus.RUNNING:
+            return "RUNNING"
+        case DisplayStatus.INTERRUPTED:
+            return "KILLED"
+        case DisplayStatus.STOPPED | DisplayStatus.WAITING:
+            return "SCHEDULED" if live else "KILLED"
+
+
+def state_tags(record: TrialRecord) -> dict[str, str]:
+    """Return the changing tags of a trial's run; empty ones are left out."""
+    tags = {
+        "recrl.status": str(record.status),
+        "recrl.attempt": str(record.attempt),
+        "recrl.host": record.host,
+        "recrl.error": record.error[:MAX_ERROR],
+    }
+    return {name: value for name, value in tags.items() if value}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.tracking.address import is_server
+from recrl.orchestrator.tracking.client import is_server
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 from recrl.orchestrator.tracking.points import charts_page
 from recrl.orchestrator.tracking.positions import sync_folder

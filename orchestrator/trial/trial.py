@@ -4,11 +4,11 @@ Independent of Ray and MLflow. All of a trial's state (agent, optimisers, multip
 generators, counters, partial episodes) is in one tree. So a trial that was killed and resumed gives the same
 bytes as an uninterrupted one.
 
-The steps of an update: collect T x B environment steps; append the finished episodes; call
-``agent.update(rollout, episode costs, step)`` with the curriculum's step, then ``teacher.step(state,
-report)`` for the next one. After the budget B the phase is deployment: the limits are d_d, the noise is 0,
-and the teacher is not called any more. The agent continues learning. At the end the final policy is evaluated
-without learning.
+The steps of an update: collect T steps in each environment; call ``agent.update(rollout, episode costs,
+step)`` with the curriculum's step; append the finished episodes and the update's row; call
+``teacher.step(state, report)`` for the next step of the curriculum. After the budget B the phase is
+deployment: the limits are d_d, the noise is 0, and the teacher is not called any more. The agent continues
+learning. At the end the final policy is evaluated without learning.
 """
 
 from __future__ import annotations
@@ -26,23 +26,29 @@ from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded, FinalPoli
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import CurriculumStep, EpisodeStats, Floats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Floats, Phase
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.orchestrator.errors import (
-    RowError,
-)
+from recrl.orchestrator.errors import RowError
+from recrl.orchestrator.files.curriculum_warnings import HARD_LANDING
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.rollout_check import check_rollout
-from recrl.teachers.teacher import ProgressReport, Teacher, TeacherState, checked_answer
+from recrl.teachers.teacher import (
+    ProgressReport,
+    Teacher,
+    TeacherState,
+    check_limits_fall,
+    checked_answer,
+)
 
 LOGGED_UPDATES = 50
 """Approximate number of log lines of a trial."""
-HARD_LANDING = 0.1
-"""Fraction of d_d (of 1, if d_d is smaller) by which the last training limit may exceed d_d without an event.
-"""
+LANDING_FRACTION = 0.1
+"""Fraction of d_t - d_d by which the last training limit may exceed d_d without an event.
+
+It is a fraction of d_d, or of 1, where that is larger."""
 
 logger = logging.getLogger("recrl.trial")
 
@@ -93,8 +99,8 @@ class Trial:
         tree = writer.restore()
         if tree is None:
             self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
-            self._step, self._teacher_state = self._checked(teacher.start())
             self.update = self.env_steps = self._episodes = 0
+            self._step, self._teacher_state = self._checked(teacher.start(), before=None)
             logger.info("started: %s", spec.title)
         else:
             self._load(tree)
@@ -199,7 +205,8 @@ class Trial:
             return
         before = self._step
         report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
-        self._step, self._teacher_state = self._checked(self._teacher.step(self._teacher_state, report))
+        answer = self._teacher.step(self._teacher_state, report)
+        self._step, self._teacher_state = self._checked(answer, before=before.limits)
         if self._step.start_limits is not None and self._step.start_limits != before.start_limits:
             limits = self._step.start_limits.to_json()
             self._event("start limits measured", limits=limits)
@@ -215,18 +222,29 @@ class Trial:
                 "not support; choose another of the two"
             )
 
-    def _checked(self, answer: object) -> tuple[CurriculumStep, TeacherState]:
-        return checked_answer(answer, self.spec.method.label, self._cmdp.num_costs)
+    def _checked(self, answer: object, *, before: CostLimits | None) -> tuple[CurriculumStep, TeacherState]:
+        """Check the curriculum's answer; ``before`` has the limits before it, None at the start."""
+        label = self.spec.method.label
+        step, state = checked_answer(answer, label, self._cmdp.num_costs)
+        check_limits_fall(
+            step,
+            before,
+            self.spec.train_limits,
+            curriculum=label,
+            cost_names=self._cmdp.cost_names,
+            update=self.update,
+        )
+        return step, state
 
     def _warn_of_hard_landing(self) -> None:
         """Record an event if deployment begins with limits far below the last training limits."""
         before, after = self._step.limits, self.spec.deploy_limits
         start = self._step.start_limits or self.spec.train_limits
         if any(
-            late - final > HARD_LANDING * max(first - final if math.isfinite(first) else 0.0, final, 1.0)
+            late - final > LANDING_FRACTION * max(first - final if math.isfinite(first) else 0.0, final, 1.0)
             for first, late, final in zip(start, before, after, strict=True)
         ):
-            self._event("hard landing", limits=before.to_json(), deploy_limits=after.to_json())
+            self._event(HARD_LANDING, limits=before.to_json(), deploy_limits=after.to_json())
 
     def _told(self, row: Mapping[str, Any]) -> str:
         """Format return and costs of an update as a log line."""

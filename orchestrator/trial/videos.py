@@ -19,7 +19,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.files.small_files import write_atomically
+from recrl.orchestrator.files.atomic_files import write_atomically
 
 Frame = npt.NDArray[np.uint8]
 

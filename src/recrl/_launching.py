@@ -18,15 +18,14 @@ from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_in
 from recrl.orchestrator.errors import GridError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid, read_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from recrl.analysis.data.sweep_data import Sweep
-    from recrl.orchestrator.cli.requests import LaunchRequest
 
 Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
@@ -93,30 +92,28 @@ def launch(
         GridError: the grid is wrong; nothing was started.
         RecrlError: another process runs the sweep, or Ray, MLflow or the disk cannot be used.
     """
-    from recrl.orchestrator.cli.requests import LaunchRequest  # noqa: PLC0415
+    # of the command line only what prints is used
+    from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
+    from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
+    from recrl.orchestrator.launching import LaunchOptions, launch_grid  # noqa: PLC0415
 
     if executor not in ("ray", "inline"):
         raise RecrlError(f"executor: must be 'ray' or 'inline', got {executor!r}")
-    request = LaunchRequest(
-        given=("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml"),
+    options = LaunchOptions(
         root=Path(root),
-        storage=None,
-        grid=Path(),
-        only=(),
-        retry_failed=False,
-        rerun_damaged=False,
-        rerun_changed=False,
         max_concurrent=max_concurrent,
         address=address,
-        tracking_uri=None,
         executor=executor,
-        ship_package=False,
         mlflow=mlflow,
         figures=figures,
     )
     with modules_in(Path.cwd()):
         checked = _checked(grid)
-        _launch(checked, request, quiet=not progress)
+        if progress:
+            given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
+            launch_and_print(checked, options, TextConsole(), given=given)
+        else:
+            launch_grid(checked, options)
         return load_sweep(Path(root) / checked.name, trust=True)
 
 
@@ -245,13 +242,6 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     except GridError as error:
         problems = [re.sub(rf"^{SOURCE}:\d+: ", "", problem) for problem in error.problems]
         raise GridError(problems) from error
-
-
-def _launch(grid: GridSpec, request: LaunchRequest, *, quiet: bool) -> None:
-    from recrl.orchestrator.cli.launch import launch_grid  # noqa: PLC0415
-    from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
-
-    launch_grid(grid, request, TextConsole(quiet=quiet))
 
 
 @contextmanager

@@ -51,15 +51,15 @@ def load_sweep(
         >>> sweep.evaluations.groupby(["task", "method"])["cost_0"].mean()  # doctest: +SKIP
     """
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415
-    from recrl.orchestrator.cli.sweeps import sweep_store  # noqa: PLC0415
-    from recrl.orchestrator.tracking.address import checked_uri  # noqa: PLC0415
+    from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
+    from recrl.orchestrator.tracking.client import checked_uri  # noqa: PLC0415
 
     with following(trust):
         if "://" in str(source):
             return from_mlflow.load(checked_uri(str(source)), name)
         if str(source).endswith(export.SUFFIX):
             return export.load(Path(source))
-        return sweep_data.load(sweep_store(Path(root), str(source)))
+        return sweep_data.load(find_sweep(Path(root), str(source)))
 
 
 def load_policy(
@@ -122,9 +122,9 @@ def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
 
 def _folder_below(source: str | Path, trial_id: str) -> Path:
     """The folder of a trial of the sweep with this name or folder."""
-    from recrl.orchestrator.cli.sweeps import sweep_store  # noqa: PLC0415
+    from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
 
-    store = sweep_store(Path("runs"), str(source))
+    store = find_sweep(Path("runs"), str(source))
     trial = next((it for it in store.trials() if it.trial_id == trial_id), None)
     if trial is None:
         raise RecrlError(

@@ -12,7 +12,9 @@ from scipy.optimize import brentq
 from recrl.agents.agent import Rollout
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.constraints.cost_measures import (
+    Episodes,
     MeanCost,
+    RecentEpisodes,
     TailCost,
     conditional_value_at_risk,
     tail_costs,
@@ -97,55 +99,117 @@ def test_at_level_0_and_value_at_risk_0_tail_costs_are_costs() -> None:
 
 
 def rollout_of(costs: Floats) -> Rollout:
-    """T steps of one environment with one cost, none of which ends an episode."""
-    steps = len(costs)
-    never, nothing = np.zeros((steps, 1), bool), np.zeros((0, 1), np.float32)
+    """Steps with one cost, [T] or [T, B], none of which ends an episode."""
+    costs = costs.reshape(len(costs), -1, 1)
+    shape = costs.shape[:2]
+    never, nothing = np.zeros(shape, bool), np.zeros((0, 1), np.float32)
     return Rollout(
-        observations=np.zeros((steps, 1, 1), np.float32),
-        actions=np.zeros((steps, 1), np.int64),
-        rewards=np.zeros((steps, 1)),
-        costs=costs.reshape(steps, 1, 1),
+        observations=np.zeros((*shape, 1), np.float32),
+        actions=np.zeros(shape, np.int64),
+        rewards=np.zeros(shape),
+        costs=costs,
         terminated=never,
         truncated=never,
         final_observations=nothing,
-        last_observations=np.zeros((1, 1), np.float32),
-        carried_costs=np.zeros((1, 1)),
-        carried_lengths=np.zeros(1, np.int64),
+        last_observations=np.zeros((shape[1], 1), np.float32),
+        carried_costs=np.zeros((shape[1], 1)),
+        carried_lengths=np.zeros(shape[1], np.int64),
     )
+
+
+def episodes_of(*costs: float, finished: int | None = None, length: int = 10) -> Episodes:
+    """Episodes of one cost and one length, of which the last ``finished`` are new."""
+    return Episodes(
+        column(*costs),
+        np.full(len(costs), length),
+        finished=len(costs) if finished is None else finished,
+    )
+
+
+NONE = Episodes(np.empty((0, 1)), np.empty(0, np.int64), finished=0)
 
 
 def test_without_a_finished_episode_the_value_at_risk_stays_and_nothing_is_known() -> None:
     form = TailCost(0.5, 1)
     limit = np.array([9.0])
-    form.constraint_costs(rollout_of(np.zeros(1)), column(1.0, 2.0, 3.0), limit)
-    costs, values = form.constraint_costs(rollout_of(np.array([1.0, 3.0])), np.empty((0, 1)), limit)
-    assert costs.ravel().tolist() == [0.0, 4.0]
-    assert math.isnan(values[0])
+    form.measure(rollout_of(np.zeros(1)), episodes_of(1.0, 2.0, 3.0), limit)
+    found = form.measure(rollout_of(np.array([1.0, 3.0])), episodes_of(7.0, finished=0), limit)
+    assert found.step_costs.ravel().tolist() == [0.0, 4.0]
+    assert math.isnan(found.values[0])
     resumed = TailCost(0.5, 1)
     resumed.load_state_dict(form.state_dict())
-    found, _ = resumed.constraint_costs(rollout_of(np.array([1.0, 3.0])), np.empty((0, 1)), limit)
-    assert found.ravel().tolist() == [0.0, 4.0]
+    again = resumed.measure(rollout_of(np.array([1.0, 3.0])), NONE, limit)
+    assert again.step_costs.ravel().tolist() == [0.0, 4.0]
 
 
-def test_the_mean_form_leaves_costs_alone() -> None:
-    rollout = rollout_of(np.array([1.0, 3.0]))
-    limit = np.array([9.0])
-    costs, values = MeanCost().constraint_costs(rollout, column(1.0, 2.0), limit)
-    assert costs is rollout.costs
-    assert values.tolist() == [1.5]
-    assert math.isnan(MeanCost().constraint_costs(rollout, np.empty((0, 1)), limit)[1][0])
+def test_the_mean_is_that_of_the_episodes_where_enough_finished() -> None:
+    rollout = rollout_of(np.array([[1.0, 1.0], [3.0, 3.0]]))
+    found = MeanCost(2).measure(rollout, episodes_of(1.0, 3.0), np.array([9.0]))
+    assert found.step_costs is rollout.costs
+    assert (found.values.tolist(), found.standard_errors.tolist()) == ([2.0], [1.0])
+
+
+def test_where_few_episodes_finished_the_mean_is_that_of_the_steps() -> None:
+    """Two environments cost 0.5 and 1.5 a step; episodes of 10 steps cost 5 and 15 by that, 99 long ago."""
+    rollout = rollout_of(np.array([[0.0, 1.0], [1.0, 2.0]]))
+    for finished in (0, 1):
+        found = MeanCost(2).measure(rollout, episodes_of(99.0, 99.0, finished=finished), np.array([9.0]))
+        assert found.values.tolist() == [10.0]
+        assert found.standard_errors.tolist() == pytest.approx([5.0])
+
+
+def test_with_few_environments_the_mean_is_that_of_the_window() -> None:
+    rollout = rollout_of(np.zeros((3, 2)))
+    found = MeanCost(3).measure(rollout, episodes_of(2.0, 4.0, 6.0, finished=1), np.array([9.0]))
+    assert found.values.tolist() == [4.0]
+    unknown = MeanCost(3).measure(rollout, episodes_of(2.0, 4.0, 6.0, finished=0), np.array([9.0]))
+    assert math.isnan(unknown.values[0])
+
+
+def test_the_mean_is_unknown_until_an_episode_tells_its_length() -> None:
+    assert math.isnan(MeanCost(1).measure(rollout_of(np.ones(3)), NONE, np.array([9.0])).values[0])
+
+
+def test_the_estimate_from_steps_is_right_for_random_lengths() -> None:
+    """Each step costs 1 with probability 0.3 and ends the episode with 0.02: 0.3 x 50 an episode."""
+    generator = np.random.default_rng(0)
+    window = RecentEpisodes(16, 1)
+    carried, found = np.zeros(64, np.int64), []
+    for _ in range(400):
+        costs = (generator.random((4, 64)) < 0.3).astype(float)
+        ended, lengths = generator.random((4, 64)) < 0.02, []
+        for over in ended:
+            carried += 1
+            lengths += carried[over].tolist()
+            carried[over] = 0
+        episodes = window.add(np.zeros((len(lengths), 1)), np.array(lengths, np.int64))
+        if len(episodes.lengths):
+            found.append(MeanCost(17).measure(rollout_of(costs), episodes, np.array([9.0])).values[0])
+    assert np.mean(found[50:]) == pytest.approx(15.0, rel=0.05)
+
+
+def test_the_window_has_the_newest_update_and_earlier_ones_until_it_is_full() -> None:
+    window = RecentEpisodes(3, 1)
+    window.add(column(1.0, 2.0), np.array([1, 2]))
+    window.add(column(3.0, 4.0), np.array([3, 4]))
+    found = window.add(np.empty((0, 1)), np.empty(0, np.int64))
+    assert (found.costs.ravel().tolist(), found.finished) == ([1.0, 2.0, 3.0, 4.0], 0)
+    resumed = RecentEpisodes(3, 1)
+    resumed.load_state_dict(window.state_dict())
+    for each in (window, resumed):
+        found = each.add(column(5.0), np.array([5]))
+        assert found.costs.ravel().tolist() == [3.0, 4.0, 5.0]
+        assert (found.lengths.tolist(), found.finished) == ([3, 4, 5], 1)
 
 
 def test_where_the_limit_is_violated_all_cost_beyond_it_counts() -> None:
     """All episodes cost 9: the CVaR is flat; cost beyond the limit 5 is not, (9 - 5) / 0.25 beyond 5."""
     form = TailCost(0.75, 1)
-    costs, values = form.constraint_costs(
-        rollout_of(np.array([4.0, 3.0, 2.0])), column(9.0, 9.0), np.array([5.0])
-    )
-    assert costs.ravel().tolist() == [0.0, 8.0, 8.0]
-    assert values.tolist() == [5.0 + 16.0]
-    _, unlimited = form.constraint_costs(rollout_of(np.zeros(1)), column(9.0, 9.0), np.array([math.inf]))
-    assert unlimited.tolist() == [9.0]
+    found = form.measure(rollout_of(np.array([4.0, 3.0, 2.0])), episodes_of(9.0, 9.0), np.array([5.0]))
+    assert found.step_costs.ravel().tolist() == [0.0, 8.0, 8.0]
+    assert found.values.tolist() == [5.0 + 16.0]
+    unlimited = form.measure(rollout_of(np.zeros(1)), episodes_of(9.0, 9.0), np.array([math.inf]))
+    assert unlimited.values.tolist() == [9.0]
 
 
 @pytest.mark.parametrize("limit", [0.5, 2.0, 4.0, 9.0])
@@ -153,7 +217,8 @@ def test_the_bound_is_within_the_limit_exactly_where_the_cvar_is(limit: float) -
     generator = np.random.default_rng(0)
     for _ in range(50):
         costs = generator.gamma(1.0, 2.0, size=(20, 1))
-        _, values = TailCost(0.7, 1).constraint_costs(rollout_of(np.zeros(1)), costs, np.array([limit]))
+        episodes = Episodes(costs, np.ones(20, np.int64), finished=20)
+        values = TailCost(0.7, 1).measure(rollout_of(np.zeros(1)), episodes, np.array([limit])).values
         exact = conditional_value_at_risk(costs, 0.7)
         assert values[0] >= exact[0]
         if exact[0] <= limit:

@@ -11,9 +11,9 @@ from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.learning.batch import LearningBatch
-from recrl.agents.learning.networks import NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
 from recrl.agents.trust_region.cpo_dual import StepCase
 from recrl.environments.cmdp import Floats
 

@@ -20,9 +20,9 @@ from recrl.agents.algorithms.p3o import PenalisedProximalPolicyOptimisation, pen
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Categorical
-from recrl.agents.learning.networks import NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
 from recrl.environments.cmdp import Floats
 
 STATES = np.array([0, 0, 1, 1, 1, 2])

@@ -14,14 +14,15 @@ from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.algorithms.p3o import penalised_surrogate_objective
 from recrl.agents.algorithms.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning import networks
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.gradient_ascent import Objective, with_entropy
-from recrl.agents.learning.networks import FlatParameters, NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
+from recrl.agents.networks import tanh_stack
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.environments.cmdp import Floats
 
 SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
@@ -119,7 +120,7 @@ def differences(parameters: FlatParameters, value: Callable[[], float]) -> Float
 def test_an_objectives_gradient_is_its_finite_differences(
     name: str, space: Space[object], compact: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(networks, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(tanh_stack, "BLOCK_ROWS", 7)
     torch.manual_seed(0)
     policy, experience = moved_policy(space, compact)
     objective = OBJECTIVES[name](experience)
@@ -139,7 +140,7 @@ def test_an_objectives_gradient_is_its_finite_differences(
 
 
 def test_the_critics_gradient_is_its_finite_differences(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(networks, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(tanh_stack, "BLOCK_ROWS", 7)
     generator = torch.Generator().manual_seed(0)
     critics = Critics(3, 2, FORM, generator)
     rows, targets = torch.randn(20, 3, generator=generator), torch.randn(3, 20, generator=generator)

@@ -84,6 +84,12 @@ def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates
     assert state["integral"].tolist() == pytest.approx([1.0, 0.9])
 
 
+def test_a_large_violation_counts_no_more_than_the_largest_in_both_terms() -> None:
+    gains: dict[str, Any] = {"proportional": 0.5, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
+    state = pid(start_pid(2, 0.0), np.array([60.0, 3.0]), largest=5.0, **gains)
+    assert state["multipliers"].tolist() == pytest.approx([0.5 * 5.0 + 0.1 * 5.0, 0.5 * 3.0 + 0.1 * 3.0])
+
+
 def test_a_gap_counts_by_its_limit_and_by_how_well_it_is_known() -> None:
     gaps = relative_gaps(
         np.array([50.0, 50.0, 2.0, -25.0, -math.inf, 3.0, 0.0]),

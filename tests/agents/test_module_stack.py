@@ -12,8 +12,10 @@ from torch import Tensor, nn
 
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.errors import NetworkError
-from recrl.agents.learning.module_stack import ModuleStack, checked_module
-from recrl.agents.learning.networks import FlatParameters, TanhStack, orthogonal
+from recrl.agents.networks.architecture import orthogonal
+from recrl.agents.networks.flat_parameters import FlatParameters
+from recrl.agents.networks.module_stack import ModuleStack, checked_module
+from recrl.agents.networks.tanh_stack import TanhStack
 from recrl.agents.registry import make_agent
 from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CostLimits, CurriculumStep
@@ -159,6 +161,12 @@ def mixed_rows(num_inputs: int, num_outputs: int) -> nn.Module:
 def test_what_is_wrong_with_a_network_is_said(factory: Callable[[int, int], Any], sentence: str) -> None:
     with pytest.raises(NetworkError, match=sentence):
         checked_module(factory, 4, 2)
+
+
+@pytest.mark.parametrize("role", ["policy", "critic"])
+def test_a_wrong_shape_says_of_which_network(role: str) -> None:
+    with pytest.raises(NetworkError, match=rf"^the network of the {role} maps 2 rows of 4 numbers to "):
+        checked_module(of_another_shape, 4, 2, role=role)
 
 
 def test_a_file_of_somebody_else_runs_no_network() -> None:

@@ -20,9 +20,9 @@ from recrl.agents.algorithms.pcpo import ProjectionBasedConstrainedPolicyOptimis
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.batch import LearningBatch
-from recrl.agents.learning.networks import NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
 from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, projection_weights
 from recrl.environments.cmdp import Floats
 

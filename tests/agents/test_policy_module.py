@@ -7,10 +7,10 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from recrl.agents.encoding import Encoder
-from recrl.agents.learning.module_stack import perceptron
-from recrl.agents.learning.networks import INITIALISERS, NetworkForm
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
+from recrl.agents.networks.module_stack import perceptron
+from recrl.agents.observation_features import Encoder
 from recrl.agents.policy_module import PolicyModule
 from recrl.environments.cmdp import ObservationComponent
 

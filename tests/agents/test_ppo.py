@@ -16,9 +16,10 @@ from recrl.agents.learning.advantages import penalised_advantages
 from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Categorical
 from recrl.agents.learning.gradient_ascent import Objective, gradient_ascent, with_entropy, with_prices
-from recrl.agents.learning.networks import Adam, NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.flat_parameters import Adam
 from recrl.environments.cmdp import Floats
 
 SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]

@@ -9,12 +9,13 @@ from gymnasium.spaces import Discrete
 
 from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import SURROGATE_OBJECTIVES, PPOLagrangian
+from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import scaled_advantages
 from recrl.agents.learning.batch import LearningBatch
-from recrl.agents.learning.networks import NetworkForm, orthogonal
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
 
 STATES = np.array([0, 0, 1, 1, 1, 2])
 ACTIONS = np.array([0, 1, 0, 1, 1, 0])
@@ -59,7 +60,7 @@ def test_equal_shares_of_the_limit_have_equal_multipliers_whatever_the_limit(rul
 
 
 def test_a_pid_answers_half_a_limit_too_much_with_half_its_gain() -> None:
-    assert improved(2.5, 5.0)["multiplier_0"] == pytest.approx((0.5 * 0.2 + 0.5 * 0.1) * EXCHANGE)
+    assert improved(2.5, 5.0)["multiplier_0"] == pytest.approx((0.5 * 1.0 + 0.5 * 0.1) * EXCHANGE)
 
 
 def test_without_a_finished_episode_the_multiplier_stays() -> None:
@@ -128,13 +129,13 @@ def test_a_separate_penalty_is_not_clipped_by_hand() -> None:
 
 
 def test_episodes_have_their_own_lengths_however_short_the_rollout() -> None:
-    lengths, costs = np.array([10, 30]), np.array([[2.0], [4.0]])
-    found = Constraints.measure(costs, lengths, np.array([3.0]), np.array([1.0]))
+    measured = MeasuredCosts(np.zeros((1, 1, 1)), np.array([3.0]), np.array([1.0]))
+    found = Constraints.of(measured, np.array([10, 30]), np.array([1.0]))
     assert (found.episode_length, found.gaps.tolist(), found.standard_errors.tolist()) == (20.0, [2.0], [1.0])
 
 
 def test_without_an_episode_only_infinite_limits_are_known_to_be_kept() -> None:
-    nothing, unknown = np.empty((0, 2)), np.full(2, np.nan)
+    unknown = MeasuredCosts(np.zeros((1, 1, 2)), np.full(2, np.nan), np.zeros(2))
     none = np.empty(0, np.int64)
-    assert not Constraints.measure(nothing, none, unknown, np.array([math.inf, 1.0])).known
-    assert Constraints.measure(nothing, none, unknown, np.array([math.inf, math.inf])).known
+    assert not Constraints.of(unknown, none, np.array([math.inf, 1.0])).known
+    assert Constraints.of(unknown, none, np.array([math.inf, math.inf])).known

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from recrl.agents.learning.networks import FlatParameters
-from recrl.agents.trust_region.line_search import backtrack, conjugate_gradient
+from recrl.agents.networks.flat_parameters import FlatParameters
+from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
+from recrl.agents.trust_region.line_search import backtrack
 
 
 def test_conjugate_gradients_solve_a_system_in_as_many_steps_as_it_has_unknowns() -> None:

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from recrl.analysis import report, report_files
 from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.sweep_data import Sweep, drawn_columns
 from recrl.analysis.figures import styles
+from recrl.analysis.report import drawing, table_files
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 
@@ -60,15 +60,15 @@ def test_figures_and_tables_are_drawn_from_it(
     sweep = sweep_data.load(store)
     small = export.load(export.save(sweep, tmp_path / "sweep.zip"))
     for stem in ("learning-curves_cpo", "curricula"):
-        pictures = [report.drawings(it)[stem]() for it in (sweep, small)]
+        pictures = [drawing.drawings(it)[stem]() for it in (sweep, small)]
         one, other = (
             pixels(styles.save_png(picture, tmp_path / f"{number}.png"))
             for number, picture in enumerate(pictures)
             if picture is not None
         )
         assert np.abs(one - other).max() <= 4, stem  # a rounded curve has other soft edges
-    written, _ = report_files.write_tables(sweep, tmp_path / "files")
-    report_files.write_tables(small, tmp_path / "compact")
+    written, _ = table_files.write_tables(sweep, tmp_path / "files")
+    table_files.write_tables(small, tmp_path / "compact")
     for path in written:
         if path.name != "bounds.csv":  # sums over rounded updates
             assert path.read_bytes() == (tmp_path / "compact" / path.name).read_bytes(), path.name

@@ -17,7 +17,7 @@ from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.teachers.bounds import undiscounted_excess
 
 RIVER = TrialSpec(

@@ -18,7 +18,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
-from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
+from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 
@@ -73,7 +73,7 @@ def test_low_costs_stay_on_a_linear_axis(finished: Sweep) -> None:
 def test_two_costs_have_six_columns(made_up_sweep: Callable[..., SweepStore]) -> None:
     store = made_up_sweep(seeds=1, num_costs=2, tasks=["a"], agents=["cpo"], methods=["none", "step"])
     figure = learning_curves.learning_curves(sweep_data.load(store), "cpo")
-    assert [axes.get_title() for axes in figure.axes][4:] == ["episode cost 2", "cost 2 in deployment"]
+    assert [axes.get_title() for axes in figure.axes][4:] == ["episode cost 1", "cost 1 in deployment"]
     assert len(learning_curves.curricula(sweep_data.load(store)).axes) == 2
 
 
@@ -158,7 +158,7 @@ def test_each_cost_has_its_own_row(made_up_sweep: Callable[..., SweepStore]) -> 
     store = made_up_sweep(seeds=1, num_costs=2, tasks=["a"], agents=["cpo"], methods=["linear"])
     figure = return_against_cost(sweep_data.load(store))
     assert figure is not None
-    assert [axes.get_xlabel() for axes in figure.axes] == ["episode cost 1", "episode cost 2"]
+    assert [axes.get_xlabel() for axes in figure.axes] == ["episode cost 0", "episode cost 1"]
 
 
 def test_costs_equal_to_the_limit_do_not_fill_a_panel_with_rounding_errors(panel: Sweep) -> None:

@@ -19,8 +19,7 @@ from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking import export_file
-from recrl.orchestrator.tracking.address import tracking_uri
-from recrl.orchestrator.tracking.client import connect
+from recrl.orchestrator.tracking.client import connect, tracking_uri
 from recrl.orchestrator.tracking.export_file import ExportUpload, write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import Tracker, sync
 from recrl.orchestrator.tracking.positions import Position

@@ -170,6 +170,14 @@ def test_ends_of_wilsons_interval_are_one_quantile_away(runs: int, data: st.Data
     assert 0.0 <= interval.low <= interval.estimate <= interval.high <= 1.0
 
 
+@pytest.mark.parametrize("runs", [1, 2, 5, 20, 160])
+def test_wilsons_interval_is_that_of_scipy(runs: int) -> None:
+    for successes in range(runs + 1):
+        interval = wilson_interval(successes, runs)
+        expected = stats.binomtest(successes, runs).proportion_ci(method="wilson")
+        assert (interval.low, interval.high) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
 def test_five_of_five_seeds_are_not_certainty() -> None:
     interval = wilson_interval(5, 5)
     assert interval.estimate == interval.high == 1.0

@@ -7,10 +7,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from recrl.analysis import report
 from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.merging import merge
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts
+from recrl.analysis.report import drawing
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -100,7 +100,7 @@ def test_figures_need_no_row_of_the_trials_with_most_costs(part: Part, tmp_path:
     merged = merge([part("one"), without_rows(waiting)])
     assert merged.num_costs == 2
     assert merged.updates["limit_1"].isna().all()
-    assert report.draw(merged, tmp_path / "figures")
+    assert drawing.draw(merged, tmp_path / "figures")
 
 
 def test_notes_that_are_no_longer_true_are_left_out(part: Part) -> None:

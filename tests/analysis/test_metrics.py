@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from recrl.analysis import report_tables
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.statistics import feasibility, metrics
+from recrl.analysis.report import table_formats
+from recrl.analysis.statistics import metrics, verdicts
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 
@@ -47,7 +47,7 @@ def test_feasible_allows_one_percent_or_one_standard_error() -> None:
             {"cost_0": 0.02, "cost_0_se": 0.0, "deploy_limit_0": 0.0},
         ]
     )
-    assert feasibility.within_limits(rows).tolist() == [True, False, True, False, True, True, False]
+    assert verdicts.within_limits(rows).tolist() == [True, False, True, False, True, True, False]
 
 
 def test_the_standard_error_of_the_deployment_phase_counts(finished: Sweep) -> None:
@@ -64,23 +64,23 @@ def test_solved_is_who_is_near_the_optimum_and_within_every_limit() -> None:
     near = {"gap": 0.2, "cost_0": 5.05, "deploy_limit_0": 5.0, "cost_1": 7.0, "deploy_limit_1": math.nan}
     others = [{"gap": 0.21}, {"gap": -0.4, "cost_0": 5.06}, {"deploy_limit_1": 6.9}, {"gap": math.nan}]
     rows = pd.DataFrame([near, *(near | other for other in others), near | {"gap": -math.inf}])
-    assert feasibility.optimal(rows).tolist() == [True, False, False, False, False, False]
+    assert verdicts.solved(rows).tolist() == [True, False, False, False, False, False]
 
 
 def test_a_gap_of_a_fifth_is_near_whatever_rounding_does_to_it() -> None:
     gap = 9.5 - 9.299999999999994
     assert gap == 0.2000000000000064
     rows = pd.DataFrame([{"gap": gap, "cost_0": 5.0, "deploy_limit_0": 5.0}])
-    assert feasibility.optimal(rows).tolist() == [True]
+    assert verdicts.solved(rows).tolist() == [True]
 
 
 def test_a_summary_counts_the_seeds_at_the_optimum(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     rows.loc[rows["measure"] == "stochastic", ["gap", "cost_0"]] = [0.1, 4.0]
-    rows["optimal"], rows["feasible"] = feasibility.optimal(rows), feasibility.within_limits(rows)
+    rows["optimal"], rows["feasible"] = verdicts.solved(rows), verdicts.within_limits(rows)
     found = metrics.summary(rows).set_index("measure").loc["stochastic"]
     assert (found["optimal_seeds"] == found["seeds"]).all()
-    table = report_tables.outcome_table(metrics.summary(rows), metrics.Measure.STOCHASTIC)
+    table = table_formats.outcome_table(metrics.summary(rows), metrics.Measure.STOCHASTIC)
     seeds = int(found["seeds"].iloc[0])
     assert (table["solved"] == f"{seeds} of {seeds}").all()  # three seeds: no interval
 

@@ -15,7 +15,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 
 SPEC = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),

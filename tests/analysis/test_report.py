@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from recrl.analysis import report, report_files
 from recrl.analysis.data import sweep_data
-from recrl.analysis.report import NothingToDrawError
+from recrl.analysis.report import drawing, table_files
+from recrl.analysis.report.drawing import NothingToDrawError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.faults.committing import commit_file
 
@@ -24,7 +24,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         unfinished=["river-a my cpo linear seed 0"],
         failed=["river-a my cpo linear seed 1"],
     )
-    written = report.draw(sweep_data.load(store), tmp_path / "first")
+    written = drawing.draw(sweep_data.load(store), tmp_path / "first")
     assert [path.name for path in written] == [
         "report.html",
         "report.md",
@@ -58,7 +58,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
     )
     assert "- river-a my cpo linear seed 0: still running, 50% of its steps done" in text
-    again = report.draw(sweep_data.load(store), tmp_path / "second")
+    again = drawing.draw(sweep_data.load(store), tmp_path / "second")
     assert [path.read_bytes() for path in written] == [path.read_bytes() for path in again]
 
 
@@ -69,12 +69,12 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
         seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], unfinished=["a cpo none seed 0"]
     )
     sweep = sweep_data.load(store)
-    names = [path.name for path in report.sketch(sweep, tmp_path)]
+    names = [path.name for path in drawing.sketch(sweep, tmp_path)]
     assert "curricula.png" in names
     assert "outcomes.csv" not in names
     assert "No trial is complete yet: no verdict." in (tmp_path / "report.md").read_text()
     for stem in ("bounds_cpo", "return-against-cost", "performance-profiles"):
-        assert report.drawings(sweep)[stem]() is None
+        assert drawing.drawings(sweep)[stem]() is None
 
 
 def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
@@ -84,19 +84,19 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
         seeds=1, tasks=["a"], agents=["cpo"], methods=["none", "step"], unfinished=["a cpo step seed 0"]
     )
     sweep = sweep_data.load(store)
-    sketched = report.sketch(sweep, tmp_path / "sketch")
+    sketched = drawing.sketch(sweep, tmp_path / "sketch")
     pictures = {path.name for path in sketched if path.suffix == ".png"}
     assert pictures == {"return-against-cost.png", "learning-curves_cpo.png", "curricula.png"}
     assert not any(path.suffix == ".pdf" for path in sketched)
     tables = {path.name for path in sketched if path.suffix in (".csv", ".tex", ".parquet")}
-    assert tables == {path.name for path in report_files.write_tables(sweep, tmp_path / "tables")[0]}
-    assert f"- {report.UNFINISHED}" in sketched[1].read_text().splitlines()
+    assert tables == {path.name for path in table_files.write_tables(sweep, tmp_path / "tables")[0]}
+    assert f"- {drawing.UNFINISHED}" in sketched[1].read_text().splitlines()
 
 
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "empty")
     with pytest.raises(NothingToDrawError) as caught:
-        report.draw(sweep_data.load(store), tmp_path / "figures")
+        drawing.draw(sweep_data.load(store), tmp_path / "figures")
     assert str(caught.value) == (
         "empty: nothing to draw yet, because none of its 0 trials has committed a policy update"
     )
@@ -145,7 +145,7 @@ def test_the_page_holds_everything_and_fetches_nothing(
     trial = store.trials()[0]
     commit_file(trial, "provenance.json", '{"torch": "9.9"}')
     store.write_specs([trial.spec], b"name: made-up  # <script>alert(1)</script>\n")
-    report.sketch(sweep_data.load(store), tmp_path / "figures")  # the page is made as by draw
+    drawing.sketch(sweep_data.load(store), tmp_path / "figures")  # the page is made as by draw
     reader = Strict()
     reader.feed((tmp_path / "figures" / "report.html").read_text())
     assert reader.open == []

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from recrl.analysis import report_tables
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.report import table_formats
 from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.metrics import Measure
 
 
 def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
-    table = report_tables.outcome_table(metrics.summary(metrics.outcomes(finished)), Measure.STOCHASTIC)
+    table = table_formats.outcome_table(metrics.summary(metrics.outcomes(finished)), Measure.STOCHASTIC)
     assert len(table) == 2 * 2 * 3
     assert table.iloc[0].to_dict() == {
         "task": "river-a",
@@ -31,7 +31,7 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
 
 def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(finished: Sweep) -> None:
     summary = metrics.summary(metrics.outcomes(finished)).assign(seeds=5, feasible_seeds=4, optimal_seeds=5)
-    row = report_tables.outcome_table(summary, Measure.STOCHASTIC).iloc[0]
+    row = table_formats.outcome_table(summary, Measure.STOCHASTIC).iloc[0]
     assert row["regret"] == "–"
     assert row["solved"].startswith("5 of 5 (")
 
@@ -39,8 +39,8 @@ def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(fini
 def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     compared = metrics.comparisons(rows, np.random.default_rng(0))
-    chosen = report_tables.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
-    table = report_tables.comparison_table(chosen)
+    chosen = table_formats.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
+    table = table_formats.comparison_table(chosen)
     assert table["P(higher return)"].str.endswith("†").all()
     assert table["return gained"].iloc[0].startswith("15.33 [-17.65, 48.32]")
 
@@ -48,11 +48,11 @@ def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
 def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark(finished: Sweep) -> None:
     rows = metrics.outcomes(finished).query("seed == 0")
     compared = metrics.comparisons(rows, np.random.default_rng(0))
-    chosen = report_tables.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
-    assert report_tables.row_kinds(chosen) == [""] * len(chosen)
+    chosen = table_formats.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
+    assert table_formats.row_kinds(chosen) == [""] * len(chosen)
     chosen.loc[0, "feasible_seeds"] = 0
-    table = report_tables.comparison_table(chosen)
-    assert report_tables.row_kinds(chosen)[:2] == ["infeasible", ""]
+    table = table_formats.comparison_table(chosen)
+    assert table_formats.row_kinds(chosen)[:2] == ["infeasible", ""]
     assert table.loc[0, ["return gained", "P(higher return)"]].tolist() == ["–", "–"]
     assert "–" not in table.loc[1].tolist()
     assert not table["P(higher return)"].str.contains("†").any()
@@ -60,8 +60,8 @@ def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark
 
 def test_markdown_and_latex_by_hand() -> None:
     table = pd.DataFrame({"task": ["a_1", "b"], "share": ["1 of 2 (9–91%)", "±"]})
-    assert report_tables.markdown(table).splitlines()[2] == "| a_1 | 1 of 2 (9–91%) |"
-    assert report_tables.latex(table).splitlines() == [
+    assert table_formats.markdown(table).splitlines()[2] == "| a_1 | 1 of 2 (9–91%) |"
+    assert table_formats.latex(table).splitlines() == [
         r"\begin{tabular}{ll}",
         r"\toprule",
         r"task & share \\",
@@ -76,5 +76,5 @@ def test_markdown_and_latex_by_hand() -> None:
 
 def test_csv_keeps_every_digit(tmp_path: Path) -> None:
     frame = pd.DataFrame({"value": [0.1 + 0.2, 1e-17, 9.5]})
-    path = report_tables.write_csv(frame, tmp_path / "deep" / "frame.csv")
+    path = table_formats.write_csv(frame, tmp_path / "deep" / "frame.csv")
     assert pd.read_csv(path)["value"].tolist() == frame["value"].tolist()

@@ -6,10 +6,10 @@ from html import unescape
 import pandas as pd
 import pytest
 
-from recrl.analysis import report_page, report_verdicts
 from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.statistics.verdict_counts import verdicts
+from recrl.analysis.report import html_page, verdict_texts
+from recrl.analysis.statistics.verdict_counts import count_verdicts
 
 NONE_COMPARED = pd.DataFrame()
 
@@ -49,7 +49,9 @@ ROWS = [
 
 def judged(rows: list[dict[str, object]]) -> pd.DataFrame:
     flags = pd.DataFrame(rows)[[*KEY, "measure"]].query("measure == 'stochastic'")[list(KEY)]
-    return verdicts(pd.DataFrame(rows), NONE_COMPARED, flags.assign(no_curriculum=False, hard_landing=False))
+    return count_verdicts(
+        pd.DataFrame(rows), NONE_COMPARED, flags.assign(no_curriculum=False, hard_landing=False)
+    )
 
 
 def test_seeds_are_counted_by_the_final_policy_only() -> None:
@@ -66,36 +68,41 @@ def test_the_worst_cost_is_the_one_that_is_furthest_over_its_limit() -> None:
     others = {"cost_1": 3.0, "deploy_limit_1": 1.0, "feasible": False}
     row = judged([outcome("none", 0, 9.5, 5.5, **others)]).iloc[0]
     assert (row["worst_excess"], row["worst_share"]) == (2.0, 2.0)
+    assert (row["worst_cost"], row["cost_name_0"], row["cost_name_1"]) == ("1", "0", "1")
+    table = verdict_texts.verdict_table(
+        judged([outcome("none", 0, 9.5, 5.5, **others)]).assign(cost_1_se=0.0)
+    )
+    assert {"cost 0", "limit 1"} <= set(table)
 
 
 def test_the_table_says_the_verdict_in_words() -> None:
-    table = report_verdicts.verdict_table(judged(ROWS))
+    table = verdict_texts.verdict_table(judged(ROWS))
     assert table["verdict"].tolist() == [
         "solved 1 of 2; feasible, not solved 1 of 2",
         "infeasible by up to 2.00 (40%)",
         "solved",
     ]
-    assert report_verdicts.verdict_kinds(judged(ROWS)) == ["feasible", "infeasible", "solved"]
+    assert verdict_texts.verdict_kinds(judged(ROWS)) == ["feasible", "infeasible", "solved"]
     assert table["n"].tolist() == ["2", "2", "2"]
-    assert table[report_verdicts.DEPLOYMENT].iloc[0] == "return 2.00 ± 1.00, cost 50.000 ± 0.000"
+    assert table[verdict_texts.DEPLOYMENT].iloc[0] == "return 2.00 ± 1.00, cost 50.000 ± 0.000"
     assert table["cost"].tolist() == ["2.500 ± 2.500", "6.500 ± 0.500", "5.000 ± 0.000"]
 
 
 def test_warnings_stand_beside_the_verdict_they_concern() -> None:
     table = judged(ROWS)
-    assert "warning" not in report_verdicts.verdict_table(table)
+    assert "warning" not in verdict_texts.verdict_table(table)
     table.loc[table["method"] == "dynamic", ["no_curriculum", "hard_landing"]] = [1, 2]
-    shown = report_verdicts.verdict_table(table)
+    shown = verdict_texts.verdict_table(table)
     assert shown["warning"].tolist() == ["", "", "curriculum without effect 1 of 2; hard landing"]
     assert list(shown).index("warning") == list(shown).index("verdict") + 1
-    assert "Hard landing: more than 10% of the way" in report_verdicts.explanation(table)[-1]
+    assert "Hard landing: more than 10% of the way" in verdict_texts.explanation(table)[-1]
 
 
 def test_one_seed_has_no_interval() -> None:
-    table = report_verdicts.verdict_table(judged(ROWS[:1]))
+    table = verdict_texts.verdict_table(judged(ROWS[:1]))
     assert table["return"].tolist() == ["-20.00"]
     assert table["cost"].tolist() == ["0.000"]
-    deployed = report_verdicts.verdict_table(judged([ROWS[0], ROWS[6]]))[report_verdicts.DEPLOYMENT]
+    deployed = verdict_texts.verdict_table(judged([ROWS[0], ROWS[6]]))[verdict_texts.DEPLOYMENT]
     assert deployed.tolist() == ["return 1.00, cost 50.000"]
     assert table["verdict"].tolist() == ["feasible"]
 
@@ -124,7 +131,7 @@ def test_one_seed_has_no_interval() -> None:
     ],
 )
 def test_a_sentence_a_task(rows: list[dict[str, object]], sentence: str) -> None:
-    assert report_verdicts.answers(judged(rows)) == [sentence]
+    assert verdict_texts.answers(judged(rows)) == [sentence]
 
 
 def test_each_curriculum_that_violates_is_named_with_its_excess() -> None:
@@ -139,17 +146,17 @@ def test_each_curriculum_that_violates_is_named_with_its_excess() -> None:
         outcome("dynamic", 0, 9.5, 5.084),
         outcome("dynamic", 0, 9.5, 5.0, agent="ppo"),
     ]
-    assert report_verdicts.answers(judged(rows)) == [
+    assert verdict_texts.answers(judged(rows)) == [
         "One seed (n = 1): no intervals, and another seed may give another verdict.",
         "river: 3 of 8 final policies (2 agents x 4 curricula x 1 seed) solve it, most often with none (2 of "
-        "2); linear and cosine exceed the limit of 5 by 4.00 to 4.06 (4 of 4 policies); dynamic solves 1 of 2, "
-        "the other exceeds it by 0.084.",
+        "2); linear and cosine exceed the limit of 5 by 4.00 to 4.06 (4 of 4 policies); dynamic solves 1 of "
+        "2, the other exceeds it by 0.084.",
     ]
 
 
 def test_each_task_says_what_its_limits_mean(finished: Sweep) -> None:
     table = judged([outcome("none", 0, 9.5, 5.0, task="river-a")])
-    (sentence,) = report_verdicts.task_sentences(finished, table)
+    (sentence,) = verdict_texts.task_sentences(finished, table)
     assert sentence == (
         "river-a: A camp and a mine, one cost, closed-form optimum: for testing learners. Limit: 5 per "
         "episode, allowed 5.05 (1%, exact). Training limit d_t: 100.0, from the grid."
@@ -158,16 +165,14 @@ def test_each_task_says_what_its_limits_mean(finished: Sweep) -> None:
 
 def test_violators_are_marked_by_text_and_colour() -> None:
     table = judged(ROWS)
-    html = report_page.verdict_table(
-        report_verdicts.verdict_table(table), report_verdicts.verdict_kinds(table)
-    )
+    html = html_page.verdict_table(verdict_texts.verdict_table(table), verdict_texts.verdict_kinds(table))
     assert '<tr class="infeasible"><td class="name">river</td><td class="name">cpo</td>' in html
     assert '<td class="name"><small>river cpo</small>linear</td>' in html
     assert '<td class="verdict">infeasible by up to 2.00 (40%)</td>' in unescape(html)
-    assert "tr.infeasible" in report_page.STYLE
+    assert "tr.infeasible" in html_page.STYLE
 
 
 def test_sampled_policies_are_said_to_be_sampled() -> None:
     sampled = judged([outcome("none", 0, 9.5, 5.0, exact=False, episodes=30)])
-    assert "means over 30 episodes" in report_verdicts.explanation(sampled)[0]
-    assert "computed exactly" in report_verdicts.explanation(judged(ROWS))[0]
+    assert "means over 30 episodes" in verdict_texts.explanation(sampled)[0]
+    assert "computed exactly" in verdict_texts.explanation(judged(ROWS))[0]

@@ -26,8 +26,8 @@ from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.executor import RayExecutor
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
+from recrl.orchestrator.tracking.client import tracking_uri
 from tests.benchmarks.bench_overhead import car_trial, family
 
 LOOK_SECONDS = 1.0

@@ -30,12 +30,12 @@ from typing import Any
 import torch
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.cli.launch import SYNC_INTERVAL_SECONDS
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.launching import SYNC_INTERVAL_SECONDS
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
-from recrl.orchestrator.trial.runner import run_trial
+from recrl.orchestrator.tracking.client import tracking_uri
+from recrl.orchestrator.trial.attempt import run_trial
 from recrl.teachers.registry import make_teacher
 
 STEPS_PER_UPDATE = 16_000

@@ -21,8 +21,8 @@ import numpy as np
 from recrl.environments.cmdp import CostLimits, Phase
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 STEPS_PER_UPDATE = 3200

@@ -34,8 +34,9 @@ from recrl.agents.agent import Rollout
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.learning.batch import find_repeated
 from recrl.agents.learning.critics import Critics
-from recrl.agents.learning.networks import Adam, NetworkForm, xavier
 from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.networks.architecture import NetworkForm, xavier
+from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.agents.shared_options import ActorCriticConfig, AscentConfig, TrustRegionConfig
 from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep

@@ -34,13 +34,22 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.simulation.machine_code import compiled_for_batch, mj_forward, mj_rnePostConstraint
 from recrl.environments.velocity.batch import VelocityBatch
-from recrl.environments.velocity.physics import derive, derive_with_forces
+from recrl.environments.velocity.physics import copy_fields, derive, physics_at
 from recrl.environments.velocity.tasks import VELOCITY_TASKS, VelocityTask
 
 TOLERANCE = 1e-5
 STAGES = (0.5, 0.5, 1.0)
 """Where the second to fourth stage of a Runge-Kutta step begin, in steps after its start."""
+
+
+@compiled_for_batch
+def derive_with_forces(model: int, data: int, index: int, argument: int) -> None:
+    """Compute and copy what follows from the state, contact forces included."""
+    mj_forward(model, data)
+    mj_rnePostConstraint(model, data)
+    copy_fields(physics_at(argument, 1)[0], data, index)
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, Floats
-from recrl.environments.finite.exact_solver import (
-    evaluate_policy,
-    solve_by_lagrangian,
-    solve_by_linear_program,
-)
+from recrl.environments.finite.exact_solver import evaluate_policy, solve_by_lagrangian
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError
 from recrl.environments.registry import make_vector, optimal_return
 from recrl.environments.rivergrid.grid_world import river_cmdp
 from recrl.environments.rivergrid.maps import MAPS, MapGenerator, generate_map, parse_map
+from tests.environments.linear_program import solve_by_linear_program
 
 
 def random_cmdp(

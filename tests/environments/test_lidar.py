@@ -9,8 +9,8 @@ import numpy.typing as npt
 import pytest
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.safety_gym.compiled_step import add_to_lidar, turned
 from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
-from recrl.environments.safety_gym.native.environment_step import add_to_lidar, turned
 from recrl.environments.safety_gym.scene import rotation_matrices, upright
 
 

@@ -297,7 +297,7 @@ def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -
 def test_robots_cannot_tell_that_gremlins_far_away_are_no_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
     some = SafetyGymVectorEnv("CarButton2", 4)
     monkeypatch.setattr(
-        "recrl.environments.safety_gym.native.task_record.ALERT", 100.0
+        "recrl.environments.safety_gym.task_record.ALERT", 100.0
     )  # the nearest is always a body
     always = SafetyGymVectorEnv("CarButton2", 4)
     some.reset(seed=8)

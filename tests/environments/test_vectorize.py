@@ -11,8 +11,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.registry import make_vector, task_options
+from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv, make_from_callable
+from recrl.environments.registry import KeywordOptions, make_vector, task_options
 
 
 class Countdown(gymnasium.Env[Any, Any]):
@@ -226,6 +226,44 @@ def test_what_an_environment_returns_is_looked_at(field: str, value: Any, senten
     with pytest.raises(ValueError) as caught:
         environments.step(np.array([0]))
     assert str(caught.value).startswith(sentence)
+
+
+def _breezy(wind: float = 0.0, *, length: int = 3) -> gymnasium.Env[Any, Any]:
+    return gymnasium.make("CartPole-v1")
+
+
+def _nothing() -> gymnasium.Env[Any, Any]:
+    return _breezy()
+
+
+def _any_option(**_: Any) -> gymnasium.Env[Any, Any]:
+    return _breezy()
+
+
+@pytest.mark.parametrize(
+    ("factory", "options", "sentence"),
+    [
+        (
+            _breezy,
+            {"winds": 1.0},
+            "breezy takes no option 'winds'; did you mean 'wind'? (its options: wind, length)",
+        ),
+        (_breezy, {"zebra": 1}, "breezy takes no option 'zebra' (its options: wind, length)"),
+        (_nothing, {"wind": 1.0}, "breezy takes no option 'wind' (it has no options)"),
+    ],
+)
+def test_a_wrong_option_of_a_users_task_names_the_known_ones(
+    factory: Any, options: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ValueError) as caught:
+        make_from_callable(factory, "breezy", 1, KeywordOptions(**options))
+    assert str(caught.value) == sentence
+
+
+@pytest.mark.parametrize("options", [{}, {"wind": 1.0, "length": 2}])
+def test_right_options_of_a_users_task_are_passed_on(options: dict[str, Any]) -> None:
+    make_from_callable(_breezy, "breezy", 1, KeywordOptions(**options)).close()
+    make_from_callable(_any_option, "breezy", 1, KeywordOptions(**options)).close()
 
 
 def test_a_factory_that_makes_no_environment_is_named() -> None:

@@ -31,13 +31,13 @@ from recrl.orchestrator.cli.main import main as recrl_sweep
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep import LaunchSettings, launch
-from recrl.orchestrator.tracking.address import tracking_uri
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 
 GRID = """\
 name: {name}

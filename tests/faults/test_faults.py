@@ -25,8 +25,8 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, launch
+from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.heartbeat import Heartbeat
-from recrl.orchestrator.trial.runner import run_recorded
 
 SPEC = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
@@ -172,7 +172,7 @@ def test_what_a_full_disk_keeps_from_being_said_hides_nothing(
             fill(small_disk)
             raise ArithmeticError("the first error")
 
-    from recrl.orchestrator.grid.grid import parse_grid  # noqa: PLC0415
+    from recrl.orchestrator.grid.checking import parse_grid  # noqa: PLC0415
 
     text = (
         "name: sweep\ntasks: [{name: two-state, options: {horizon: 10}, deploy_limits: 3}]\nagents: "
@@ -243,7 +243,7 @@ def test_a_trial_that_takes_long_to_begin_is_heard_meanwhile(
     store = SweepStore(tmp_path, "sweep").trial(spec)
     (tmp_path / "my_slow_task.py").write_text(SLOW_TASK.format(state=str(store.state_path)))
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("recrl.orchestrator.trial.runner.HEARTBEAT_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.trial.attempt.HEARTBEAT_SECONDS", 0.01)
     assert run_recorded(spec, store, should_stop=lambda: True) is TrialState.WAITING
     assert sys.modules.pop("my_slow_task").heard
 

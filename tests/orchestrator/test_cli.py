@@ -17,7 +17,7 @@ from recrl.orchestrator.cli.arguments import COMMANDS
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid, read_grid
+from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.trial.speed import measured_speed
 
@@ -538,12 +538,12 @@ def test_a_module_that_is_nowhere_is_a_sentence(folder: Path, capsys: pytest.Cap
         (
             "name: 'room_b:Room'",
             "grid.yaml:2: tasks.0: room_b:Room fails in its first step: ValueError: room_b:Room: the "
-            "environment must report info['cost'] at every step, got only ['speed']",
+            "environment must report info['cost'] at every step: info has no 'cost', only 'speed' (for",
         ),
         (
             "name: gymnasium, options: {id: Pendulum-v1}",
             "grid.yaml:2: tasks.0: gymnasium fails in its first step: ValueError: gymnasium: the "
-            "environment must report info['cost'] at every step, got only []",
+            "environment must report info['cost'] at every step: info has no 'cost' (for",
         ),
     ],
 )

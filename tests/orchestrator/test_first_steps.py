@@ -15,7 +15,7 @@ from recrl.environments.registry import TASKS
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.cli.requests import TEMPLATES
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.json_schema import grid_schema
 from recrl.teachers.registry import TEACHERS
 
@@ -104,6 +104,19 @@ def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str
     assert re.search(r"^total_steps +whole number +required +Environment steps", out, re.MULTILINE)
     assert "silence_seconds" in output(capsys, "options", "resources")
     assert "train_limits" in output(capsys, "options", "limits")
+
+
+@pytest.mark.parametrize(
+    ("section", "command"), [("tasks", "tasks"), ("agents", "agents"), ("methods", "curricula")]
+)
+def test_options_of_a_list_of_a_grid_say_what_it_takes(
+    section: str, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = " ".join(output(capsys, "options", section).split())
+    assert out.startswith(f"{section}, a section of a grid: a list; each entry is a name, or a mapping with ")
+    assert f"Names: recrl-sweep list {command}; options of one: recrl-sweep options " in out
+    assert ("deploy_limits" in out) == (section == "tasks")
+    assert "label" in out
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.saved_policy import NoCheckpointError, SavedTrial, summary
 from recrl.orchestrator.trial.videos import VideoFormat
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from recrl.orchestrator.errors import CheckpointError, GridError
 from recrl.orchestrator.files.checkpoint_format import MAGIC, decode, encode
-from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid
 
 EXAMPLES = int(os.environ.get("RECRL_FUZZ_EXAMPLES", "60"))
 FUZZED = settings(

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import GridError
-from recrl.orchestrator.grid.grid import parse_grid, read_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid, read_grid
 
 SMALL = """\
 name: small
@@ -400,6 +400,26 @@ def test_a_grid_damaged_anywhere_is_right_or_gives_located_sentences(cut: int, a
             assert all(problem.startswith("grid.yaml:") for problem in error.problems)
 
 
+@pytest.mark.parametrize("key", ["train_limits", "deploy_limits"])
+@pytest.mark.parametrize("at_task", [True, False])
+def test_a_list_of_one_limit_is_not_for_all_costs(key: str, at_task: bool) -> None:
+    entry = f", {key}: [8]" if at_task else ""
+    top = "" if at_task else f"{key}: [8]\n"
+    others = "" if key == "deploy_limits" else ", deploy_limits: 1"
+    data = (
+        f"name: two\ntasks: [{{name: two-state-2{others}{entry}}}]\n"
+        f"agents: [cpo]\nmethods: [none]\nseeds: 1\n{top}run: {{total_steps: 10_000}}\n"
+    )
+    with pytest.raises(GridError) as caught:
+        parse_grid(data.encode(), source="grid.yaml")
+    place = f"grid.yaml:2: tasks.0.{key}" if at_task else f"grid.yaml:6: {key}"
+    (problem,) = caught.value.problems
+    assert problem.startswith(f"{place}: two-state-2 has 2 costs (")
+    assert problem.endswith("), got 1 limit; one for all is a plain number")
+    plain = parse_grid(data.replace("[8]", "8").encode(), source="grid.yaml")
+    assert getattr(plain.trials()[0], key) == CostLimits((8.0, 8.0))
+
+
 OWN_PARTS = """\
 import torch
 from pydantic import BaseModel
@@ -451,3 +471,32 @@ run: {total_steps: 10_000}
         "own_parts:CURRICULUM: must return a CurriculumStep and its state, a mapping, got NoneType"
     )
     assert len(parse_grid(data, source="grid.yaml").trials()) == 4  # a launch leaves that to the trials
+
+
+def test_one_mistake_on_every_task_is_one_line_with_the_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_parts.py").write_text(OWN_PARTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    data = b"""\
+name: own
+deploy_limits: 2
+tasks: [{name: two-state, label: zebra}, {name: two-state, label: ant}, two-state-2]
+agents: ["own_parts:AGENT"]
+methods: ["own_parts:CURRICULUM"]
+seeds: 2
+run: {total_steps: 10_000}
+"""
+    with pytest.raises(GridError) as caught:
+        parse_grid(data, source="grid.yaml", build=True)
+    assert caught.value.problems == [
+        "grid.yaml:4: agents.0: own_parts:AGENT cannot be built: KeyError: 'momentum' "
+        "(on zebra, ant, two-state-2)",
+        "grid.yaml:5: methods.0: own_parts:CURRICULUM cannot be started: TypeError: curriculum "
+        "own_parts:CURRICULUM: must return a CurriculumStep and its state, a mapping, got NoneType "
+        "(on zebra, ant, two-state-2)",
+    ]
+    with pytest.raises(GridError) as caught:
+        parse_grid(data.replace(b"10_000", b"100"), source="grid.yaml")
+    (problem,) = caught.value.problems
+    assert problem.endswith("got 100 (on zebra, ant, two-state-2)")

@@ -12,22 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recrl.analysis import report
 from recrl.analysis.data import sweep_data
+from recrl.analysis.report import drawing
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import CheckpointError, DamagedError, RowError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.atomic_files import read_sealed, write_sealed
 from recrl.orchestrator.files.row_files import Extent, RowFile
-from recrl.orchestrator.files.small_files import read_sealed, write_sealed
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import PlannedAction, make_plan
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 
 GRID = """\
 name: small
@@ -133,7 +133,7 @@ def test_a_complete_trial_that_was_cut_is_damaged_and_its_numbers_are_not_used(
     assert sweep.trials["status"].tolist() == ["complete", "damaged"]
     assert set(sweep.phases["method"]) == set(sweep.updates["method"]) == {"none"}
     title = trial.spec.title
-    assert f"{title}: damaged, 0% of its steps done: {sentence}" in report.missing(sweep)
+    assert f"{title}: damaged, 0% of its steps done: {sentence}" in drawing.missing(sweep)
     for command in (["status", "--brief"], ["plan", "grid.yaml"], ["export", "small"]):
         assert main(command) == ExitCode.OK
         assert f"damaged: {title}: {sentence}\n" in capsys.readouterr().out

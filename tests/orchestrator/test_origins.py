@@ -9,21 +9,23 @@ from pathlib import Path
 
 import pytest
 
-from recrl.analysis import report
 from recrl.analysis.data import sweep_data
-from recrl.analysis.data.validity import curriculum_flags
+from recrl.analysis.data.sweep_warnings import curriculum_flags
+from recrl.analysis.report import drawing
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.code_changes import (
-    code_of,
-    has_other_code,
-    other_code_sentence,
-)
 from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import read_grid
+from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.provenance import code_changes
+from recrl.orchestrator.provenance.code_changes import (
+    code_of,
+    has_other_code,
+    other_code,
+    other_code_sentence,
+)
 from recrl.orchestrator.sweep import LaunchSettings, launch
 
 TASK = """\
@@ -86,6 +88,10 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert not has_other_code(trial, trial.spec)
     before = trial.episodes_path.read_bytes()
     change(folder)
+    capsys.readouterr()
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK  # nothing to do, but not without a word
+    assert SENTENCE in capsys.readouterr().out.splitlines()
+    assert main(["plan", "grid.yaml", "--trust", "--check"]) == ExitCode.TRIALS_LEFT
     (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1"))
     capsys.readouterr()
     assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
@@ -96,7 +102,7 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert SENTENCE in capsys.readouterr().out.splitlines()
     assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
     assert f"{SENTENCE}; these evaluations use the installed code" in capsys.readouterr().out.splitlines()
-    assert SENTENCE.removeprefix("warning: ") in report.missing(sweep_data.load(store))
+    assert SENTENCE.removeprefix("warning: ") in drawing.missing(sweep_data.load(store))
 
     assert main(["launch", "grid.yaml", *INLINE, "--rerun-changed"]) == ExitCode.OK
     assert "small: 2 trials: 1 to run again on the present code, 1 complete\n" in capsys.readouterr().out
@@ -113,7 +119,7 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
 
     class Stopping(InlineExecutor):
         def run(self, specs: object, place: SweepPlace, stop: threading.Event) -> None:
-            from recrl.orchestrator.trial.runner import run_recorded  # noqa: PLC0415
+            from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415
 
             answers = iter([False])
             run_recorded(spec, place.store.trial(spec), should_stop=lambda: next(answers, True))
@@ -137,6 +143,41 @@ def test_the_code_of_a_task_is_found_without_running_it(folder: Path) -> None:
     sys.modules.pop("my_scaled_task", None)
     assert set(code_of(spec)) == {"recrl", "my_scaled_task"}
     assert "my_scaled_task" not in sys.modules
+
+
+def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    own = "import json\nimport numpy as np\nfrom my_physics import GRAVITY\n" + TASK
+    (folder / "my_scaled_task.py").write_text(own)
+    (folder / "my_physics.py").write_text("def late():\n    import my_units.lengths\n")
+    (folder / "my_units").mkdir()
+    (folder / "my_units" / "lengths.py").write_text("import my_scaled_task  # a circle\n")
+    (folder / "my_other.py").write_text("")  # nobody imports it
+    importlib.invalidate_caches()
+    before = code_of(spec)
+    assert list(before) == ["recrl", "my_scaled_task", "my_physics", "my_units"]
+    (folder / "my_units" / "lengths.py").write_text("METRE = 2\n")
+    after = code_of(spec)
+    assert {name for name in before if before[name] != after[name]} == {"my_units"}
+    assert other_code([{"code": before}], spec)
+    old = {name: before[name] for name in ("recrl", "my_scaled_task")}  # what earlier versions wrote
+    assert not other_code([{"code": old}], spec)
+    assert not {"my_physics", "my_units"} & set(sys.modules)
+
+
+def test_the_imports_of_a_plug_in_are_followed_within_its_project_and_bounds(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    (folder / "my_scaled_task.py").write_text(f"import my_a, my_b, my_elsewhere\n{TASK}")
+    for name in ("my_a", "my_b"):
+        (folder / f"{name}.py").write_text("")
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (elsewhere / "my_elsewhere.py").write_text("")
+    monkeypatch.syspath_prepend(elsewhere)
+    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a", "my_b"]
+    monkeypatch.setattr(code_changes, "MOST_FILES", 2)
+    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a"]
 
 
 def test_of_a_package_that_is_not_here_nothing_is_said(folder: Path) -> None:
@@ -188,7 +229,7 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
         "two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
-    assert sentence in report.missing(sweep_data.load(store))
+    assert sentence in drawing.missing(sweep_data.load(store))
     assert json.loads(store.trials()[0].provenance_path.read_text())["attempts"][0]["attempt"] == 1
 
 
@@ -211,7 +252,7 @@ def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert f"warning: {sentence}" in launched
     sweep = sweep_data.load(SweepStore(folder / "runs", "small"))
-    assert sentence in report.missing(sweep)
+    assert sentence in drawing.missing(sweep)
     flags = curriculum_flags(sweep)
     assert flags["hard_landing"].tolist() == [method == "dynamic" for method in flags["method"]]
     assert not flags["no_curriculum"].any()

@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.plan import PlannedAction, estimate, make_plan, select, trials_at_once
+from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.grid.plan import PlannedAction, estimate, make_plan, trials_at_once
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 GRID = b"""\
@@ -78,22 +77,6 @@ def test_a_selection_makes_no_orphans(store: SweepStore) -> None:
     plan = make_plan(SPECS, store, only={"seed": ["1"]})
     assert {spec.seed for spec in plan.to_do} == {1}
     assert plan.orphans == ()
-
-
-def test_a_selection_takes_what_matches_every_key() -> None:
-    chosen = select(SPECS, {"method": ["linear"], "seed": ["0", "1"], "agent": ["cpo"]})
-    assert [spec.title for spec in chosen] == ["two-state cpo linear seed 0", "two-state cpo linear seed 1"]
-
-
-def test_a_selection_of_what_is_not_there_is_refused() -> None:
-    with pytest.raises(RecrlError) as caught:
-        select(SPECS, {"method": ["linaer"]})
-    assert str(caught.value) == (
-        "--only: no trial has method 'linaer'; did you mean 'linear'? (known: none, linear)"
-    )
-    with pytest.raises(RecrlError) as caught:
-        select(SPECS, {"colour": ["red"]})
-    assert str(caught.value) == "--only: trials are chosen by task, agent, method, seed, got 'colour'"
 
 
 def test_the_time_is_unknown_before_a_trial_of_the_kind_has_run(store: SweepStore) -> None:

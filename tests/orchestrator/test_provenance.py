@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from recrl.orchestrator.files.provenance import collect, git_state, package_versions
+from recrl.orchestrator.provenance.versions import collect, git_state, package_versions
 
 
 def _git(folder: Path, *arguments: str) -> str:

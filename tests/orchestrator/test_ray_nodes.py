@@ -9,8 +9,8 @@ import pytest
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import ClusterError, GridError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.own_package import copy_package, source_digest
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.provenance.own_package import copy_package, source_digest
 from recrl.orchestrator.ray.clusters import existing_cluster
 from recrl.orchestrator.ray.nodes import SIGHT, differences
 
@@ -55,7 +55,7 @@ def test_a_shipped_package_is_complete_and_comes_first(tmp_path: Path) -> None:
     code = """
 import importlib.metadata
 from recrl.orchestrator import grid
-from recrl.orchestrator.files import own_package
+from recrl.orchestrator.provenance import own_package
 import recrl.environments.rivergrid.grid_world
 print(grid.__file__)
 print(own_package.source_digest())

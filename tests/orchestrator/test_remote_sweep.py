@@ -24,8 +24,8 @@ from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore
@@ -34,7 +34,7 @@ from recrl.orchestrator.remote.stop_object import StopObject
 from recrl.orchestrator.remote.upload import Upload
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
 
 GRID = """\
@@ -176,9 +176,9 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
         "import json, sys, threading\n"
         "from pathlib import Path\n"
         "from recrl.orchestrator.files.sweep_store import SweepStore\n"
-        "from recrl.orchestrator.remote.opening import sweep_place\n"
+        "from recrl.orchestrator.remote.remote_sweep import sweep_place\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
-        "from recrl.orchestrator.trial.runner import run_recorded\n"
+        "from recrl.orchestrator.trial.attempt import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
         "asked = iter(range(99))\n"
         "hang = lambda: next(asked) >= 3 and threading.Event().wait()\n"

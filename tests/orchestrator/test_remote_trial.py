@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,16 @@ from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError
+from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
-from recrl.orchestrator.remote.commit import Commit, pack, unpack
+from recrl.orchestrator.remote.commit_format import Commit, pack, unpack
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import RemoteTrial
-from recrl.orchestrator.remote.upload import Upload
+from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
 
 SPEC = TrialSpec(
@@ -123,6 +126,22 @@ def test_a_trial_goes_on_elsewhere_with_what_was_sent_last(remote: RemoteTrial, 
     assert there.record() == second.trial.record()
     for path in ("episodes_path", "updates_path", "spec_path"):
         assert getattr(there, path).read_bytes() == getattr(second.trial, path).read_bytes()
+
+
+def test_every_file_of_a_trial_has_a_kind_and_is_sent(tmp_path: Path) -> None:
+    spec = replace(SPEC, rollout_steps=50, evaluation_episodes=2)
+    remote = RemoteTrial(ObjectStore(f"file://{tmp_path}/bucket"), spec.folder_name)
+    with working_copy(remote, spec, lambda: False) as trial:
+        assert run_recorded(spec, trial, should_stop=lambda: False) is TrialState.COMPLETE
+        trial.error_path.write_text("of an attempt that failed")
+        written = {path.name: path.read_bytes() for path in trial.folder.iterdir() if path.is_file()}
+    sent = files_of(FileKind.ROWS, FileKind.LOG, FileKind.WHOLE)
+    others = files_of(FileKind.RECORD, FileKind.LOCAL)
+    assert set(sent) == set(written) - set(others)
+    there = TrialStore(tmp_path / "copy" / spec.folder_name)
+    remote.download(there, checkpoints=True)
+    for name in sent:
+        assert (there.folder / name).read_bytes() == written[name], name
 
 
 def test_a_local_copy_follows_commit_by_commit(bucket: RemoteTrial, tmp_path: Path) -> None:

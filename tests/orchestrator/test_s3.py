@@ -11,7 +11,7 @@ import pytest
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep

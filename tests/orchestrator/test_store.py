@@ -12,7 +12,7 @@ import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import LostLeaseError, SweepBusyError
-from recrl.orchestrator.files.small_files import write_atomically
+from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter

@@ -13,8 +13,8 @@ import pytest
 from recrl.orchestrator.errors import ClusterError, RecrlError, SweepBusyError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.grid_spec import GridSpec
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import Plan, PlannedAction
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec, TrialState

@@ -23,8 +23,8 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
-from recrl.orchestrator.tracking.address import tracking_uri
 from recrl.orchestrator.tracking.background_sync import start_sync
+from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.points import (
     Summary,
@@ -35,7 +35,7 @@ from recrl.orchestrator.tracking.points import (
     rows_after,
     thinned,
 )
-from recrl.orchestrator.tracking.run_states import mlflow_status
+from recrl.orchestrator.tracking.trial_sync import mlflow_status
 from recrl.orchestrator.tracking.ui import open_ui, ui_command, ui_url
 from tests.faults.committing import commit_file
 

@@ -21,7 +21,7 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.trial.runner import run_recorded
+from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
@@ -127,7 +127,7 @@ def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path
         "import json, sys; from pathlib import Path\n"
         "from recrl.orchestrator.spec import TrialSpec\n"
         "from recrl.orchestrator.files.sweep_store import SweepStore\n"
-        "from recrl.orchestrator.trial.runner import run_recorded\n"
+        "from recrl.orchestrator.trial.attempt import run_recorded\n"
         "spec = TrialSpec.from_json(json.loads(sys.argv[2]))\n"
         "store = SweepStore(Path(sys.argv[1]), 'sweep').trial(spec)\n"
         "run_recorded(spec, store, should_stop=lambda: False, commit_seconds=0.0)\n"
@@ -238,6 +238,40 @@ def test_a_teachers_state_is_opaque_to_the_trial(undisturbed: TrialStore, tmp_pa
     assert list(store.updates()) == list(undisturbed.updates())
     assert store.record().start_limits == undisturbed.record().start_limits
     assert [event["event"] for event in store.events()] == ["start limits measured"]
+
+
+def test_the_names_of_several_costs_are_recorded(undisturbed: TrialStore, tmp_path: Path) -> None:
+    spec = replace(
+        SPEC,
+        task=Choice("two-state-2", {"horizon": 10}),
+        train_limits=CostLimits((9.0, 9.0)),
+        deploy_limits=CostLimits((3.0, 3.0)),
+    )
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=stop_after(1)) is TrialState.WAITING
+    assert store.provenance()[0]["cost_names"] == ["wear", "noise"]
+    assert "cost_names" not in undisturbed.provenance()[0]
+
+
+class Rising:
+    """A curriculum of the user's own that raises its limit after update 2."""
+
+    def start(self) -> tuple[CurriculumStep, TeacherState]:
+        return CurriculumStep(CostLimits((9.0,))), {"update": 0}
+
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
+        limit = 9.0 if report.update < 2 else 12.0
+        return CurriculumStep(CostLimits((limit,))), {"update": report.update}
+
+
+def test_a_limit_that_rises_fails_the_trial(tmp_path: Path) -> None:
+    spec = replace(SPEC, method=Choice("mine:RISING", label="rising"))
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=never, teacher=Rising()) is TrialState.FAILED
+    assert store.record().error == (
+        "ValueError: curriculum rising: the limit of wear rose from 9 to 12 after update 2; limits may only "
+        "fall (in update 2; no checkpoint before it)"
+    )
 
 
 def test_a_student_whose_entropy_cannot_be_rewarded_is_named(

@@ -9,10 +9,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from recrl.analysis import report_tables
 from recrl.analysis.data import export
 from recrl.analysis.data.optima import optima_of
-from recrl.analysis.report import draw
+from recrl.analysis.report import table_formats
+from recrl.analysis.report.drawing import draw
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.plugins import UntrustedNameError, refuse_import_paths
 from recrl.environments.registry import find_task, task_options
@@ -238,10 +238,10 @@ def test_no_file_of_a_trial_is_written_through_a_link(foreign: Path, name: str) 
 def test_labels_are_text_in_latex_and_markdown() -> None:
     frame = pd.DataFrame({"task": [r"\input{/etc/passwd} $x$ ^~ {a}"]})
     assert r"\textbackslash{}input\{/etc/passwd\} \$x\$ \textasciicircum{}\textasciitilde{} \{a\}" in (
-        report_tables.latex(frame)
+        table_formats.latex(frame)
     )
     frame = pd.DataFrame({"task": ["<script>x</script> [a](javascript:b) | c\nd"]})
-    assert report_tables.markdown(frame).splitlines()[-1] == (
+    assert table_formats.markdown(frame).splitlines()[-1] == (
         r"| &lt;script&gt;x&lt;/script&gt; [a]\(javascript:b) \| c d |"
     )
 

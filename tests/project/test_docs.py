@@ -17,9 +17,9 @@ from recrl.analysis.data import sweep_data
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files import trial_tables
-from recrl.orchestrator.grid.grid import parse_grid
-from recrl.orchestrator.grid.grid_file import GridFile
+from recrl.orchestrator.files import trial_files
+from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.grid.file_models import GridFile
 from tests.project.documentation import DOCS, PAGES, ROOT, Fence, fences, label
 
 BASE: dict[str, Any] = {
@@ -79,9 +79,9 @@ def test_every_metric_of_every_agent_is_explained() -> None:
 def test_every_column_is_explained() -> None:
     explained = (REFERENCE / "files.md").read_text()
     columns = {
-        *trial_tables.EPISODE_COLUMNS,
-        *trial_tables.UPDATE_COLUMNS,
-        *trial_tables.EVALUATION_COLUMNS,
+        *trial_files.EPISODE_COLUMNS,
+        *trial_files.UPDATE_COLUMNS,
+        *trial_files.EVALUATION_COLUMNS,
         *sweep_data.TRIAL_COLUMNS,
         *sweep_data.PHASE_COLUMNS,
         *sweep_data.EVENT_COLUMNS,

@@ -10,7 +10,7 @@ import pytest
 from recrl.orchestrator.errors import GridError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.grid import parse_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep import LaunchSettings, launch

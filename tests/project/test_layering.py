@@ -21,6 +21,7 @@ ALLOWED = {
         "recrl.environments",
         "recrl.orchestrator.errors",
         "recrl.orchestrator.files",
+        "recrl.orchestrator.provenance.code_changes",
         "recrl.orchestrator.redaction",
         "recrl.orchestrator.spec",
         "recrl.orchestrator.tracking.read",
@@ -31,11 +32,19 @@ ALLOWED = {
     ),
     "orchestrator": ("recrl.agents", "recrl.environments", "recrl.teachers"),
 }
+# Modules of the orchestrator that may import the analysis, too: a launch draws its figures.
+WITH_ANALYSIS = r"orchestrator\.(cli\..*|launching)"
+# The Python API stands on top of everything; of the command line it uses only these modules.
+API_FILES = sorted((ROOT / "src" / "recrl").glob("*.py"))
+API_OF_CLI = {
+    "__main__": ("recrl.orchestrator.cli.main",),
+    "_launching": ("recrl.orchestrator.cli.launch", "recrl.orchestrator.cli.output"),  # to print progress
+}
 # Third-party modules that only some of our modules may import.
 ADAPTERS = {
     "PIL": r"orchestrator\.trial\.videos",
     "av": r"orchestrator\.trial\.videos",
-    "torch": r"agents\..*|orchestrator\.(trial\.(trial|runner|speed)|ray\.tune_trial)",
+    "torch": r"agents\..*|orchestrator\.(trial\.(trial|attempt|speed)|ray\.tune_trial)",
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\.rivergrid\..*",
     "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
@@ -53,10 +62,12 @@ ADAPTERS = {
 LAYERS = (
     ("background", "errors", "exit_codes", "located_yaml", "redaction", "spec", "untrusted", "validation"),
     ("files",),
+    ("provenance",),
     ("executors", "places", "sweep_progress", "trial"),
     ("grid", "remote"),
-    ("tracking",),
+    ("find_sweep", "tracking"),
     ("ray", "report_refresh", "sweep"),
+    ("launching",),
     ("cli",),
 )
 
@@ -99,7 +110,7 @@ def test_imports_of_ours_point_one_way(path: Path) -> None:
     allowed = (f"recrl.{own}", *ALLOWED[own])
     # "from recrl.environments import plugins" yields the package too: what counts is the module
     ours = {name for name in imports(parsed(path)) if name.count(".") >= 2 and within(name, "recrl")}
-    if dotted(path).startswith("orchestrator.cli."):
+    if re.fullmatch(WITH_ANALYSIS, dotted(path)):
         allowed += ("recrl.analysis",)
     assert sorted(name for name in ours if not any(within(name, package) for package in allowed)) == []
 
@@ -135,6 +146,21 @@ def test_the_orchestrator_has_layers() -> None:
                 assert height[parts[2]] <= height[own], f"{dotted(path)} imports {name}"
 
 
+@pytest.mark.parametrize("path", API_FILES, ids=lambda path: path.stem)
+def test_the_python_api_uses_the_command_line_only_to_print(path: Path) -> None:
+    of_cli = [name for name in imports(parsed(path)) if within(name, "recrl.orchestrator.cli")]
+    allowed = API_OF_CLI.get(path.stem, ())
+    assert [name for name in of_cli if not any(within(name, module) for module in allowed)] == []
+    third_party = {name.partition(".")[0] for name in imports(parsed(path), at_run_time=True)}
+    assert not third_party & {"ray", "mlflow", "matplotlib", "yaml", "rich", "fsspec"}
+
+
+def test_nothing_imports_the_python_api() -> None:
+    api = tuple(f"recrl.{path.stem}" for path in API_FILES if path.stem != "__init__")
+    for path in FILES:
+        assert not [it for it in imports(parsed(path)) if any(within(it, name) for name in api)], path
+
+
 def test_no_import_is_relative() -> None:
     for path in FILES:
         for node in ast.walk(parsed(path)):
@@ -142,7 +168,7 @@ def test_no_import_is_relative() -> None:
 
 
 def test_files_of_subpackages_are_checked_too() -> None:
-    assert "environments.safety_gym.native.environment_step" in NAMES
+    assert "environments.safety_gym.compiled_step" in NAMES
 
 
 def test_no_package_file_imports_anything() -> None:

@@ -5,10 +5,14 @@ there if some number in such a file is equal to it at the digits that the README
 measurements (limits, sizes, versions, optima of the maps) are listed below, each with what it is.
 """
 
+import math
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
+
+from recrl.analysis.statistics.verdicts import solved
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -22,8 +26,8 @@ DEFINITIONS = {
     "What was found": {
         "2e6": "steps of a trial",
         "1e7": "steps of a published run",
-        "240": "trials of the grid",
-        "1%": "the tolerance",
+        "11e5894": "a commit",
+        "0.79": "a p-value, see test_the_table_of_rivergrid_is_counted",
     },
 }
 NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
@@ -87,6 +91,29 @@ def test_every_measured_number_is_in_a_file_of_results(title: str) -> None:
         token for token in measured if token not in DEFINITIONS.get(title, {}) and not is_in(token, known)
     ]
     assert not unknown, f"{title or 'the beginning'}: in no file of results/ that it names: {unknown}"
+
+
+def test_the_table_of_rivergrid_is_counted() -> None:
+    """Solved policies of 20 seeds, pairs that differ, McNemar's exact test, and negative returns."""
+    rows = pd.read_csv(ROOT / "results/rivergrid/average.csv")
+    rows["optimal_return"] = rows["task"].map({"rivergrid-1a": 9.5, "rivergrid-1b": 9.1})
+    rows["gap"] = rows["optimal_return"] - rows["return"]
+    rows = rows.rename(columns={"cost": "cost_0", "limit": "deploy_limit_0"})
+    rows = rows[rows["policy"] == "average"].assign(solved=solved(rows))
+    outcomes = rows.pivot_table(index=["task", "agent", "seed"], columns="method", values="solved")
+    for method in ("none", "dynamic"):
+        counts = outcomes[method].groupby(["task", "agent"]).sum().astype(int)
+        cells = [counts[f"rivergrid-{task}", agent] for task in ("1a", "1b") for agent in ("ppo-lag", "cpo")]
+        assert f"| `{method}` | {' | '.join(map(str, cells))} |" in README
+        count = ((rows["method"] == method) & (rows["return"] < 0.0)).sum()
+        assert f"{count or 'No policy'} " in README.partition("McNemar")[2]
+    on_1b = outcomes.xs("rivergrid-1b")
+    dynamic, none = on_1b["dynamic"].to_numpy(bool), on_1b["none"].to_numpy(bool)
+    only_dynamic, only_none = int((dynamic & ~none).sum()), int((none & ~dynamic).sum())
+    pairs = only_dynamic + only_none
+    tail = sum(math.comb(pairs, k) for k in range(min(only_dynamic, only_none) + 1)) / 2**pairs
+    said = f"alone solves {only_dynamic} pairs of equal seeds, `none` alone {only_none} "
+    assert f"{said}(McNemar's exact test, p = {2 * tail:.2f})" in README
 
 
 def test_definitions_are_still_used() -> None:

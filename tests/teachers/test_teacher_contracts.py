@@ -8,13 +8,20 @@ from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.teachers.registry import TEACHERS, make_teacher
-from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState, checked_answer
+from recrl.teachers.teacher import (
+    ProgressReport,
+    TeacherSpec,
+    TeacherState,
+    check_limits_fall,
+    checked_answer,
+)
 
 # Every teacher under its defaults, and the dynamic one also where its settings lead elsewhere.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
@@ -114,6 +121,20 @@ def test_limits_never_rise(history: History) -> None:
     for spec in history.specs():
         for (before, _), (after, _) in pairwise(played(spec, history.reports)):
             assert all(new <= old for new, old in zip(after.limits, before.limits, strict=True))
+
+
+@CONTRACT
+@given(history=histories())
+def test_every_answer_passes_the_trials_checks(history: History) -> None:
+    names = ["a", "b", "c"][: len(history.train_limits)]
+    for spec in history.specs():
+        before = None
+        for update, answer in enumerate(played(spec, history.reports)):
+            step, _ = checked_answer(answer, spec.name, len(names))
+            check_limits_fall(
+                step, before, spec.train_limits, curriculum=spec.name, cost_names=names, update=update
+            )
+            before = step.limits
 
 
 @CONTRACT
@@ -284,7 +305,78 @@ def test_what_is_wrong_with_a_curriculums_answer_is_said(answer: object, sentenc
         checked_answer(answer, "mine", 1)
 
 
+@pytest.mark.parametrize(
+    ("state", "problem"),
+    [
+        ({"seen": {1}}, "state['seen'] is a set"),
+        ({"costs": [[1.0], np.zeros(2)]}, "state['costs'][1] is an ndarray"),
+        ({"best": {"mean": np.float32(1.0)}}, "state['best']['mean'] is a float32"),
+        ({"rows": (row for row in [1])}, "state['rows'] is a generator"),
+        ({"pair": (1, 2)}, "state['pair'] is a tuple"),
+        ({"of": {3: 1.0}}, "state['of'] has the key 3, an int, and keys must be text"),
+    ],
+)
+def test_a_state_that_is_no_json_is_said_with_its_path(state: dict[str, Any], problem: str) -> None:
+    with pytest.raises(TypeError) as caught:
+        checked_answer((CurriculumStep(CostLimits((1.0,))), state), "set", 1)
+    assert str(caught.value) == f"curriculum set: {problem}; a state holds JSON values only"
+
+
+def test_a_state_of_json_values_is_right() -> None:
+    state = {"update": 3, "costs": [[1.0, math.inf]], "best": None, "of": {"a": True}, "said": "yes"}
+    assert checked_answer((CurriculumStep(CostLimits((1.0,))), state), "mine", 1)[1] is state
+
+
 def test_plain_numbers_are_limits_too() -> None:
     step = CurriculumStep((2.0, 1))  # type: ignore[arg-type]
     assert step.limits == CostLimits((2.0, 1.0))
     assert checked_answer((step, STATE), "mine", 2) == (step, STATE)
+
+
+INF = math.inf
+
+
+@pytest.mark.parametrize(
+    ("before", "limit", "train", "sentence"),
+    [
+        (None, 9.0, 9.0, None),
+        (None, 5.0, 9.0, None),
+        (None, INF, 9.0, None),  # a control without limits
+        (9.0, 9.0, 9.0, None),
+        (INF, 12.0, INF, None),  # a measured start
+        (9.0, 9.0 + 1e-12, 9.0, None),  # rounding
+        (9.0, 12.0, 20.0, "the limit of noise rose from 9 to 12 after update 5; limits may only fall"),
+        (9.0, INF, INF, "the limit of noise rose from 9 to inf after update 5; limits may only fall"),
+        (
+            None,
+            12.0,
+            9.0,
+            "the limit of noise is 12 at the start, above its train_limits of 9; limits may only fall",
+        ),
+        (
+            INF,
+            12.0,
+            9.0,
+            "the limit of noise is 12 after update 5, above its train_limits of 9; limits may only fall",
+        ),
+    ],
+)
+def test_a_limit_that_rises_is_an_error_with_its_cost(
+    before: float | None, limit: float, train: float, sentence: str | None
+) -> None:
+    def check() -> None:
+        check_limits_fall(
+            CurriculumStep(CostLimits((1.0, limit))),
+            None if before is None else CostLimits((1.0, before)),
+            CostLimits((1.0, train)),
+            curriculum="rising",
+            cost_names=("fuel", "noise"),
+            update=0 if before is None else 5,
+        )
+
+    if sentence is None:
+        check()
+        return
+    with pytest.raises(ValueError) as caught:
+        check()
+    assert str(caught.value) == f"curriculum rising: {sentence}"

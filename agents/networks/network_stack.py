@@ -1,0 +1,84 @@
+"""Networks of a policy or of critics, by the agent's options: the fast perceptron, or modules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.flat_parameters import FlatParameters
+from recrl.agents.networks.module_stack import ModuleStack, checked_module, perceptron
+from recrl.agents.networks.tanh_stack import Scratch, TanhStack
+
+
+class Stack(Protocol):
+    """C networks of one kind whose parameters are views into one block; see ``TanhStack``."""
+
+    def scale(self, factors: Tensor) -> None:
+        """Multiply each network's outputs by a factor, [C] or a scalar."""
+        ...
+
+    def to_module(self) -> nn.Module:
+        """Return a copy of the first network."""
+        ...
+
+    def outputs(self, rows: Tensor) -> Tensor:
+        """The outputs of every network, [C, U, out]; rows are [U, n]."""
+        ...
+
+    def activations(self, rows: Tensor, scratch: Scratch | None = None) -> list[Tensor]:
+        """Return the data for differentiating, for one block of rows; the outputs, [C, U, out], come last."""
+        ...
+
+    def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
+        """The derivative of the outputs along a change of the parameters, [C, U, out]."""
+        ...
+
+    def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
+        """Write the derivative of a loss by the parameters to the gradient block."""
+        ...
+
+
+def make_stack(
+    form: NetworkForm,
+    num_networks: int,
+    num_inputs: int,
+    num_outputs: int,
+    *,
+    last_scale: float,
+    generator: torch.Generator,
+    role: str,
+    others: Sequence[tuple[int, ...]] = (),
+) -> tuple[FlatParameters, Stack]:
+    """Make C networks with their parameters.
+
+    Args:
+        form: their architecture.
+        num_networks: C.
+        num_inputs: n.
+        num_outputs: of each.
+        last_scale: factor on the initial outputs.
+        generator: the initialisation's randomness.
+        role: of the networks, for errors: ``policy`` or ``critic``.
+        others: shapes of further parameters at the end of the block.
+
+    Raises:
+        NetworkError: a user's network does not meet the requirements.
+    """
+    if form.factory is None and form.activation == "tanh":
+        sizes = (num_inputs, *form.hidden_sizes, num_outputs)
+        parameters = FlatParameters([*TanhStack.shapes(num_networks, sizes), *others])
+        stack = TanhStack(parameters, len(sizes) - 1)
+        stack.initialise(form.initialiser, last_scale, generator)
+        return parameters, stack
+    factory = form.factory or perceptron(form.hidden_sizes, form.activation, form.initialiser)(generator)
+    with torch.random.fork_rng(devices=[]):  # a user's module draws from PyTorch's global generator
+        torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
+        modules = [checked_module(factory, num_inputs, num_outputs, role=role) for _ in range(num_networks)]
+    parameters = FlatParameters([*ModuleStack.shapes(modules), *others])
+    of_modules = ModuleStack(modules, parameters)
+    of_modules.initialise(last_scale)
+    return parameters, of_modules

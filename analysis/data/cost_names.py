@@ -1,0 +1,62 @@
+"""Names of a task's costs for titles and verdicts, from the provenance of its trials.
+
+A task with one cost needs none. Where the names are unknown, as for trials of earlier versions, costs have
+the numbers of the CSV files' columns: cost 0, cost 1.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from recrl.analysis.data.sweep_data import Sweep, TrialFacts
+from recrl.orchestrator.redaction import printable
+
+LONGEST_NAME = 60
+
+
+def cost_names(sweep: Sweep) -> Mapping[str, tuple[str, ...]]:
+    """Return the names of the k costs of each task with k > 1, by the task's label; numbers if unknown."""
+    names: dict[str, tuple[str, ...]] = {}
+    for trial in sweep.facts:
+        label, num_costs = trial.spec.task.label, len(trial.spec.deploy_limits)
+        if num_costs > 1 and not _is_named(names.get(label, ())):
+            numbers = tuple(str(i) for i in range(num_costs))
+            names[label] = _recorded(trial, num_costs) or names.get(label, numbers)
+    return names
+
+
+def cost_suffix(sweep: Sweep, i: int, task: str | None = None) -> str:
+    """Return what follows the word cost in a title: `` fuel``, or nothing where there is one cost.
+
+    Args:
+        sweep: its trials have the names.
+        i: index of the cost.
+        task: label of the task that is shown; None for all tasks, which may name cost i differently: then
+            the number is used.
+    """
+    shown = [it.spec for it in sweep.facts if task in (None, it.spec.task.label)]
+    if max((len(spec.deploy_limits) for spec in shown), default=1) == 1:
+        return ""
+    names = cost_names(sweep)
+    labels = {spec.task.label for spec in shown if len(spec.deploy_limits) > i}
+    found = {names[label][i] if label in names else str(i) for label in labels}
+    return f" {found.pop()}" if len(found) == 1 else f" {i}"
+
+
+def _is_named(names: tuple[str, ...]) -> bool:
+    return bool(names) and names != tuple(str(i) for i in range(len(names)))
+
+
+def _recorded(trial: TrialFacts, num_costs: int) -> tuple[str, ...]:
+    """Return the names that the last attempt recorded; empty if there are none of the right form."""
+    try:
+        attempts: list[Any] = json.loads(trial.provenance).get("attempts", [])
+        names = attempts[-1].get("cost_names", ())
+    except (ValueError, AttributeError, IndexError, TypeError, KeyError):
+        return ()
+    if not isinstance(names, list) or len(names) != num_costs:
+        return ()
+    texts = tuple(name for name in names if isinstance(name, str) and 0 < len(name) <= LONGEST_NAME)
+    return texts if len(texts) == num_costs and all(printable(it) == it for it in texts) else ()

@@ -1,0 +1,1 @@
+"""The report of a sweep: figures, tables, and the pages that hold them."""

@@ -1,0 +1,148 @@
+"""The tables of a sweep: files, and text for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from recrl.analysis.data.cost_names import cost_names, cost_suffix
+from recrl.analysis.data.labels import GROUP
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.data.sweep_warnings import curriculum_flags
+from recrl.analysis.report import table_formats
+from recrl.analysis.statistics import claims, metrics
+from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.intervals import ENOUGH_RUNS
+from recrl.analysis.statistics.metrics import Measure
+from recrl.analysis.statistics.verdict_counts import count_verdicts
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
+
+BOOTSTRAP_SEED = 0
+SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
+
+TIES = (
+    f"P(higher return): a tie counts half. Returns tie within {SOLVED_GAP} of each other where the optimum "
+    "is known, as for solved; elsewhere only where they differ by rounding."
+)
+FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
+BOUNDS_NOTE = (
+    "Sums over the policies of the training phase, one expected episode each; means over n seeds. Limits in "
+    "force: the sum of the limits that the curriculum set. Above limits in force, above the limit: the part "
+    "of the measured cost above them, and above the deployment limit. Bound: if every update solves CPO's "
+    "problem (CPO only). Discounted bound: Proposition 1 of the paper. Trivial bound: every step at the "
+    "largest cost."
+)
+
+
+@dataclass(frozen=True)
+class ShownTable:
+    """A table of the report.
+
+    Attributes:
+        heading: its title.
+        table: finished text.
+        note: a sentence below it, or empty.
+        kinds: of each row, ``infeasible`` or empty; none for a table without such rows.
+    """
+
+    heading: str
+    table: pd.DataFrame
+    note: str = ""
+    kinds: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Content of the report besides the figures.
+
+    Attributes:
+        verdicts: of ``verdict_counts.count_verdicts``; empty before a trial is complete.
+        shown: the tables for people.
+    """
+
+    verdicts: pd.DataFrame = field(default_factory=pd.DataFrame)
+    shown: Sequence[ShownTable] = ()
+
+
+def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
+    """Write the tables of a finished or running sweep.
+
+    Args:
+        sweep: its frames.
+        folder: where the files go.
+
+    Returns:
+        The files, and the report's content.
+    """
+    rows = metrics.outcomes(sweep)
+    bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
+    written = [
+        table_formats.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
+        table_formats.write_csv(pd.concat(bounds), folder / "bounds.csv"),
+    ]
+    if not len(rows):
+        return written, Tables()
+    generator = np.random.default_rng(BOOTSTRAP_SEED)
+    averaged = metrics.summary(rows)
+    robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
+    compared = metrics.comparisons(rows, generator)
+    weighed = claims.weigh(rows)
+    whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
+    judged = count_verdicts(rows, compared, curriculum_flags(sweep), cost_names(sweep))
+    suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
+    outcomes = _outcome_tables(averaged, suffixes)
+    latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
+    shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
+    if len(weighed):
+        written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
+        shown.append(ShownTable("What the paper says of these maps", claims.claims_table(weighed)))
+    for i, costs in enumerate(bounds):
+        which = f" (cost{suffixes[i]})" if suffixes[i] else ""
+        if len(costs):
+            heading = f"Cumulative cost of training against its bounds{which}"
+            shown.append(ShownTable(heading, bound_table(costs), BOUNDS_NOTE))
+    written += [
+        table_formats.write_csv(judged, folder / "verdicts.csv"),
+        table_formats.write_csv(rows, folder / "outcomes.csv"),
+        table_formats.write_parquet(rows, folder / "outcomes.parquet"),
+        table_formats.write_csv(whole, folder / "summary.csv"),
+        table_formats.write_csv(compared, folder / "comparisons.csv"),
+        table_formats.write_text("\n".join(latex), folder / "outcomes.tex"),
+    ]
+    return written, Tables(judged, shown)
+
+
+def _outcome_tables(averaged: pd.DataFrame, suffixes: Sequence[str]) -> list[ShownTable]:
+    """Return the outcomes, those of the final policy first."""
+    tables = []
+    for measure in SHOWN_MEASURES:
+        rows = averaged[averaged["measure"] == measure.value]
+        if len(rows):
+            table = table_formats.outcome_table(averaged, measure, suffixes)
+            tables.append(ShownTable(_heading(measure), table, kinds=table_formats.row_kinds(rows)))
+    return tables
+
+
+def _comparison_tables(
+    compared: pd.DataFrame, averaged: pd.DataFrame, suffixes: Sequence[str]
+) -> list[ShownTable]:
+    """Return differences to the agent without a curriculum, those of the final policy first."""
+    tables = []
+    for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT) if len(compared) else ():
+        rows = table_formats.compared_rows(compared, averaged, measure)
+        table = table_formats.comparison_table(rows, suffixes)
+        marked = table["P(higher return)"].str.contains(table_formats.TOO_FEW).any() if len(table) else False
+        note = f"{TIES} {FEW}" if marked else TIES
+        tables.append(
+            ShownTable(f"{_heading(measure)}, minus none", table, note, table_formats.row_kinds(rows))
+        )
+    return tables
+
+
+def _heading(measure: Measure) -> str:
+    text = measure.description.removeprefix("the ")
+    return text[0].upper() + text[1:]

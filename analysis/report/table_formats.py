@@ -1,0 +1,227 @@
+"""Tables of the trials' outcomes: CSV with every digit for programs, Markdown and LaTeX for people.
+
+In the tables for people a value is "mean ± standard error" over seeds, or one seed's value. A share of seeds
+is "3 of 5", from five seeds on with Wilson's 95% interval in percent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from recrl.analysis.data.labels import GROUP
+from recrl.analysis.statistics.intervals import share_text
+from recrl.analysis.statistics.metrics import Measure
+from recrl.orchestrator.redaction import printable
+
+DASH = "–"
+TOO_FEW = "†"
+LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "&": r"\&",
+    "%": r"\%",
+    "_": r"\_",
+    "#": r"\#",
+    "±": r"$\pm$",
+    "≤": r"$\leq$",
+    TOO_FEW: r"$\dagger$",
+}
+
+
+def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[str] = ()) -> pd.DataFrame:
+    """Format return, costs, regret and fractions of feasible and solved seeds.
+
+    The regret, J*(d_d) minus the return, is left out if a seed is infeasible, because its return may be above
+    J*(d_d).
+
+    Args:
+        summary: of ``metrics.summary``.
+        measure: which of the three outcomes.
+        suffixes: of ``cost_suffix`` for each cost; the numbers of the CSV files by default.
+    """
+    rows = summary[summary["measure"] == measure.value]
+    costs = [name for name in map(str, rows) if f"{name}_se" in rows and name.startswith("cost_")]
+    lines = []
+    for _, row in rows.iterrows():
+        line = names_of(row) | {"n": str(row["seeds"])}
+        for name in costs:
+            which = _cost_suffix(suffixes, name, len(costs))
+            line[f"cost{which}"] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
+            line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
+        line["return"] = with_error(row["episode_return"], row["episode_return_se"])
+        line["optimum"] = number(row["optimal_return"])
+        seeds, feasible = int(row["seeds"]), int(row["feasible_seeds"])
+        line["regret"] = with_error(row["gap"], row["gap_se"]) if feasible == seeds else DASH
+        line["feasible"] = share_text(feasible, seeds, row["feasible_low"], row["feasible_high"])
+        found = share_text(int(row["optimal_seeds"]), seeds, row["optimal_low"], row["optimal_high"])
+        line["solved"] = DASH if math.isnan(row["optimal_return"]) else found
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def row_kinds(rows: pd.DataFrame) -> list[str]:
+    """Return ``infeasible`` for each row with an infeasible seed, else an empty text.
+
+    Args:
+        rows: seeds and feasible_seeds, as in ``metrics.summary``.
+    """
+    return ["infeasible" if row.feasible_seeds < row.seeds else "" for row in rows.itertuples()]
+
+
+def names_of(row: pd.Series) -> dict[str, str]:
+    """Return the labels of a row's task, agent and curriculum."""
+    return {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
+
+
+def compared_rows(comparisons: pd.DataFrame, summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+    """Return the comparisons of one measure, with ``seeds`` and ``feasible_seeds`` of the curriculum.
+
+    Args:
+        comparisons: of ``metrics.comparisons``.
+        summary: of ``metrics.summary``.
+        measure: which of the three outcomes.
+    """
+    rows = comparisons[comparisons["measure"] == measure.value]
+    counts = summary[[*GROUP, "measure", "seeds", "feasible_seeds"]]
+    return rows.merge(counts, on=[*GROUP, "measure"], how="left", sort=False)
+
+
+def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.DataFrame:
+    """Format paired differences to the agent without a curriculum.
+
+    More return is no gain if every seed is infeasible: such a row has no gain, only its added cost.
+
+    Args:
+        rows: of ``compared_rows``.
+        suffixes: as for ``outcome_table``.
+    """
+    costs = [name for name in map(str, rows) if name.startswith("cost_") and name.endswith("_difference")]
+    lines = []
+    for _, row in rows.iterrows():
+        line = names_of(row) | {"n": str(row["pairs"])}
+        no_gain = row["feasible_seeds"] == 0
+        line["return gained"] = DASH if no_gain else with_interval(row, "return_difference")
+        for name in costs:
+            title = f"cost{_cost_suffix(suffixes, name, len(costs))} added"
+            line[title] = with_interval(row, name)
+        mark = TOO_FEW if row["too_few_seeds"] and not math.isnan(row["improvement_low"]) else ""
+        line["P(higher return)"] = DASH if no_gain else with_interval(row, "improvement") + mark
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def _cost_suffix(suffixes: Sequence[str], column: str, num_costs: int) -> str:
+    i = int(column.split("_")[1])
+    return suffixes[i] if i < len(suffixes) else "" if num_costs == 1 else f" {i}"
+
+
+def number(value: float) -> str:
+    """Format a value with suitable digits; a dash for NaN.
+
+    >>> [number(value) for value in (9.5, 128.44, 0.0312, 0.0, float("nan"))]
+    ['9.50', '128.4', '0.031', '0.00', '–']
+    """
+    if math.isnan(value):
+        return DASH
+    size = abs(value)
+    digits = 1 if size >= 100.0 else 3 if 0.0 < size < 0.1 else 2
+    return f"{value:.{digits}f}"
+
+
+def with_error(mean: float, error: float, *, digits: int = 2) -> str:
+    """Format mean ± standard error, without the error for a single seed.
+
+    Args:
+        mean: NaN becomes a dash.
+        error: of the mean, or NaN.
+        digits: after the point; one is enough from 100 on.
+
+    >>> with_error(9.41, 0.05), with_error(9.41, float("nan")), with_error(-20.0, 0.0)
+    ('9.41 ± 0.05', '9.41', '-20.00 ± 0.00')
+    >>> with_error(5.002, 0.001, digits=3), with_error(-0.001, 0.012)
+    ('5.002 ± 0.001', '0.00 ± 0.01')
+    """
+    if math.isnan(mean):
+        return DASH
+    shown = 1 if abs(mean) >= 100.0 else digits
+    value = round(mean, shown) + 0.0  # no -0.00
+    return f"{value:.{shown}f}" if math.isnan(error) else f"{value:.{shown}f} ± {error:.{shown}f}"
+
+
+def with_interval(row: pd.Series, name: str) -> str:
+    """Format estimate [low, high] from the three columns of an interval; without ends if they are NaN."""
+    estimate, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    shown, low, high = (round(value, 2) + 0.0 for value in (estimate, low, high))  # no -0.00
+    ends = "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
+    return DASH if math.isnan(estimate) else f"{shown:.2f}{ends}"
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Format a Markdown table; repeated labels in the first columns stay, for sorting and searching.
+
+    >>> print(markdown(pd.DataFrame({"task": ["1a"], "return": ["9.50"]})))
+    | task | return |
+    | --- | --- |
+    | 1a | 9.50 |
+    """
+    lines = [list(map(str, table)), ["---"] * len(table.columns), *table.astype(str).to_numpy().tolist()]
+    return "\n".join("| " + " | ".join(map(markdown_text, line)) + " |" for line in lines)
+
+
+def markdown_text(text: str) -> str:
+    r"""Escape HTML, links and cell separators in a text for Markdown.
+
+    >>> markdown_text("<img src=x> [a](b) | c")
+    '&lt;img src=x&gt; [a]\\(b) \\| c'
+    """
+    text = " ".join(printable(text).split())
+    for mark, escaped in {"<": "&lt;", ">": "&gt;", "](": r"]\(", "|": r"\|"}.items():
+        text = text.replace(mark, escaped)
+    return text
+
+
+def latex(table: pd.DataFrame) -> str:
+    """Format a LaTeX tabular for the package booktabs, with a rule between tasks."""
+    lines = [r"\begin{tabular}{" + "l" * len(table.columns) + "}", r"\toprule"]
+    lines += [_latex_line(list(map(str, table))), r"\midrule"]
+    before = None
+    for cells in table.astype(str).to_numpy().tolist():
+        if before is not None and cells[0] != before:
+            lines.append(r"\midrule")
+        before = cells[0]
+        lines.append(_latex_line(cells))
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
+
+
+def write_csv(frame: pd.DataFrame, path: Path) -> Path:
+    """Write a data frame as CSV; floats as the shortest exact text."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame.to_csv(path, index=False, lineterminator="\n")
+    return path
+
+
+def write_parquet(frame: pd.DataFrame, path: Path) -> Path:
+    """Write a data frame as Parquet, with its types."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame.to_parquet(path, index=False)
+    return path
+
+
+def write_text(text: str, path: Path) -> Path:
+    """Write a text file that ends with a line feed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+    return path
+
+
+def _latex_line(cells: Sequence[str]) -> str:
+    escaped = ["".join(LATEX.get(letter, letter) for letter in cell.replace("–", "--")) for cell in cells]
+    return " & ".join(escaped) + r" \\"

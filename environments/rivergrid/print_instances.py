@@ -1,0 +1,70 @@
+"""Print generated RiverGrid instances as lines for a grid file: map, J*(d) and limit d_d.
+
+    python -m recrl.environments.rivergrid.print_instances 0 1 2
+    python -m recrl.environments.rivergrid.print_instances 7 --options '{"width": 12, "river_width": [1, 3]}'
+
+Paste the output below ``tasks:``. The limit is that of ``instances.suggested_limit``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.registry import optimal_return
+from recrl.environments.rivergrid.grid_world import RiverGridGeneratedOptions
+from recrl.environments.rivergrid.instances import Route, cheapest_route, quickest_route, suggested_limit
+
+TASK = "rivergrid-generated"
+
+
+def grid_entry(options: Mapping[str, Any]) -> str:
+    """Return an entry for ``tasks:`` in a grid file, with the map and its optimum in a comment above it.
+
+    Args:
+        options: of ``rivergrid-generated``, with the river as the only cost.
+    """
+    river_map = RiverGridGeneratedOptions.model_validate(dict(options)).river_map()
+    limit, seed = suggested_limit(river_map), options["map_seed"]
+    quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
+    assert quickest is not None and cheapest is not None, "an instance's goal can be reached"
+    optima = {
+        value: optimal_return(TASK, options, CostLimits((value,)))
+        for value in sorted({*range(quickest.cost + 1), limit})
+    }
+    comments = [
+        f"Map {seed}: the shortest path takes {_words(quickest)}, "
+        f"{'the safe path' if cheapest.cost == 0 else 'the cheapest'} {_words(cheapest)}.",
+        *str(river_map).split("\n"),
+        ", ".join(f"J*({value:g}) = {optimum:.2f}" for value, optimum in optima.items()),
+    ]
+    entry = f"{{name: {TASK}, label: map-{seed}, options: {json.dumps(options)}, deploy_limits: {limit:g}}}"
+    return "\n".join([*(f"  # {line}" for line in comments), f"  - {entry}"])
+
+
+def _words(route: Route) -> str:
+    return f"{route.steps} steps at a cost of {route.cost}"
+
+
+def main() -> None:
+    """Print one entry for each map seed on the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m recrl.environments.rivergrid.print_instances",
+        description="Entries for the tasks of a grid file: generated RiverGrid maps and their limits.",
+    )
+    parser.add_argument("map_seed", type=int, nargs="+", help="seeds of the maps")
+    parser.add_argument(
+        "--options", type=json.loads, default={}, help="other options of rivergrid-generated, as JSON"
+    )
+    arguments = parser.parse_args()
+    try:
+        print("\n".join(grid_entry({"map_seed": seed, **arguments.options}) for seed in arguments.map_seed))
+    except ValueError as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

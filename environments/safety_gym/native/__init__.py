@@ -1,1 +1,0 @@
-"""The compiled environment step of the Safety Gym tasks."""

@@ -1,0 +1,117 @@
+"""The files of a trial: their names and kinds, columns and paths; ``sweep_store`` describes them.
+
+A file that trials have is declared once, as an attribute of ``TrialFiles``. Its kind decides how a writer
+commits it, and whether and how it is uploaded to an object store.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+EPISODE_COLUMNS = ("index", "phase", "end_step", "length", "episode_return", "noise")
+UPDATE_COLUMNS = (
+    "update",
+    "phase",
+    "end_step",
+    "episodes",
+    "episode_return",
+    "noise",
+    "time",
+    "collect_seconds",
+    "update_seconds",
+)
+EVALUATION_COLUMNS = ("policy", "index", "length", "episode_return")
+
+
+class FileKind(Enum):
+    """How a file is written."""
+
+    ROWS = "rows appended by each commit, together with a checkpoint"
+    LOG = "lines appended at any time"
+    WHOLE = "written as a whole"
+    RECORD = "the record, which names the committed files"  # a commit in an object store contains it
+    LOCAL = "of the machine that runs the trial; not uploaded"
+
+
+class Below:
+    """The path of a file or folder, an attribute of what has a ``folder``."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __get__(self, owner: Any, kind: type[Any]) -> Path:
+        folder: Path = owner.folder
+        return folder / self.name
+
+
+class TrialFile(Below):
+    """The path of a file of a trial.
+
+    Attributes:
+        kind: how it is written.
+    """
+
+    def __init__(self, name: str, kind: FileKind) -> None:
+        super().__init__(name)
+        self.kind = kind
+
+
+class TrialFiles:
+    """The files and folders of one trial; ``sweep_store`` says what each holds.
+
+    Attributes:
+        folder: the trial's folder; its name is ``TrialSpec.folder_name``.
+    """
+
+    episodes_path = TrialFile("episodes.csv", FileKind.ROWS)
+    updates_path = TrialFile("updates.csv", FileKind.ROWS)
+    events_path = TrialFile("events.jsonl", FileKind.ROWS)
+    log_path = TrialFile("log.txt", FileKind.LOG)
+    spec_path = TrialFile("spec.json", FileKind.WHOLE)
+    provenance_path = TrialFile("provenance.json", FileKind.WHOLE)
+    error_path = TrialFile("error.txt", FileKind.WHOLE)
+    evaluation_path = TrialFile("evaluation.csv", FileKind.WHOLE)
+    policy_path = TrialFile("policy.csv", FileKind.WHOLE)
+    state_path = TrialFile("state.json", FileKind.RECORD)
+    reserve_path = TrialFile(".reserve", FileKind.LOCAL)
+    lock_path = TrialFile(".lock", FileKind.LOCAL)
+    pulled_path = TrialFile(".pulled.json", FileKind.LOCAL)
+    checkpoints_folder = Below("checkpoints")
+    evaluations_folder = Below("evaluations")
+    videos_folder = Below("videos")
+    aside_folder = Below("aside")
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @property
+    def trial_id(self) -> str:
+        """The trial's id, from the folder's name."""
+        return self.folder.name.rpartition("__")[2]
+
+    @property
+    def is_local_copy(self) -> bool:
+        """Whether the folder is only a local copy of a trial in an object store."""
+        return self.pulled_path.exists()
+
+    def checkpoints(self) -> list[Path]:
+        """The checkpoints on disk, newest first."""
+        return sorted(self.checkpoints_folder.glob("checkpoint-*.recrl"), reverse=True)
+
+    @property
+    def saved_update(self) -> int:
+        """The update of the newest checkpoint, intact or not; 0 if there is none."""
+        names = [path.stem.removeprefix("checkpoint-") for path in self.checkpoints()[:1]]
+        return int(names[0]) if names and names[0].isdecimal() else 0
+
+
+def files_of(*kinds: FileKind) -> tuple[str, ...]:
+    """Return the names of the files of these kinds, in the order of their declaration.
+
+    >>> files_of(FileKind.ROWS)
+    ('episodes.csv', 'updates.csv', 'events.jsonl')
+    """
+    files = (file for file in vars(TrialFiles).values() if isinstance(file, TrialFile))
+    return tuple(file.name for file in files if file.kind in kinds)

@@ -1,0 +1,51 @@
+"""Find a sweep by its name, folder or grid file, here or in an object store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.grid.checking import read_name
+from recrl.orchestrator.remote.remote_sweep import sweeps_at
+from recrl.orchestrator.validation import nearest
+
+EXPORT_SUFFIX = ".zip"
+
+
+def find_sweep(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
+    """Return the folder of a sweep, which is not brought up to date.
+
+    Args:
+        root: the folder of all sweeps.
+        sweep: its name, its folder or its grid file; None for the only sweep there.
+        storage: the address of an object store to search; None to search ``root``.
+
+    Raises:
+        RecrlError: there is no such sweep, or more than one.
+    """
+    place: str | Path = storage or root
+    names = sweeps_at(storage) if storage else sorted(path.name for path in root.glob("*") if is_sweep(path))
+    if sweep is None:
+        if len(names) == 1:
+            return SweepStore(root, names[0])
+        listed = f"give one: {', '.join(names)}" if names else "launch one first"
+        raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
+    if sweep.endswith((".yaml", ".yml")):
+        sweep = read_name(Path(sweep))
+    if sweep.endswith(EXPORT_SUFFIX) and sweep not in names:
+        raise RecrlError(
+            f"{sweep}: an export has tables but no policies, logs or trials; give the sweep's name or folder"
+        )
+    if sweep not in names:
+        folder = Path(sweep).absolute()
+        if not storage and (is_sweep(folder) or (folder / "trials").is_dir()):
+            return SweepStore(folder.parent, folder.name)
+        listed = f" (there: {', '.join(names)})" if names else ", nothing was launched there yet"
+        raise RecrlError(f"{place}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
+    return SweepStore(root, sweep)
+
+
+def is_sweep(folder: Path) -> bool:
+    """Whether a sweep was launched into this folder."""
+    return (folder / "sweep.json").exists() or (folder / "trials.jsonl").exists()

@@ -1,0 +1,84 @@
+"""Checks of a grid that build its parts: environments, and the user's own agents and curricula."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from recrl.agents.registry import AGENTS, make_agent
+from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
+from recrl.environments.registry import make_vector
+from recrl.orchestrator.errors import USERS_ERRORS, described
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.located_yaml import Place
+from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.teachers.registry import TEACHERS, make_teacher
+from recrl.teachers.teacher import check_limits_fall, checked_answer
+
+TASK_MARK = "\0"  # stands for a task in a sentence, after "on" or "of"
+
+
+class BuildError(Exception):
+    """A part of a grid cannot be built; the text is one sentence."""
+
+
+def cmdp_of(task: Choice) -> CMDPSpec:
+    """Return the task's CMDP, by building one environment; a user's environment also takes one step.
+
+    Raises:
+        BuildError: it cannot be built, or fails in its first step.
+    """
+    try:
+        envs = make_vector(task.name, 1, options=task.options)
+    except USERS_ERRORS as error:
+        raise BuildError(f"{task.name} cannot be built: {described(error)}") from error
+    try:
+        if isinstance(envs, SyncCMDPVectorEnv):  # a user's environment: does a step report its cost?
+            envs.reset(seed=0)
+            envs.action_space.seed(0)
+            envs.step(envs.action_space.sample())
+    except USERS_ERRORS as error:
+        raise BuildError(f"{task.name} fails in its first step: {described(error)}") from error
+    finally:
+        envs.close()
+    return envs.cmdp
+
+
+def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[Place, str, str]]:
+    """Build the user's own agents, networks and curricula once on each task that they meet.
+
+    Args:
+        grid: the grid.
+        cmdps: of its tasks, by label.
+
+    Yields:
+        Of each that cannot be built: its place, a sentence with ``TASK_MARK``, and the task's label.
+    """
+    trials = grid.trials()
+    agents = {(it.task.label, it.agent.label): it for it in trials if _is_own_agent(it.agent)}
+    methods = {(it.task.label, it.method.label): it for it in trials if it.method.name not in TEACHERS}
+    for (task, label), spec in agents.items():
+        place = ("agents", [agent.label for agent in grid.agents].index(label))
+        try:
+            make_agent(spec.agent.name, cmdps[task], spec.agent.options, np.random.SeedSequence(0))
+        except USERS_ERRORS as error:
+            yield place, f"{label} cannot be built on {TASK_MARK}: {described(error)}", task
+    for (task, label), spec in methods.items():
+        place = ("methods", [method.label for method in grid.methods].index(label))
+        try:
+            _check_start(spec, cmdps[task])
+        except USERS_ERRORS as error:
+            yield place, f"{label} cannot be started on {TASK_MARK}: {described(error)}", task
+
+
+def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
+    """Check the first step of a trial's curriculum, and its state."""
+    label = spec.method.label
+    step, _ = checked_answer(make_teacher(spec.teacher).start(), label, cmdp.num_costs)
+    check_limits_fall(step, None, spec.train_limits, curriculum=label, cost_names=cmdp.cost_names, update=0)
+
+
+def _is_own_agent(agent: Choice) -> bool:
+    return agent.name not in AGENTS or isinstance(agent.options.get("network"), str)

@@ -1,0 +1,80 @@
+"""A checked grid and its trials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.grid.file_models import (
+    Exclusion,
+    Resources,
+    Run,
+)
+from recrl.orchestrator.spec import Choice, TrialSpec
+
+
+@dataclass(frozen=True)
+class TaskCell:
+    """A task with its resolved limits and rollout length.
+
+    Attributes:
+        task: the CMDP.
+        train_limits: d_t, [k].
+        deploy_limits: d_d, [k].
+        rollout_steps: T.
+    """
+
+    task: Choice
+    train_limits: CostLimits
+    deploy_limits: CostLimits
+    rollout_steps: int
+
+
+@dataclass(frozen=True)
+class GridSpec:
+    """A checked grid with all defaults.
+
+    Attributes:
+        name: the sweep's name.
+        tasks: the CMDPs with their limits.
+        agents: the agents.
+        methods: the curricula.
+        seeds: at least one, all different.
+        run: length and width of every trial.
+        resources: of a trial.
+        exclude: trials to leave out of the product.
+        text: the original file.
+    """
+
+    name: str
+    tasks: tuple[TaskCell, ...]
+    agents: tuple[Choice, ...]
+    methods: tuple[Choice, ...]
+    seeds: tuple[int, ...]
+    run: Run
+    resources: Resources
+    exclude: tuple[Exclusion, ...]
+    text: bytes
+
+    def trials(self) -> tuple[TrialSpec, ...]:
+        """Return the trials, in their starting order."""
+        cells = product(self.seeds, self.tasks, self.agents, self.methods)
+        specs = (self._trial(*cell) for cell in cells)
+        return tuple(spec for spec in specs if not any(rule.matches(spec) for rule in self.exclude))
+
+    def _trial(self, seed: int, cell: TaskCell, agent: Choice, method: Choice) -> TrialSpec:
+        deploy_steps = round(self.run.total_steps * self.run.deploy_fraction)
+        return TrialSpec(
+            task=cell.task,
+            agent=agent,
+            method=method,
+            train_limits=cell.train_limits,
+            deploy_limits=cell.deploy_limits,
+            train_steps=self.run.total_steps - deploy_steps,
+            deploy_steps=deploy_steps,
+            num_envs=self.run.num_envs,
+            rollout_steps=cell.rollout_steps,
+            evaluation_episodes=self.run.evaluation_episodes,
+            seed=seed,
+        )

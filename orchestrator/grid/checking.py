@@ -1,0 +1,415 @@
+"""The grid file: the trials of a sweep, checked completely before any of them starts.
+
+    name: rivergrid
+    tasks:
+      - {name: rivergrid-1a, deploy_limits: 5}
+      - {name: rivergrid-1b, deploy_limits: 1}
+    agents: [ppo-lag, cpo]
+    methods: [none, linear, {name: dynamic, options: {window: 5}}]
+    seeds: 5
+    run: {total_steps: 960000}
+
+A grid is a product: every task x agent x method x seed, without the entries of ``exclude``. ``read_grid``
+reports all mistakes at once, each with its line. ``GridSpec.trials`` is pure, ordered and without duplicates.
+Seeds are the outermost loop, so that every method gets its first seed before any gets its second.
+
+Symbols: ``train_limits`` is d_t, ``deploy_limits`` is d_d, k the number of a task's costs, B the training
+budget, T ``rollout_steps``. Limits are undiscounted costs per episode.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from recrl.agents.registry import agent_config
+from recrl.environments.cmdp import CMDPSpec, CostLimits
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError, trusted_attribute
+from recrl.environments.registry import task_options
+from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
+from recrl.orchestrator.grid.building import TASK_MARK, BuildError, build_own, cmdp_of
+from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
+from recrl.orchestrator.grid.file_models import (
+    Entry,
+    GridFile,
+    Limits,
+    Run,
+    SweepName,
+    TaskEntry,
+)
+from recrl.orchestrator.located_yaml import Place, Problem, parse
+from recrl.orchestrator.spec import Choice
+from recrl.orchestrator.validation import as_written, nearest, sentences
+from recrl.teachers.registry import teacher_config
+
+MAX_TRIALS = 100_000
+ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many updates
+# Defaults: an infinite d_t, so that the curriculum measures its start. There is no default d_d.
+DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
+
+Model = TypeVar("Model", bound=BaseModel)
+# Function of a registry that validates the options of a name and adds defaults.
+OptionsOf = Callable[[str, Mapping[str, Any]], BaseModel]
+
+
+def read_grid(path: Path, *, build: bool = False) -> GridSpec:
+    """Read and check the grid in a file.
+
+    Args:
+        path: of the file.
+        build: whether to build the user's own agents, networks and curricula once on each task.
+
+    Raises:
+        GridError: the file is missing or wrong; one located sentence for each mistake.
+        UncalledError: no mistake was found, but import paths were not checked, as this process refuses them.
+    """
+    return parse_grid(_read(path), source=str(path), build=build)
+
+
+def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
+    """Read and check the grid in ``data``.
+
+    Args:
+        data: a YAML document.
+        source: the file's name, for errors.
+        build: see ``read_grid``.
+
+    Raises:
+        GridError: one located sentence for each mistake.
+        UncalledError: see ``read_grid``.
+    """
+    check = _Check(data)
+    grid = check.grid()
+    if grid is not None and build:
+        for place, sentence, task in build_own(grid, check.cmdps):
+            check.add_of_task(place, sentence, task)
+    if check.problems:
+        unique = dict.fromkeys(check.problems)
+        ordered = sorted(unique, key=lambda problem: (problem.line, str(problem.place)))
+        raise GridError([f"{source}:{problem}" for problem in ordered])
+    if grid is None:
+        raise UncalledError(source, check.uncalled)
+    return grid
+
+
+def read_name(path: Path) -> str:
+    """Read the sweep's name from a grid file; the rest is not checked, and no code is called.
+
+    Raises:
+        GridError: the file is missing, no mapping, or its name is wrong.
+    """
+    document = parse(_read(path))
+    value = document.value
+    if not isinstance(value, dict):
+        problems = document.problems or (Problem(1, (), "a grid must be a mapping of settings"),)
+        raise GridError([f"{path}:{problem}" for problem in problems])
+    try:
+        return TypeAdapter(SweepName).validate_python(value.get("name"))
+    except ValidationError as error:
+        problem = Problem(document.line(("name",)), ("name",), next(sentences(error, None))[1])
+        raise GridError([f"{path}:{problem}"]) from error
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise GridError([f"{path}: {missing(path)}"]) from error
+    except (OSError, ValueError) as error:
+        raise GridError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from error
+
+
+class NotJsonError(Exception):
+    """The options cannot be written as JSON."""
+
+
+class _Check:
+    """One pass over a grid file; it continues after mistakes as far as possible.
+
+    First the whole file is checked against its schema. Then each entry of the right form is checked against
+    the registries and the other entries, independent of other mistakes.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._document = parse(data)
+        self.problems = list(self._document.problems)
+        self.uncalled: list[str] = []
+        self._of_tasks: dict[tuple[Place, str], list[str]] = {}  # tasks with the same mistake
+        self.cmdps: dict[str, CMDPSpec] = {}  # of the tasks that can be built, by label
+        raw = self._document.value
+        self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
+
+    def grid(self) -> GridSpec | None:
+        """Return the grid, or None if there are problems."""
+        if not isinstance(self._document.value, dict):
+            if not self.problems:
+                self.add((), f"a grid must be a mapping of settings, got {as_written(self._document.value)}")
+            return None
+        file = self._validated(GridFile, self._raw)
+        tasks = self._tasks()
+        agents = self._choices("agents", Entry, agent_config)
+        methods = self._choices("methods", Entry, teacher_config)
+        if file is None or self.problems or self.uncalled:
+            return None
+        grid = GridSpec(
+            name=file.name,
+            tasks=tuple(tasks),
+            agents=tuple(agents.values()),
+            methods=tuple(methods.values()),
+            seeds=file.seeds,
+            run=file.run,
+            resources=file.resources,
+            exclude=tuple(file.exclude),
+            text=self._data,
+        )
+        self._check_whole(grid)
+        return None if self.problems else grid
+
+    def _check_whole(self, grid: GridSpec) -> None:
+        """Check the product of all parts."""
+        size = len(grid.tasks) * len(grid.agents) * len(grid.methods) * len(grid.seeds)
+        if size > MAX_TRIALS:
+            self.add((), f"a grid must have at most {MAX_TRIALS} trials, got {size}")
+            return
+        known: dict[str, list[Any]] = {
+            "task": [cell.task.label for cell in grid.tasks],
+            "agent": [agent.label for agent in grid.agents],
+            "method": [method.label for method in grid.methods],
+            "seed": list(grid.seeds),
+        }
+        for index, rule in enumerate(grid.exclude):
+            wanted = rule.model_dump(exclude_none=True)
+            if not wanted:
+                self.add(("exclude", index), f"must name at least one of {', '.join(known)}")
+            for key, values in wanted.items():
+                for value in (value for value in values if value not in known[key]):
+                    hint = nearest(str(value), [str(name) for name in known[key]])
+                    self.add(("exclude", index, key), f"this grid has no {key} {as_written(value)}{hint}")
+        if not self.problems and not grid.trials():
+            self.add(("exclude",), "leaves no trial")
+
+    def _tasks(self) -> list[TaskCell]:
+        """Return the tasks with correct limits and rollouts."""
+        run = _valid(Run, self._raw.get("run"))
+        cells = []
+        for index, task in self._choices("tasks", TaskEntry, task_options).items():
+            try:
+                cmdp = cmdp_of(task)
+            except BuildError as error:
+                self.add(("tasks", index), str(error))
+                continue
+            self.cmdps[task.label] = cmdp
+            limits = self._both_limits(index, task.label, cmdp)
+            rollout_steps = self._rollout_steps(run, task.label, cmdp)
+            if limits is not None and rollout_steps is not None:
+                cells.append(TaskCell(task, *limits, rollout_steps))
+        return cells
+
+    def _choices(self, section: str, model: type[Entry], options_of: OptionsOf) -> dict[int, Choice]:
+        """Return the correct entries of a section, by their index."""
+        choices: dict[int, Choice] = {}
+        for index, value in enumerate(_items(self._raw.get(section))):
+            entry = _valid(model, value)
+            if entry is None:  # the schema check has reported why; its name may be wrong as well
+                named = _valid(Entry, _named(value))
+                if named is not None:
+                    self._options((section, index), named, options_of)
+                continue
+            options = self._options((section, index), entry, options_of)
+            if options is None:
+                continue
+            choice = Choice(entry.name, options, entry.label)
+            self._check_differs((section, index), choice, choices)
+            choices[index] = choice
+        return choices
+
+    def _options(self, place: Place, entry: Entry, options_of: OptionsOf) -> dict[str, Any] | None:
+        """Return the entry's options with defaults, as JSON values."""
+        name_place = (*place, "name") if (*place, "name") in self._document.lines else place
+        try:
+            options = options_of(entry.name, entry.options).model_dump(mode="json")
+            _require_json(options)
+        except ValidationError as error:
+            for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
+                self.add((*place, "options", *inner), sentence)
+        except UnknownNameError as error:
+            self.add(name_place, str(error))
+        except UntrustedNameError as error:
+            self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
+        except NotJsonError as error:
+            self.add((*place, "options"), f"must be finite JSON values ({error})")
+        except USERS_ERRORS as error:
+            self.add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
+        else:
+            self._check_network((*place, "options", "network"), options)
+            return options
+        return None
+
+    def _check_network(self, place: Place, options: Mapping[str, Any]) -> None:
+        """Check that a user's network can be imported, if import paths are followed."""
+        path = options.get("network")
+        if place[0] != "agents" or not isinstance(path, str):
+            return
+        try:
+            trusted_attribute(path)
+        except UnknownNameError as error:
+            self.add(place, str(error))
+        except UntrustedNameError as error:
+            self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
+        except USERS_ERRORS as error:
+            self.add(place, f"{path!r} cannot be imported: {described(error)}")
+
+    def _check_differs(self, place: Place, choice: Choice, earlier: Mapping[int, Choice]) -> None:
+        """Check that no earlier entry has the same label, or is the same under another label."""
+        for index, other in earlier.items():
+            if other.label == choice.label:
+                self.add(
+                    place, f"is called {choice.label!r}, as is {place[0]}.{index}; give it another label"
+                )
+                return
+            if (other.name, other.options) == (choice.name, choice.options) and place[0] != "tasks":
+                self.add(place, f"is the same as {place[0]}.{index}, under another label")
+                return
+
+    def _both_limits(self, index: int, label: str, cmdp: CMDPSpec) -> tuple[CostLimits, CostLimits] | None:
+        """Return the task's d_t and d_d."""
+        train_limits, place = self._limits(index, "train_limits", label, cmdp)
+        deploy_limits, _ = self._limits(index, "deploy_limits", label, cmdp)
+        if train_limits is None or deploy_limits is None:
+            return None
+        if any(train < deploy for train, deploy in zip(train_limits, deploy_limits, strict=True)):
+            self.add(
+                place,
+                f"must be at least the deploy_limits of {label} (d_t >= d_d), "
+                f"got {_numbers(train_limits)} under {_numbers(deploy_limits)}",
+            )
+            return None
+        return train_limits, deploy_limits
+
+    def _limits(self, index: int, key: str, label: str, cmdp: CMDPSpec) -> tuple[CostLimits | None, Place]:
+        """Return one kind of a task's limits, its own or the grid's, and their place in the file."""
+        place: Place = ("tasks", index, key)
+        raw = self._raw["tasks"][index]
+        values = getattr(_valid(TaskEntry, raw), key)
+        if values is None:
+            place, raw = (key,), self._raw
+            shared = _valid(Limits, {key: self._raw.get(key)})
+            if shared is None:  # the schema check has reported it
+                return None, place
+            values = getattr(shared, key) or DEFAULT_LIMITS[key]
+        if values is None:
+            self.add(("tasks", index), f"{key} is required, here or for all tasks")
+            return None, place
+        is_listed = isinstance(raw, dict) and isinstance(raw.get(key), list)
+        if len(values) != cmdp.num_costs and (is_listed or len(values) > 1):
+            costs = f"{cmdp.num_costs} cost{'s' * (cmdp.num_costs > 1)} ({', '.join(cmdp.cost_names)})"
+            got = f"{len(values)} limits" if len(values) > 1 else "1 limit; one for all is a plain number"
+            self.add(place, f"{label} has {costs}, got {got}")
+            return None, place
+        return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
+
+    def _rollout_steps(self, run: Run | None, label: str, cmdp: CMDPSpec) -> int | None:
+        """Return T: the given value, or its default."""
+        if run is None:
+            return None
+        default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
+        steps, num_envs = run.rollout_steps or default, run.num_envs
+        if run.total_steps < num_envs * steps:
+            self.add_of_task(
+                ("run", "total_steps"),
+                f"must be at least one update of {TASK_MARK}, "
+                f"{num_envs} environments x {steps} steps = {num_envs * steps}, got {run.total_steps}",
+                label,
+            )
+        else:
+            return steps
+        return None
+
+    def _validated(self, model: type[Model], value: Any) -> Model | None:
+        """Return the value as ``model``; all mistakes are added to the problems."""
+        try:
+            return model.model_validate(value)
+        except ValidationError as error:
+            for place, sentence in sentences(error, model):
+                self.add(place, sentence)
+        return None
+
+    def add(self, place: Place, sentence: str) -> None:
+        """Add a problem, with the line of its place."""
+        self.problems.append(self._problem(place, sentence))
+
+    def add_of_task(self, place: Place, sentence: str, task: str) -> None:
+        """Add a mistake on a task; the same mistake on further tasks stays one problem, which names them.
+
+        Args:
+            place: of the mistake.
+            sentence: with ``TASK_MARK`` in place of the task, after a preposition.
+            task: its label.
+        """
+        tasks = self._of_tasks.setdefault((place, sentence), [])
+        if tasks:
+            self.problems.remove(self._problem(place, _of_tasks(sentence, tasks)))
+        tasks.append(task)
+        self.add(place, _of_tasks(sentence, tasks))
+
+    def _problem(self, place: Place, sentence: str) -> Problem:
+        return Problem(self._document.line(place), place, sentence)
+
+
+def _of_tasks(sentence: str, tasks: Sequence[str]) -> str:
+    """Return the sentence of a mistake with its task, or with several in brackets at the end.
+
+    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a"])
+    'mine cannot be built on a: no'
+    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a", "b"])
+    'mine cannot be built: no (on a, b)'
+    """
+    before, after = sentence.split(TASK_MARK, 1)
+    if len(tasks) == 1:
+        return f"{before}{tasks[0]}{after}"
+    head = before.removesuffix(" on ").removesuffix(" of ")
+    return f"{head}{after} (on {', '.join(tasks)})"
+
+
+def _valid(model: type[Model], value: Any) -> Model | None:
+    """Return the value as ``model``, or None if it is wrong; its mistakes are reported elsewhere."""
+    try:
+        return model.model_validate(value)
+    except ValidationError:
+        return None
+
+
+def _named(value: Any) -> Any:
+    """Return an entry's name and options without its other settings."""
+    return (
+        {key: value[key] for key in ("name", "options") if key in value} if isinstance(value, dict) else value
+    )
+
+
+def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:
+    """Return the class of the options of ``name``, if it can be built without arguments."""
+    try:
+        return type(options_of(name, {}))
+    except (ValidationError, *USERS_ERRORS):
+        return None
+
+
+def _require_json(options: Mapping[str, Any]) -> None:
+    try:
+        json.dumps(options, allow_nan=False)
+    except ValueError as error:
+        raise NotJsonError(str(error)) from error
+
+
+def _items(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _numbers(limits: CostLimits) -> str:
+    return ", ".join(f"{limit:g}" for limit in limits)

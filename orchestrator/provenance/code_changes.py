@@ -1,0 +1,225 @@
+"""Detect whether a trial ran other code than is installed now.
+
+A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
+only the former are in the digest. A user's task, agent or curriculum has a digest of its top-level package
+(all Python files) or single module. Each module of the user's project that it imports, directly or through
+others, has one too. Nothing is imported to find them: import statements are read from the files.
+
+The project is the nearest folder above the module that holds a project file or a repository, else the
+module's own folder. Installed packages, the standard library and imports by a computed name are left out.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib.machinery
+import importlib.util
+import sys
+from collections.abc import Iterable, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from recrl.agents.registry import AGENTS
+from recrl.environments.registry import TASKS
+from recrl.orchestrator.errors import StorageError
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.provenance.own_package import digest_of_files, folder_of
+from recrl.orchestrator.spec import TrialSpec
+from recrl.teachers.registry import TEACHERS
+
+OURS = "recrl"
+FOLDERS = ("agents", "environments", "teachers")
+MODULES = ("trial/trial.py", "trial/attempt.py", "spec.py")  # of the orchestrator
+SUFFIXES = (".py", ".xml", ".txt")  # top-level parts that affect results
+MOST_FILES = 1000  # of the user's project, for one plug-in
+PROJECT_FILES = ("pyproject.toml", "setup.py", "setup.cfg", ".git")  # in the folder of a project
+INSTALLED = ("site-packages", "dist-packages")
+KINDS = (
+    ("task", "recrl.tasks", TASKS),
+    ("agent", "recrl.agents", AGENTS),
+    ("method", "recrl.teachers", TEACHERS),
+)
+
+
+def code_of(spec: TrialSpec) -> dict[str, str]:
+    """Return digests of a trial's code: recrl's, and one for each top-level package or module of the user.
+
+    These are the named ones, and those of the same project that they import. A package that is not
+    installed here is left out.
+    """
+    found = {OURS: _own_digest()}
+    for kind, group, ours in KINDS:
+        choice = getattr(spec, kind)
+        names = [] if choice.name in ours else [_module_of(choice.name, group)]
+        if isinstance(identity := choice.options.get("id"), str) and ":" in identity:
+            names.append(identity)  # an id of Gymnasium: ``module:name``
+        if isinstance(network := choice.options.get("network"), str):
+            names.append(network)
+        for name in filter(None, names):
+            package = name.partition(":")[0].partition(".")[0]
+            for each, files in _with_imports(package).items():
+                found[each] = digest_of_files(files)[:16]
+    return found
+
+
+def other_code(attempts: Iterable[Mapping[str, Any]], spec: TrialSpec) -> bool:
+    """Whether an attempt of a trial ran other code than is installed now; False if unknown.
+
+    Args:
+        attempts: of ``TrialStore.provenance``.
+        spec: the trial.
+    """
+    now = code_of(spec)
+    for attempt in attempts:
+        code = attempt.get("code", {})
+        if any(name in now and digest != now[name] for name, digest in code.items()):
+            return True
+    return False
+
+
+def has_other_code(trial: TrialStore, spec: TrialSpec) -> bool:
+    """Apply ``other_code`` to the trial's files; False if these are damaged."""
+    try:
+        return other_code(trial.provenance(), spec)
+    except StorageError:
+        return False
+
+
+def other_code_sentence(complete: int, begun: int) -> str:
+    """Describe trials that ran other code; empty for none.
+
+    Args:
+        complete: complete ones.
+        begun: incomplete ones.
+    """
+    parts = []
+    if complete:
+        parts.append(f"{complete} complete trial{'' if complete == 1 else 's'}")
+    if begun:
+        noun = f"one{'' if begun == 1 else 's'}" if complete else f"trial{'' if begun == 1 else 's'}"
+        parts.append(f"{begun} begun {noun}")
+    if not parts:
+        return ""
+    comes = "comes" if complete + begun == 1 else "come"
+    them = "it" if complete + begun == 1 else "them"
+    return (
+        f"{' and '.join(parts)} {comes} from other code than is installed now; launch --rerun-changed runs "
+        f"{them} again"
+    )
+
+
+def _module_of(name: str, group: str) -> str:
+    """Return the import path of a name that is not recrl's: itself, or that of its entry point."""
+    if ":" in name:
+        return name
+    return next((point.value for point in entry_points(group=group) if point.name == name), "")
+
+
+@functools.cache
+def _own_digest() -> str:
+    """Return the digest of the parts of recrl that affect results."""
+    files = {
+        f"{name}/{path.relative_to(folder_of(name))}": path
+        for name in FOLDERS
+        for path in folder_of(name).rglob("*")
+        if path.suffix in SUFFIXES
+    }
+    trial = {f"orchestrator/{module}": folder_of("orchestrator") / module for module in MODULES}
+    if missing := [str(path) for path in trial.values() if not path.is_file()]:
+        raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is missing")
+    return digest_of_files({**files, **trial})[:16]
+
+
+def _with_imports(package: str) -> dict[str, dict[str, Path]]:
+    """Return the files of a top-level package or module, and of those of its project that it imports.
+
+    Returns:
+        The files by their names within the package, by package; empty if the package is not found. Imported
+        packages are followed in the order of their names, up to about ``MOST_FILES`` files.
+    """
+    files = _files_of(package)
+    if not files:
+        return {}
+    found, room = {package: files}, MOST_FILES - len(files)
+    project = _project_of(package, files)
+    waiting = sorted(_imported_by(files)) if project else []
+    while waiting and room > 0:
+        name = waiting.pop(0)
+        if name in found or name == OURS or name in sys.stdlib_module_names:
+            continue
+        files = _files_of(name, project)
+        if not files:
+            continue
+        found[name] = dict(sorted(files.items())[:room])
+        room -= len(found[name])
+        waiting += sorted(_imported_by(found[name]) - set(waiting))
+    return found
+
+
+def _files_of(package: str, project: Path | None = None) -> dict[str, Path]:
+    """Return the Python files of a top-level package or module; empty if it is not found in the project.
+
+    Args:
+        package: its name.
+        project: the folder of a project; None to look everywhere.
+    """
+    try:
+        spec = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        return {}
+    if spec is None:
+        return {}
+    folders = [Path(place) for place in spec.submodule_search_locations or ()]
+    places = folders or [Path(spec.origin or "")]
+    if project is not None and not all(_is_in_project(place, project) for place in places):
+        return {}  # before the files of a large package are listed
+    files = {str(path.relative_to(folder)): path for folder in folders for path in folder.rglob("*.py")}
+    if not folders and spec.origin and spec.origin.endswith(tuple(importlib.machinery.SOURCE_SUFFIXES)):
+        files = {Path(spec.origin).name: Path(spec.origin)}
+    return files
+
+
+def _project_of(package: str, files: Mapping[str, Path]) -> Path | None:
+    """Return the folder of the project that holds a top-level package; None if the package is installed."""
+    name, path = next(iter(files.items()))
+    folder = path.resolve().parents[len(Path(name).parts) - 1]
+    if set(files) != {f"{package}.py"}:  # a package: its own folder is below
+        folder = folder.parent
+    if set(INSTALLED) & set(folder.parts):
+        return None
+    marked = (it for it in (folder, *folder.parents) if any((it / name).exists() for name in PROJECT_FILES))
+    return next(marked, folder)
+
+
+def _is_in_project(path: Path, project: Path) -> bool:
+    resolved = path.resolve()
+    return project in resolved.parents and not set(INSTALLED) & set(resolved.parts)
+
+
+def _imported_by(files: Mapping[str, Path]) -> set[str]:
+    """Return the top-level names that the first ``MOST_FILES`` files import."""
+    names: set[str] = set()
+    for _, path in sorted(files.items())[:MOST_FILES]:
+        try:
+            names |= _imported_names(path.read_bytes())
+        except OSError:  # an editor's file that came and went
+            continue
+    return names
+
+
+@functools.lru_cache(maxsize=2 * MOST_FILES)
+def _imported_names(source: bytes) -> frozenset[str]:
+    """Return the top-level names in the import statements of a module, relative imports excluded.
+
+    >>> sorted(_imported_names(b"import a.b, c; from d import e; from . import f"))
+    ['a', 'c', 'd']
+    """
+    try:
+        nodes = list(ast.walk(ast.parse(source)))
+    except (SyntaxError, ValueError, RecursionError):
+        return frozenset()
+    absolute = [it.module for it in nodes if isinstance(it, ast.ImportFrom) and not it.level and it.module]
+    plain = [alias.name for it in nodes if isinstance(it, ast.Import) for alias in it.names]
+    return frozenset(name.partition(".")[0] for name in (*absolute, *plain))

@@ -1,0 +1,249 @@
+"""Run a trial in this process: take it over, write heartbeat and log, and record its end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
+
+import torch
+
+from recrl.environments.registry import make_vector
+from recrl.orchestrator.errors import (
+    USERS_ERRORS,
+    LostLeaseError,
+    StorageError,
+    TeacherUnavailableError,
+    described,
+)
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_writer import TrialWriter
+from recrl.orchestrator.provenance.code_changes import code_of
+from recrl.orchestrator.provenance.versions import collect as collect_provenance
+from recrl.orchestrator.redaction import shown
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.trial.heartbeat import Heartbeat
+from recrl.orchestrator.trial.trial import Trial
+from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import Teacher
+
+COMMIT_SECONDS = 20.0  # between two commits
+HEARTBEAT_SECONDS = 2.0
+
+logger = logging.getLogger("recrl.trial")
+
+
+def run_trial(
+    spec: TrialSpec,
+    writer: TrialWriter,
+    teacher: Teacher,
+    *,
+    should_stop: Callable[[], bool],
+    commit_seconds: float = COMMIT_SECONDS,
+) -> TrialState:
+    """Run a trial to its end, or until ``should_stop``, from its newest checkpoint.
+
+    Args:
+        spec: the trial.
+        writer: the lease on its folder (``TrialStore.begin``).
+        teacher: sets the limits; inline, or a proxy of a remote teacher.
+        should_stop: called after every update; once true, the trial is saved and left waiting.
+        commit_seconds: wall seconds between checkpoints; has no influence on results.
+
+    Returns:
+        COMPLETE, or WAITING if it was stopped.
+
+    Raises:
+        LostLeaseError: another attempt took over the trial.
+        StorageError: the disk is full or gone; the last commit is intact.
+        Exception: raised by the task, the agent or the teacher, with a note on the update; the last commit is
+            intact.
+    """
+    life = _Life(writer)
+    heartbeat = Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS)
+    with heartbeat.beating():  # preparation may take minutes
+        trial = life.of(Trial(spec, writer, teacher))
+        committed = time.monotonic()
+        while not trial.learned and not should_stop():
+            with _located(f"in update {trial.update + 1}", writer):
+                trial.advance()
+            heartbeat.check()
+            if time.monotonic() - committed >= commit_seconds:
+                trial.save()
+                committed = time.monotonic()
+        if trial.learned:
+            with _located("in the evaluation", writer):
+                trial.evaluate()
+        trial.save()
+    if not trial.learned:
+        writer.close(TrialState.WAITING)
+        logger.info("stopped after update %d; it can be resumed", trial.update)
+        return TrialState.WAITING
+    writer.close(TrialState.COMPLETE)
+    logger.info("complete: %d updates, %d environment steps", trial.update, trial.env_steps)
+    return TrialState.COMPLETE
+
+
+class _Life:
+    """Content of a trial's heartbeat: its progress, and its speed over the last updates."""
+
+    def __init__(self, writer: TrialWriter) -> None:
+        self._writer = writer
+        self._trial: Trial | None = None
+        self._speed = 0.0
+
+    def of(self, trial: Trial) -> Trial:
+        """Set the trial once it is made; before, the heartbeat has its recorded progress."""
+        self._steps, self._since = trial.env_steps, time.monotonic()
+        self._trial = trial
+        return trial
+
+    def beat(self) -> None:
+        """Write it."""
+        if self._trial is None:
+            before = self._writer.record
+            self._writer.heartbeat(
+                update=before.update, env_steps=before.env_steps, steps_per_second=self._speed
+            )
+            return
+        now, done = time.monotonic(), self._trial.env_steps
+        if done > self._steps:
+            self._speed = (done - self._steps) / (now - self._since)
+            self._steps, self._since = done, now
+        self._writer.heartbeat(update=self._trial.update, env_steps=done, steps_per_second=self._speed)
+
+
+@contextmanager
+def _located(where: str, writer: TrialWriter) -> Iterator[None]:
+    """Add a note to any error: the update, and the last checkpoint."""
+    try:
+        yield
+    except USERS_ERRORS as error:
+        update = writer.store.saved_update
+        saved = (
+            f"the last good checkpoint is that of update {update}" if update else "no checkpoint before it"
+        )
+        error.add_note(f"{where}; {saved}")
+        raise
+
+
+def run_recorded(
+    spec: TrialSpec,
+    store: TrialStore,
+    *,
+    should_stop: Callable[[], bool],
+    teacher: Teacher | None = None,
+    commit_seconds: float = COMMIT_SECONDS,
+) -> TrialState:
+    """Call ``run_trial``, and record the run in the trial's folder.
+
+    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``. Nothing is raised
+    here, so that a failure does not stop other trials. With a full disk the trial waits instead, and the same
+    launch continues from its last commit once there is room.
+
+    Returns:
+        The new status of the trial.
+
+    Raises:
+        TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
+    """
+    torch.set_num_threads(1)  # equal bytes on all machines, and no load on other trials' cores
+    provenance = {
+        **collect_provenance(),
+        "code": code_of(spec),
+        **_cost_names(spec),
+    }  # waits for git without a heartbeat, so before the trial begins
+    try:
+        writer = store.begin(spec)
+    except StorageError as error:
+        logger.warning("%s", error)
+        return TrialState.WAITING
+    with _log_to(store):
+        try:
+            writer.add_provenance(provenance)
+            return run_trial(
+                spec,
+                writer,
+                teacher or make_teacher(spec.teacher),
+                should_stop=should_stop,
+                commit_seconds=commit_seconds,
+            )
+        except LostLeaseError as error:
+            logger.warning("%s", error)
+        except TeacherUnavailableError:
+            _close(writer, TrialState.WAITING)
+            raise
+        except StorageError as error:
+            logger.error("%s", error)
+            return _close(writer, TrialState.WAITING, error=str(error))
+        except USERS_ERRORS as error:
+            logger.exception("failed; its files end at update %d", writer.record.update)
+            notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
+            text = shown(f"{described(error)}{notes}")
+            return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))
+        return store.record().status
+
+
+def _cost_names(spec: TrialSpec) -> dict[str, list[str]]:
+    """Return the names of a task's costs for titles, if it has several and can be built."""
+    if len(spec.deploy_limits) == 1:
+        return {}
+    try:
+        environments = make_vector(spec.task.name, 1, options=spec.task.options)
+        environments.close()
+    except USERS_ERRORS:  # the trial itself will say so
+        return {}
+    return {"cost_names": list(environments.cmdp.cost_names)}
+
+
+def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:
+    """End an attempt after an error; a failure to record it must not hide the error."""
+    try:
+        writer.close(status, error=error, traceback=traceback)
+    except (LostLeaseError, StorageError) as also:
+        logger.warning("%s", also)
+    return status
+
+
+@contextmanager
+def _log_to(store: TrialStore) -> Iterator[None]:
+    """Write the log of this process's trial to its folder."""
+    handler = _Log(store.log_path, encoding="utf-8", delay=True)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    root = logging.getLogger("recrl")
+    level = root.level
+    root.setLevel(logging.INFO)
+    root.addHandler(handler)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        root.setLevel(level)
+        with suppress(OSError):
+            handler.close()
+
+
+class _Log(logging.FileHandler):
+    """A log file that loses lines, for example on a full disk, instead of ending a trial.
+
+    A link is not followed: it might lead to another file of the user.
+    """
+
+    def _open(self) -> TextIOWrapper:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
+        return open(os.open(self.baseFilename, flags, 0o644), "a", encoding=self.encoding)
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record as text, without secrets and control characters."""
+        return shown(super().format(record))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):
+            super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
+        pass

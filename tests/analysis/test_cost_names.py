@@ -1,0 +1,72 @@
+"""Costs have their task's names in titles and verdicts, and without names the numbers of the CSV files."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+
+import pandas as pd
+import pytest
+
+from recrl.analysis.data import sweep_data
+from recrl.analysis.data.cost_names import cost_names, cost_suffix
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.report import table_formats, verdict_texts
+from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.metrics import Measure
+from recrl.orchestrator.cli.result_table import result_table
+from recrl.orchestrator.files.sweep_store import SweepStore
+
+
+def named(sweep: Sweep, names: object) -> Sweep:
+    """The sweep, had its trials recorded these names."""
+    text = json.dumps({"attempts": [{"attempt": 1, "code": {}, "cost_names": names}]})
+    return dataclasses.replace(
+        sweep, facts=tuple(dataclasses.replace(it, provenance=text) for it in sweep.facts)
+    )
+
+
+@pytest.fixture
+def two(made_up_sweep: Callable[..., SweepStore]) -> Sweep:
+    """A sweep with two costs whose names are not known."""
+    return sweep_data.load(made_up_sweep(seeds=1, num_costs=2, tasks=["a"], agents=["cpo"], methods=["none"]))
+
+
+def test_names_are_those_that_the_trials_recorded(two: Sweep) -> None:
+    assert cost_names(named(two, ["fuel", "noise"])) == {"a": ("fuel", "noise")}
+    assert [cost_suffix(named(two, ["fuel", "noise"]), i) for i in range(2)] == [" fuel", " noise"]
+
+
+@pytest.mark.parametrize("names", [None, ["fuel"], ["fuel", 3], ["fuel", ""], ["fuel", "\x1b[2J"], "ab"])
+def test_names_of_the_wrong_form_are_numbers(two: Sweep, names: object) -> None:
+    assert cost_names(named(two, names)) == {"a": ("0", "1")}
+    assert [cost_suffix(two, i) for i in range(2)] == [" 0", " 1"]
+
+
+def test_one_cost_needs_no_name(finished: Sweep) -> None:
+    assert cost_names(finished) == {}
+    assert cost_suffix(finished, 0) == ""
+
+
+def test_titles_of_tables_have_the_names(two: Sweep) -> None:
+    sweep = named(two, ["fuel", "noise"])
+    assert {"cost fuel", "limit fuel", "cost noise", "limit noise"} <= set(result_table(sweep)[0])
+    summary = metrics.summary(metrics.outcomes(sweep))
+    table = table_formats.outcome_table(summary, Measure.STOCHASTIC, (" fuel", " noise"))
+    assert {"cost fuel", "limit noise"} <= set(table)
+    assert {"cost 0", "limit 1"} <= set(table_formats.outcome_table(summary, Measure.STOCHASTIC))
+
+
+@pytest.mark.parametrize(
+    ("cost", "seeds", "infeasible", "text"),
+    [
+        ("noise", 1, 1, "infeasible: noise by 0.22 (11%)"),
+        ("1", 2, 2, "infeasible: cost 1 by up to 0.22 (11%)"),
+        ("noise", 5, 1, "feasible 4 of 5; infeasible 1 of 5, noise by up to 0.22 (11%)"),
+    ],
+)
+def test_a_verdict_names_the_cost_that_is_over_its_limit(
+    cost: str, seeds: int, infeasible: int, text: str
+) -> None:
+    row = {"seeds": seeds, "solved": 0, "feasible": seeds - infeasible, "infeasible": infeasible}
+    worst = {"worst_excess": 0.22, "worst_share": 0.11, "worst_cost": cost}
+    assert verdict_texts.verdict_text(pd.Series(row | worst)) == text
