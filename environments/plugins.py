@@ -137,7 +137,7 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
 
     Args:
         name: a name of ours, an entry point's name, or ``package.module:attribute``.
-        kind: what is looked for, for the error: ``task``, ``agent`` or ``teacher``.
+        kind: what is looked for, for the error: ``task``, ``agent`` or ``curriculum``.
         group: the entry-point group, for example ``recrl.tasks``.
         ours: the built-in registry.
 

@@ -10,6 +10,8 @@ from recrl.orchestrator.grid.checking import read_name
 from recrl.orchestrator.remote.remote_sweep import sweeps_at
 from recrl.orchestrator.validation import nearest
 
+EXPORT_SUFFIX = ".zip"
+
 
 def find_sweep(root: Path, sweep: str | None, storage: str | None = None) -> SweepStore:
     """Return the folder of a sweep, which is not brought up to date.
@@ -31,6 +33,10 @@ def find_sweep(root: Path, sweep: str | None, storage: str | None = None) -> Swe
         raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
     if sweep.endswith((".yaml", ".yml")):
         sweep = read_name(Path(sweep))
+    if sweep.endswith(EXPORT_SUFFIX) and sweep not in names:
+        raise RecrlError(
+            f"{sweep}: an export has tables but no policies, logs or trials; give the sweep's name or folder"
+        )
     if sweep not in names:
         folder = Path(sweep).absolute()
         if not storage and (is_sweep(folder) or (folder / "trials").is_dir()):

@@ -106,6 +106,9 @@ class LaunchListener:
     def stopping(self) -> None:
         """Called on the first signal to stop."""
 
+    def drawing(self) -> None:
+        """Called before the figures are drawn at the end."""
+
     def drawn(self, folder: Path) -> None:
         """Called after the figures are drawn to a folder."""
 
@@ -237,6 +240,7 @@ def _draw(sweep: Sweep, store: SweepStore, listener: LaunchListener) -> None:
     """Draw a launch's figures. If that fails, report the error and continue: MLflow must still be updated."""
     from recrl.analysis.report import drawing  # noqa: PLC0415  (imports matplotlib)
 
+    listener.drawing()
     try:
         drawing.draw(sweep, store.figures_folder)
     except (RecrlError, OSError):

@@ -77,7 +77,7 @@ def find_teacher(name: str) -> TeacherKind:
         UnknownNameError: the name is not known; the message names the nearest known one.
         TypeError: the named object is not a TeacherKind.
     """
-    kind = resolve(name, kind="teacher", group="recrl.teachers", ours=TEACHERS)
+    kind = resolve(name, kind="curriculum", group="recrl.teachers", ours=TEACHERS)
     if not isinstance(kind, TeacherKind):
         raise TypeError(f"teacher {name!r} must be a recrl.teachers.registry.TeacherKind, got {kind!r}")
     return kind

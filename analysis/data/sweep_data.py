@@ -6,7 +6,9 @@ AGENT_ORDER and METHOD_ORDER. i counts the costs, 0 ... k-1. If tasks of a sweep
 that a task lacks are NaN. All returns and costs are undiscounted sums over an episode.
 
     trials       one row per trial of the sweep's last launch, started or not:
-                 KEY, trial_id, group, status, error, task_name, agent_name, method_name, num_costs,
+                 KEY, trial_id, group, status (as recorded in its files: waiting, running, complete,
+                 failed or damaged; what recrl-sweep status calls stopped is waiting here, and what it
+                 calls interrupted is running), error, task_name, agent_name, method_name, num_costs,
                  train_steps, boundary_step (the first step under d_d: B rounded up to a policy update),
                  total_steps (rounded up likewise), steps_per_update, env_steps (taken so far),
                  cpu_seconds, train_limit_i, deploy_limit_i, start_limit_i (measured d_t, or NaN),
@@ -45,7 +47,7 @@ import pandas as pd
 
 from recrl.analysis.data.exact_values import exact_values, finite_model
 from recrl.analysis.data.labels import DOUBLES, KEY, TRIAL, keys_of
-from recrl.analysis.data.optima import UNKNOWN_OPTIMUM, optima_of
+from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -255,7 +257,9 @@ def assemble(
         checked_name(name)
     except ValueError as error:
         raise RecrlError(str(error)) from error
-    optima, unknown = optima_of([it.spec for it in facts])
+    tabulated = rows["policies"][TRIAL].unique() if len(rows["policies"]) else ()
+    finite = {facts[int(i)].spec.task.label for i in tabulated}
+    optima, unknown = optima_of([it.spec for it in facts], finite=finite)
     costs = range(max((len(it.spec.deploy_limits) for it in facts), default=0))
     cost_columns, limit_columns = [f"cost_{i}" for i in costs], [f"limit_{i}" for i in costs]
     phase_columns = [f"{kind}_{i}{end}" for i in costs for kind, end in PHASE_COST_COLUMNS]
@@ -279,7 +283,7 @@ def assemble(
 
 def is_made_again(note: str) -> bool:
     """Whether ``assemble`` made a note from the trials, and will make it again if it still holds."""
-    return DOUBLES in note or UNKNOWN_OPTIMUM in note
+    return any(text in note for text in (DOUBLES, UNKNOWN_OPTIMUM, NO_OPTIMUM))
 
 
 def joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:

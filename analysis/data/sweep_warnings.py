@@ -26,7 +26,7 @@ def damages(sweep: Sweep) -> list[str]:
 
 def doubts(sweep: Sweep) -> list[str]:
     """Return sentences on trials that ran other code than is installed now, and on ineffective curricula."""
-    changed = [it for it in sweep.facts if other_code(_attempts(it), it.spec)]
+    changed = [it for it in sweep.facts if other_code(attempts(it), it.spec)]
     complete = sum(it.status is TrialState.COMPLETE for it in changed)
     code = other_code_sentence(complete, len(changed) - complete)
     return [*([code] if code else []), *curriculum_warnings(sweep)]
@@ -66,7 +66,7 @@ def _titles(flags: pd.DataFrame, flag: str) -> list[str]:
     return [f"{it.task} {it.agent} {it.method} seed {it.seed}" for it in flags[flags[flag]].itertuples()]
 
 
-def _attempts(trial: TrialFacts) -> list[dict[str, Any]]:
+def attempts(trial: TrialFacts) -> list[dict[str, Any]]:
     """Return the known provenance of each attempt; empty if no attempt began."""
     try:
         attempts = json.loads(trial.provenance).get("attempts", [])

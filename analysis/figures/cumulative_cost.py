@@ -19,13 +19,13 @@ from matplotlib.lines import Line2D
 from recrl.analysis.data.labels import KEY, occurring
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
-from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
+from recrl.analysis.figures.styles import IN_FORCE_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.cumulative_cost import policies_of, training_runs
 from recrl.environments.cmdp import Floats
 
 # Colour, dashes and name of every sum except the measured one.
 REFERENCES: dict[str, tuple[str, Literal["-"] | tuple[float, Sequence[float]], str]] = {
-    "limit": (LIMIT_COLOUR, panels.DASHED, "limits in force"),
+    "limit": (IN_FORCE_COLOUR, "-", "limits in force"),
     "discounted_bound": ("#5b3a8c", (0.0, (1.2, 1.2)), "Proposition 1, discounted cost"),
     "bound": ("black", (0.0, (6.0, 1.5, 1.2, 1.5)), "bound, undiscounted cost"),
     "ceiling": ("#8a8a8a", "-", "trivial bound: every step at the largest cost"),

@@ -2,13 +2,15 @@
 
 One figure per task and agent, one column per method. From top to bottom: the agent's own cost and the limit
 in force; the mean multipliers, if the agent has them; the explained variance of the reward and cost critics;
-the mean KL divergence of its updates. Ticks below the costs mark policy noise in some run. Ticks below the KL
-divergence mark CPO's recovery steps, which only decrease the cost.
+the mean KL divergence of its updates. Ticks below the costs mark policy noise in some run. Crosses below the
+KL divergence mark CPO's recovery steps, which only decrease the cost. A dotted line is the target of the KL
+divergence, if the agent has one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +20,7 @@ from matplotlib.lines import Line2D
 
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
-from recrl.analysis.figures.styles import LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
+from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.curves import mean_curve, step_grid
 from recrl.environments.cmdp import Floats
 
@@ -26,7 +28,14 @@ BINS = 100
 NOISE_EVENT = "policy noise"
 RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only decreases the cost
 LARGE_MULTIPLIER = 50.0
-EVENT_TICK = (0.0, 0.05)  # fraction of the panel's height
+EVENT_HEIGHT = 0.04  # of the events' marks, as a fraction of the panel's height
+NOISE_MARK, RECOVERY_MARK = "|", "x"
+TARGET_LINE: dict[str, Any] = {
+    "color": "0.45",
+    "linewidth": 0.8,
+    "linestyle": (0.0, (1.0, 1.5)),
+    "zorder": 1.8,
+}
 EXPLAINED = "explained_variance_"
 LEAST_EXPLAINED = -0.5  # critics may be arbitrarily wrong; smaller values are cut off
 
@@ -60,6 +69,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     )
     rows = [name for name in quantities if _known(updates, name)]
     limit = float(trials[f"deploy_limit_{cost}"].iloc[0])
+    target = _target(sweep, agent)
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 1.15 * len(rows) + 0.85), layout="constrained")
         grid = figure.subplots(len(rows), len(methods), squeeze=False, sharex=True, sharey="row")
@@ -69,11 +79,13 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
                 _panel(axes, chosen, quantity, edges, style)
                 panels.phase_boundary(axes, boundary, total)
             _limits(column[0], chosen, f"limit_{cost}")
-            _event_ticks(column[0], events.loc[_is_noise(events, method), "end_step"], style)
+            _event_marks(column[0], events.loc[_is_noise(events, method), "end_step"], style, NOISE_MARK)
             if "case" in chosen and "kl" in rows:
                 recovering = chosen.loc[chosen["case"] == RECOVERY_CASE, "end_step"]
-                _event_ticks(column[rows.index("kl")], recovering, style)
-            column[0].axhline(limit, color="black", linewidth=0.7, linestyle=(0.0, (1.0, 1.5)), zorder=2.4)
+                _event_marks(column[rows.index("kl")], recovering, style, RECOVERY_MARK)
+            if "kl" in rows and target is not None:
+                column[rows.index("kl")].axhline(target, **TARGET_LINE)
+            column[0].axhline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, zorder=2.4)
             column[0].set_title(method)
             panels.step_axis(column[-1], 0.0, total)
             column[-1].set_xlabel("environment steps")
@@ -89,8 +101,14 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
                 axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
                 axes.set_ylim(bottom=-0.3)
-        _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}", updates["seed"].nunique())
+        _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}", updates["seed"].nunique(), target)
     return figure
+
+
+def _target(sweep: Sweep, agent: str) -> float | None:
+    """Return the KL divergence that the agent's updates aim at or end at; None if it has none."""
+    target = sweep.agent_options[agent].get("target_kl")
+    return float(target) if isinstance(target, int | float) else None
 
 
 def _label(quantity: str) -> str:
@@ -115,33 +133,41 @@ def _limits(axes: Axes, updates: pd.DataFrame, quantity: str) -> None:
     for _, run in updates.groupby("seed"):
         values = run[quantity].where(np.isfinite(run[quantity]))
         axes.plot(
-            run["end_step"], values, color=LIMIT_COLOUR, linewidth=0.7, drawstyle="steps-pre", zorder=2.5
+            run["end_step"], values, color=IN_FORCE_COLOUR, linewidth=0.8, drawstyle="steps-pre", zorder=2.5
         )
 
 
-def _event_ticks(axes: Axes, steps: Iterable[float], style: MethodStyle) -> None:
-    """Draw a tick at the lower edge for every event."""
-    for step in sorted(set(steps)):
-        axes.plot(
-            [step, step],
-            EVENT_TICK,
-            color=style.colour,
-            linewidth=0.6,
-            transform=axes.get_xaxis_transform(),
-            zorder=2.0,
-        )
+def _event_marks(axes: Axes, steps: Iterable[float], style: MethodStyle, marker: str) -> None:
+    """Draw a mark at the lower edge for every event."""
+    known = sorted(set(steps))
+    if not known:
+        return
+    axes.plot(
+        known,
+        [EVENT_HEIGHT] * len(known),
+        color=style.colour,
+        linestyle="none",
+        marker=marker,
+        markersize=3.0,
+        markeredgewidth=0.7,
+        transform=axes.get_xaxis_transform(),
+        zorder=2.0,
+    )
 
 
-def _legend(figure: Figure, title: str, seeds: int) -> None:
+def _legend(figure: Figure, title: str, seeds: int, target: float | None) -> None:
     line = "mean ± standard error" if seeds > 1 else "the one run"
     handles = [
         Line2D([], [], color="0.2", linewidth=1.1, label=line),
-        Line2D([], [], color=LIMIT_COLOUR, linewidth=0.9, label="limit in force, every run"),
-        Line2D([], [], color="black", linewidth=0.7, linestyle=(0.0, (1.0, 1.5)), label="limit $d_d$"),
+        Line2D([], [], color=IN_FORCE_COLOUR, linewidth=0.9, label="limit in force, every run"),
+        Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, label="limit $d_d$"),
         panels.infeasible_patch(),
         Line2D([], [], color="black", linewidth=0.8, linestyle=panels.DASHED, label="deployment begins"),
-        Line2D([], [], color="0.2", linestyle="none", marker="|", label="noise added / recovery step"),
+        Line2D([], [], color="0.2", linestyle="none", marker=NOISE_MARK, label="noise added (below cost)"),
+        Line2D([], [], color="0.2", linestyle="none", marker=RECOVERY_MARK, label="recovery step (below KL)"),
     ]
+    if target is not None:
+        handles.append(Line2D([], [], **TARGET_LINE, label=f"target of the KL divergence, {target:g}"))
     figure.legend(handles=handles, loc="outside upper center", ncols=3, title=title)
 
 

@@ -133,7 +133,7 @@ def _right_edge(rows: pd.DataFrame) -> float:
 
 
 def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far: float) -> None:
-    """Draw an open mark per run; runs too far to the right are at the edge.
+    """Draw a mark per run, filled if feasible; runs too far to the right are at the edge.
 
     The marks get smaller from method to method, so that equal runs are visible as nested marks.
     """
@@ -144,7 +144,7 @@ def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far
             chosen["episode_return"].to_numpy(np.float64),
             s=(9.0 - 1.3 * min(position, 5)) ** 2,
             marker=style.marker,
-            facecolors="none",
+            facecolors=[style.colour if feasible else "none" for feasible in chosen["feasible"]],
             edgecolors=style.colour,
             linewidths=1.1,
             clip_on=False,
@@ -179,5 +179,5 @@ def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str]) ->
         ncols=min(len(handles), panels.METHODS_A_LINE),
         columnspacing=1.2,
         handletextpad=0.5,
-        title="final policies, a mark a run; at the right edge: further right",
+        title="final policies, one mark per run: filled if feasible, hollow if not (at the edge: beyond)",
     )

@@ -51,7 +51,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN)
     suffixes = [cost_suffix(sweep, i) for i in range(num_costs)]
     with styles.context():
         figure = Figure(
-            figsize=(TEXT_WIDTH * max(1.0, columns / 4), ROW_HEIGHT * len(tasks) + 0.8), layout="constrained"
+            figsize=(TEXT_WIDTH * max(1.0, columns / 4), ROW_HEIGHT * len(tasks) + 1.1), layout="constrained"
         )
         grid = figure.subplots(
             len(tasks), columns, squeeze=False, gridspec_kw={"width_ratios": [1.7, 1.0] * (columns // 2)}
@@ -96,7 +96,7 @@ def curricula(sweep: Sweep) -> Figure:
         if updates.loc[updates["task"] == task, f"limit_{i}"].notna().any()
     ]
     with styles.context():
-        figure = Figure(figsize=(TEXT_WIDTH, 1.6 * len(cells) + 0.75), layout="constrained")
+        figure = Figure(figsize=(TEXT_WIDTH, 1.6 * len(cells) + 1.05), layout="constrained")
         grid = figure.subplots(len(cells), len(agents), squeeze=False, sharey="row")
         for row, (task, i) in zip(grid, cells, strict=True):
             for axes, agent in zip(row, agents, strict=True):

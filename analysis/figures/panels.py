@@ -19,6 +19,7 @@ from recrl.analysis.statistics.curves import Curve
 LOG_AXIS_FROM = 10.0  # times the limit
 MARKERS_A_LINE = 6
 METHODS_A_LINE = 7
+METHODS_A_PHONE, REFERENCES_A_PHONE = 4, 2  # a phone shows the left half of a figure
 DASHED = (0.0, (4.0, 2.0))
 INFEASIBLE: dict[str, Any] = {"color": "#c0392b", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.5}
 FAR_ABOVE = 1e6  # times the limit: the shaded region has no upper end
@@ -187,10 +188,17 @@ def legend(
         references.append(Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.7, label="optimum $J^*(d_d)$"))
     figure.legend(
         handles=lines,
-        loc="outside upper center",
-        ncols=min(len(lines), METHODS_A_LINE),
+        loc="outside upper left",
+        ncols=min(len(lines), METHODS_A_PHONE),
         handlelength=3.2,
         columnspacing=1.6,
         title=title,
+        alignment="left",
     )
-    figure.legend(handles=references, loc="outside lower center", ncols=len(references), handlelength=2.6)
+    figure.legend(
+        handles=references,
+        loc="outside lower left",
+        ncols=REFERENCES_A_PHONE,
+        handlelength=2.6,
+        columnspacing=1.6,
+    )

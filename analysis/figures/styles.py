@@ -26,6 +26,7 @@ OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$
 TEXT_WIDTH = 7.0  # inches, of a page with two columns
 PNG_DPI = 200
 LIMIT_COLOUR = "#00b7c7"
+IN_FORCE_COLOUR = "#5c5c5c"  # of the limits in force; LIMIT_COLOUR, dashed, is the deployment limit only
 OPTIMUM_COLOUR = "#8a8a8a"
 
 

@@ -22,7 +22,8 @@
 For a running sweep, ``sketch`` draws only SKETCHED, as PNGs, and all tables and pages. This takes a
 fraction of the time, and leaves the cores to the trials.
 
-Equal sweeps give equal bytes: no time is written, and the bootstrap's generator is seeded here.
+Equal sweeps give equal bytes: the only time is that of the last policy update, and the bootstrap's generator
+is seeded here.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -42,7 +44,7 @@ from matplotlib.figure import Figure
 
 from recrl.analysis.data.labels import GROUP, ordered
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.sweep_warnings import doubts
+from recrl.analysis.data.sweep_warnings import attempts, doubts
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
@@ -61,7 +63,7 @@ from recrl.orchestrator.spec import TrialState
 RELOAD_SECONDS = 120  # of the page of a sweep that runs
 CAPTIONS = {
     "return-against-cost": "Final policies: return against cost. Left of the limit is feasible, the shaded "
-    "region is not",
+    "region is not; filled marks are feasible within the tolerance, hollow ones are not",
     "learning-curves": "Return and cost while training, and magnified in the deployment phase (learning goes "
     "on). Costs in the shaded region are above the limit",
     "bounds": "Cumulative cost of training against its bounds",
@@ -180,6 +182,7 @@ def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     if len(judged):
         lines += [*_list(verdict_texts.answers(judged)), ""]
         lines += [table_formats.markdown(_marked(verdict_texts.verdict_table(judged))), ""]
+        lines += _list(verdict_texts.task_sentences(sweep, judged))
         lines += _list(verdict_texts.explanation(judged))
     else:
         lines.append(verdict_texts.NO_VERDICT)
@@ -301,13 +304,20 @@ def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
         Section("Warnings", html_page.items(sentences, kind="failed" if failed else "plain")),
         Section("Figures", _figures(first)),
         *([Section("More figures", _figures(further), folded=True)] if further else []),
-        *(Section(it.heading, html_page.table(it.table, it.note), folded=True) for it in tables.shown),
+        *(
+            Section(it.heading, html_page.table(it.table, it.note, it.kinds), folded=True)
+            for it in tables.shown
+        ),
         Section("Settings", settings, folded=True),
         Section("Provenance", html_page.verbatim("\n".join(_provenance(sweep))), folded=True),
     ]
     goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
     return html_page.page(
-        sweep.name, _opening(tables.verdicts), sections, reload_seconds=RELOAD_SECONDS if goes_on else None
+        sweep.name,
+        _opening(sweep, tables.verdicts),
+        sections,
+        made=_made(sweep),
+        reload_seconds=RELOAD_SECONDS if goes_on else None,
     )
 
 
@@ -316,7 +326,19 @@ def _figures(figures: Mapping[Path, str]) -> str:
     return "\n".join(html_page.figure(path, _caption(path), file) for path, file in figures.items())
 
 
-def _opening(judged: pd.DataFrame) -> str:
+def _made(sweep: Sweep) -> str:
+    """Return the versions of recrl that made the trials, and the date of the last policy update."""
+    versions = sorted(
+        {str(attempt["recrl"]) for it in sweep.facts for attempt in attempts(it) if "recrl" in attempt}
+    )
+    made = [f"recrl {' and '.join(versions)}"] if versions else []
+    if "time" in sweep.updates and len(sweep.updates):  # an export has no times
+        last = datetime.fromtimestamp(float(sweep.updates["time"].max()), UTC)
+        made.append(f"last policy update on {last:%Y-%m-%d} (UTC)")
+    return ", ".join(made)
+
+
+def _opening(sweep: Sweep, judged: pd.DataFrame) -> str:
     """Return the answers and the verdict table."""
     if not len(judged):
         return html_page.items([verdict_texts.NO_VERDICT], kind="answers")
@@ -324,6 +346,7 @@ def _opening(judged: pd.DataFrame) -> str:
         [
             html_page.items(verdict_texts.answers(judged), kind="answers"),
             html_page.verdict_table(verdict_texts.verdict_table(judged), verdict_texts.verdict_kinds(judged)),
+            html_page.items(verdict_texts.task_sentences(sweep, judged), kind="notes"),
             html_page.items(verdict_texts.explanation(judged), kind="notes"),
         ]
     )

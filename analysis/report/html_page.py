@@ -7,6 +7,7 @@ the page; in print they shrink instead. Folded sections are printed as well. All
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -40,6 +41,8 @@ summary h2 { display: inline; font-size: 1rem; border: 0; }
 .answers { font-size: 1.1rem; padding-left: 1.2rem; }
 .notes { color: #555; font-size: 0.85rem; }
 ul.notes { padding-left: 1.2rem; }
+.name { white-space: nowrap; }
+td.name small { display: none; color: #555; font-weight: 400; }
 tr.solved td.verdict { background: #e3f1e3; }
 tr.infeasible td { background: #fbe9e7; }
 tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
@@ -48,6 +51,10 @@ tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
 .verdicts th { white-space: normal; }
 @media screen and (max-width: 44rem) {
   .verdicts td.verdict { min-width: 7rem; }
+  .verdicts th:nth-child(-n+2), .verdicts td:nth-child(-n+2) { display: none; }
+  .verdicts th:nth-child(3), .verdicts td:nth-child(3) { position: sticky; left: 0; background: #fff; }
+  .verdicts tr.infeasible td:nth-child(3) { background: #fbe9e7; }
+  td.name small { display: block; }
   .scroll::before { content: "scroll sideways →"; position: sticky; left: 0; color: #555;
                     font-size: 0.8rem; }
 }
@@ -63,11 +70,15 @@ tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
   tr { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
   table { font-size: 6.5pt; width: 100%; }
   th, td { white-space: normal; padding-right: 0.3rem; }
+  td.name { white-space: nowrap; }
   pre { white-space: pre-wrap; font-size: 7pt; }
   figure, tr { break-inside: avoid; }
-  h2 { break-after: avoid; }
+  h2, summary { break-after: avoid; }
+  details { break-before: auto; }
 }
 """
+NAMES = ("task", "agent", "curriculum")
+HYPHENATED = re.compile(r"(?<!\S)(?=\S{1,30}(?!\S))\w+(?:-\w+)+")  # names such as ppo-lag stay on one line
 
 
 @dataclass(frozen=True)
@@ -93,11 +104,19 @@ class Section:
         return f"<section>{heading}\n{self.body}\n</section>"
 
 
-def page(title: str, opening: str, sections: Sequence[Section], *, reload_seconds: int | None = None) -> str:
+def page(
+    title: str,
+    opening: str,
+    sections: Sequence[Section],
+    *,
+    made: str = "",
+    reload_seconds: int | None = None,
+) -> str:
     """Return the whole page.
 
     Args:
         title: of the page.
+        made: version and date of the results, below the title; or empty.
         opening: HTML below it.
         sections: its other parts.
         reload_seconds: interval at which an open page reloads; None if nothing will change.
@@ -109,7 +128,9 @@ def page(title: str, opening: str, sections: Sequence[Section], *, reload_second
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<link rel="icon" href="data:,">{reload}',
             f"<title>{escape(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>",
-            f"<h1>{escape(title)}</h1>\n{opening}",
+            f"<h1>{escape(title)}</h1>\n"
+            + (f'<p class="notes">{escape(made)}</p>\n' if made else "")
+            + opening,
             *(it.html for it in sections),
             "</body>\n</html>",
         ]
@@ -133,10 +154,17 @@ def figure(png: Path, caption: str, file: str) -> str:
     )
 
 
-def table(frame: pd.DataFrame, note: str = "") -> str:
-    """Return a table of finished text with a note below it."""
+def table(frame: pd.DataFrame, note: str = "", kinds: Sequence[str] = ()) -> str:
+    """Return a table of finished text with a note below it.
+
+    Args:
+        frame: finished text.
+        note: a sentence, or empty.
+        kinds: the class of each row, or empty; without any, no row has one.
+    """
     below = f'\n<p class="notes">{escape(note)}</p>' if note else ""
-    return _table(frame, [""] * len(frame), "") + below
+    of_rows = [f' class="{kind}"' if kind else "" for kind in kinds or [""] * len(frame)]
+    return _table(frame, of_rows, "") + below
 
 
 def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:
@@ -150,14 +178,16 @@ def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:
 
 
 def _table(frame: pd.DataFrame, of_rows: Sequence[str], of_table: str) -> str:
-    marks = [' class="verdict"' if name == "verdict" and of_table else "" for name in frame]
-    head = "".join(f"<th>{escape(str(name))}</th>" for name in frame)
-    rows = [
-        f"<tr{kind}>"
-        + "".join(f"<td{mark}>{escape(str(cell))}</td>" for mark, cell in zip(marks, row, strict=True))
-        + "</tr>"
-        for kind, row in zip(of_rows, frame.to_numpy().tolist(), strict=True)
-    ]
+    columns = [str(name) for name in frame]
+    classes = {"verdict": ' class="verdict"' if of_table else "", **dict.fromkeys(NAMES, ' class="name"')}
+    marks = [classes.get(name, "") for name in columns]
+    head = "".join(f"<th>{escape(name)}</th>" for name in columns)
+    rows = []
+    for kind, row in zip(of_rows, frame.to_numpy().tolist(), strict=True):
+        cells = [escape(str(cell)) for cell in row]
+        if of_table and columns[:3] == list(NAMES):  # a phone shows all three names in one column
+            cells[2] = f"<small>{cells[0]} {cells[1]}</small>{cells[2]}"
+        rows.append(f"<tr{kind}>" + "".join(map("<td{}>{}</td>".format, marks, cells)) + "</tr>")
     return (
         f'<div class="scroll"><table{of_table}><thead><tr>{head}</tr></thead>\n<tbody>'
         + "\n".join(rows)
@@ -172,9 +202,8 @@ def items(sentences: Sequence[str], *, kind: str = "plain") -> str:
         sentences: its items.
         kind: ``plain``, ``answers``, ``notes`` or ``failed``.
     """
-    return (
-        f'<ul class="{kind}">' + "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences) + "</ul>"
-    )
+    texts = (HYPHENATED.sub(r'<span class="name">\g<0></span>', escape(sentence)) for sentence in sentences)
+    return f'<ul class="{kind}">' + "".join(f"<li>{text}</li>" for text in texts) + "</ul>"
 
 
 def verbatim(text: str) -> str:

@@ -16,6 +16,7 @@ from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import table_formats
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
@@ -27,6 +28,14 @@ TIES = (
     f"P(higher return): a tie counts half. Returns tie within {SOLVED_GAP} of each other where the optimum "
     "is known, as for solved; elsewhere only where they differ by rounding."
 )
+FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
+BOUNDS_NOTE = (
+    "Sums over the policies of the training phase, one expected episode each; means over n seeds. Limits in "
+    "force: the sum of the limits that the curriculum set. Above limits in force, above the limit: the part "
+    "of the measured cost above them, and above the deployment limit. Bound: if every update solves CPO's "
+    "problem (CPO only). Discounted bound: Proposition 1 of the paper. Trivial bound: every step at the "
+    "largest cost."
+)
 
 
 @dataclass(frozen=True)
@@ -37,11 +46,13 @@ class ShownTable:
         heading: its title.
         table: finished text.
         note: a sentence below it, or empty.
+        kinds: of each row, ``infeasible`` or empty; none for a table without such rows.
     """
 
     heading: str
     table: pd.DataFrame
     note: str = ""
+    kinds: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -85,7 +96,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
     outcomes = _outcome_tables(averaged, suffixes)
     latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
-    shown = [*outcomes, *_comparison_tables(compared, suffixes)]
+    shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
     if len(weighed):
         written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
         shown.append(ShownTable("What the paper says of these maps", claims.claims_table(weighed)))
@@ -93,7 +104,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
         which = f" (cost{suffixes[i]})" if suffixes[i] else ""
         if len(costs):
             heading = f"Cumulative cost of training against its bounds{which}"
-            shown.append(ShownTable(heading, bound_table(costs)))
+            shown.append(ShownTable(heading, bound_table(costs), BOUNDS_NOTE))
     written += [
         table_formats.write_csv(judged, folder / "verdicts.csv"),
         table_formats.write_csv(rows, folder / "outcomes.csv"),
@@ -107,24 +118,29 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
 
 def _outcome_tables(averaged: pd.DataFrame, suffixes: Sequence[str]) -> list[ShownTable]:
     """Return the outcomes, those of the final policy first."""
-    tables = [
-        (measure, table_formats.outcome_table(averaged, measure, suffixes)) for measure in SHOWN_MEASURES
-    ]
-    return [ShownTable(_heading(measure), table) for measure, table in tables if len(table)]
+    tables = []
+    for measure in SHOWN_MEASURES:
+        rows = averaged[averaged["measure"] == measure.value]
+        if len(rows):
+            table = table_formats.outcome_table(averaged, measure, suffixes)
+            tables.append(ShownTable(_heading(measure), table, kinds=table_formats.row_kinds(rows)))
+    return tables
 
 
-def _comparison_tables(compared: pd.DataFrame, suffixes: Sequence[str]) -> list[ShownTable]:
+def _comparison_tables(
+    compared: pd.DataFrame, averaged: pd.DataFrame, suffixes: Sequence[str]
+) -> list[ShownTable]:
     """Return differences to the agent without a curriculum, those of the final policy first."""
-    if not len(compared):
-        return []
-    return [
-        ShownTable(
-            f"{_heading(measure)}, minus none",
-            table_formats.comparison_table(compared, measure, suffixes),
-            TIES,
+    tables = []
+    for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT) if len(compared) else ():
+        rows = table_formats.compared_rows(compared, averaged, measure)
+        table = table_formats.comparison_table(rows, suffixes)
+        marked = table["P(higher return)"].str.contains(table_formats.TOO_FEW).any() if len(table) else False
+        note = f"{TIES} {FEW}" if marked else TIES
+        tables.append(
+            ShownTable(f"{_heading(measure)}, minus none", table, note, table_formats.row_kinds(rows))
         )
-        for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
-    ]
+    return tables
 
 
 def _heading(measure: Measure) -> str:

@@ -51,12 +51,12 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
     costs = [name for name in map(str, rows) if f"{name}_se" in rows and name.startswith("cost_")]
     lines = []
     for _, row in rows.iterrows():
-        line = {name: str(row[name]) for name in GROUP} | {"seeds": str(row["seeds"])}
-        line["return"] = with_error(row["episode_return"], row["episode_return_se"])
+        line = names_of(row) | {"n": str(row["seeds"])}
         for name in costs:
-            title = _cost_title(suffixes, name, len(costs))
-            line[title] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
-            line[f"limit of {title}"] = number(row[f"deploy_limit_{name[5:]}"])
+            which = _cost_suffix(suffixes, name, len(costs))
+            line[f"cost{which}"] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
+            line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
+        line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         line["optimum"] = number(row["optimal_return"])
         seeds, feasible = int(row["seeds"]), int(row["feasible_seeds"])
         line["regret"] = with_error(row["gap"], row["gap_se"]) if feasible == seeds else DASH
@@ -67,34 +67,60 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
     return pd.DataFrame(lines)
 
 
-def comparison_table(
-    comparisons: pd.DataFrame, measure: Measure, suffixes: Sequence[str] = ()
-) -> pd.DataFrame:
-    """Format paired differences to the agent without a curriculum.
+def row_kinds(rows: pd.DataFrame) -> list[str]:
+    """Return ``infeasible`` for each row with an infeasible seed, else an empty text.
+
+    Args:
+        rows: seeds and feasible_seeds, as in ``metrics.summary``.
+    """
+    return ["infeasible" if row.feasible_seeds < row.seeds else "" for row in rows.itertuples()]
+
+
+def names_of(row: pd.Series) -> dict[str, str]:
+    """Return the labels of a row's task, agent and curriculum."""
+    return {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
+
+
+def compared_rows(comparisons: pd.DataFrame, summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
+    """Return the comparisons of one measure, with ``seeds`` and ``feasible_seeds`` of the curriculum.
 
     Args:
         comparisons: of ``metrics.comparisons``.
+        summary: of ``metrics.summary``.
         measure: which of the three outcomes.
-        suffixes: as for ``outcome_table``.
     """
     rows = comparisons[comparisons["measure"] == measure.value]
+    counts = summary[[*GROUP, "measure", "seeds", "feasible_seeds"]]
+    return rows.merge(counts, on=[*GROUP, "measure"], how="left", sort=False)
+
+
+def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.DataFrame:
+    """Format paired differences to the agent without a curriculum.
+
+    More return is no gain if every seed is infeasible: such a row has no gain, only its added cost.
+
+    Args:
+        rows: of ``compared_rows``.
+        suffixes: as for ``outcome_table``.
+    """
     costs = [name for name in map(str, rows) if name.startswith("cost_") and name.endswith("_difference")]
     lines = []
     for _, row in rows.iterrows():
-        line = {name: str(row[name]) for name in GROUP} | {"pairs of seeds": str(row["pairs"])}
-        line["return gained"] = with_interval(row, "return_difference")
+        line = names_of(row) | {"n": str(row["pairs"])}
+        no_gain = row["feasible_seeds"] == 0
+        line["return gained"] = DASH if no_gain else with_interval(row, "return_difference")
         for name in costs:
-            title = f"{_cost_title(suffixes, name, len(costs))} added"
+            title = f"cost{_cost_suffix(suffixes, name, len(costs))} added"
             line[title] = with_interval(row, name)
-        mark = TOO_FEW if row["too_few_seeds"] else ""
-        line["P(higher return)"] = with_interval(row, "improvement") + mark
+        mark = TOO_FEW if row["too_few_seeds"] and not math.isnan(row["improvement_low"]) else ""
+        line["P(higher return)"] = DASH if no_gain else with_interval(row, "improvement") + mark
         lines.append(line)
     return pd.DataFrame(lines)
 
 
-def _cost_title(suffixes: Sequence[str], column: str, num_costs: int) -> str:
+def _cost_suffix(suffixes: Sequence[str], column: str, num_costs: int) -> str:
     i = int(column.split("_")[1])
-    return f"cost{suffixes[i]}" if i < len(suffixes) else "cost" if num_costs == 1 else f"cost {i}"
+    return suffixes[i] if i < len(suffixes) else "" if num_costs == 1 else f" {i}"
 
 
 def number(value: float) -> str:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import pandas as pd
 
+from recrl.analysis.data.cost_names import cost_suffix
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report.table_formats import DASH, number, with_error, with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
+from recrl.environments.registry import TASKS
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
@@ -23,6 +27,8 @@ WARNINGS = {
         "Hard landing: more than 10% of the way from d_t to d_d was left when deployment began.",
     ),
 }
+ONE_SEED = "One seed (n = 1): no intervals, and another seed may give another verdict."
+SOME_LIMIT = "a limit"
 NO_VERDICT = "No trial is complete yet: no verdict."
 
 
@@ -32,23 +38,104 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
-    how = "computed exactly from the recorded policies"
-    if not verdicts["exact"].all():
-        sampled = int(verdicts.loc[~verdicts["exact"], "episodes"].min())
-        how = f"means over {sampled} episodes, or exact where the task is finite"
     several = bool((verdicts["seeds"] > 1).any())
     interval = ", with its 95% interval (Student's t)" if several else ""
     errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
     return [
-        f"The verdict, the return and the cost are those of the final policy, without learning: {how}.",
+        f"The verdict, the return and the cost are those of the final policy, without learning: "
+        f"{measured_how(verdicts)}.",
         *errors,
         f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known.",
-        f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%} or one standard error, "
-        "whichever is larger.",
+        tolerance_sentence(verdicts),
         "The return of an infeasible policy may be above the optimum: it is no success.",
         f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
         *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
+    ]
+
+
+def measured_how(verdicts: pd.DataFrame) -> str:
+    """Say how the numbers of the final policies were found: computed, or averaged over episodes.
+
+    Args:
+        verdicts: of ``verdict_counts.count_verdicts``.
+    """
+    if verdicts["exact"].all():
+        return "computed exactly from the recorded policies"
+    sampled = f"means over {int(verdicts.loc[~verdicts['exact'], 'episodes'].min())} episodes"
+    tasks = [str(task) for task in dict.fromkeys(verdicts.loc[verdicts["exact"], "task"])]
+    return f"{sampled}, but computed exactly on {_listed(tasks)}" if tasks else sampled
+
+
+def tolerance_sentence(verdicts: pd.DataFrame) -> str:
+    """Say how far above its limit the mean cost of a feasible policy may be.
+
+    Args:
+        verdicts: of ``verdict_counts.count_verdicts``.
+    """
+    sampled = " or, where it is sampled, one standard error, whichever is larger"
+    error = "" if verdicts["exact"].all() else sampled
+    return f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%}{error}."
+
+
+def task_sentences(sweep: Sweep, verdicts: pd.DataFrame) -> list[str]:
+    """Return what the numbers of each task mean: its costs, limits and tolerance, and the limits d_t.
+
+    Args:
+        sweep: of the tasks.
+        verdicts: of ``verdict_counts.count_verdicts``.
+    """
+    sentences = []
+    for task in dict.fromkeys(verdicts["task"]):
+        trials = sweep.trials[sweep.trials["task"] == task]
+        exact = bool(verdicts.loc[verdicts["task"] == task, "exact"].all())
+        name = str(trials["task_name"].iloc[0])
+        parts = [TASKS[name].summary] if name in TASKS else []
+        for i in range(int(trials["num_costs"].max())):
+            suffix = cost_suffix(sweep, i, task)
+            which = f" of cost{suffix}" if suffix else ""
+            limit = float(trials[f"deploy_limit_{i}"].iloc[0])
+            parts.append(f"Limit{which}: {limit:g} per episode, {_allowed(limit, exact=exact)}.")
+            if relaxed := _training_limits(trials, i):
+                parts.append(f"Training limit d_t{which}: {relaxed}.")
+        sentences.append(f"{task}: {' '.join(parts)}")
+    return [*sentences, *_rounded_steps(sweep)]
+
+
+def _allowed(limit: float, *, exact: bool) -> str:
+    """Say which mean cost counts as feasible.
+
+    >>> _allowed(1.0, exact=True), _allowed(25.0, exact=False)
+    ('allowed 1.01 (1%, exact)', 'allowed 25.25, or 25 + SE if that is more')
+    """
+    most = limit + COST_TOLERANCE * (limit if limit > 0.0 else 1.0)
+    how = f" ({COST_TOLERANCE:.0%}, exact)" if exact else f", or {limit:g} + SE if that is more"
+    return f"allowed {most:g}{how}"
+
+
+def _training_limits(trials: pd.DataFrame, i: int) -> str:
+    """Say which d_t the curricula of a task began with, and whether they measured it; empty if none has."""
+    trials = trials[trials["method_name"] != BASELINE]  # without a curriculum the limit is d_d throughout
+    measured = trials[f"start_limit_{i}"].dropna()
+    given = trials.loc[trials[f"start_limit_{i}"].isna(), f"train_limit_{i}"]
+    given = given[np.isfinite(given)]
+    parts = [(measured, "measured at the start of training"), (given, "from the grid")]
+    return ", and ".join(f"{_range(values)}, {how}" for values, how in parts if len(values))
+
+
+def _range(values: pd.Series[float]) -> str:
+    low, high = number(float(values.min())), number(float(values.max()))
+    return low if low == high else f"{low} to {high}"
+
+
+def _rounded_steps(sweep: Sweep) -> list[str]:
+    """Say that trials took more steps than the grid asks for, because updates are whole."""
+    sizes = {(it.spec.total_steps, it.spec.steps_per_update, it.spec.num_updates) for it in sweep.facts}
+    return [
+        f"A trial has {updates} policy updates of {size:,} steps, {updates * size:,} steps, to cover the "
+        f"total_steps of {total:,}."
+        for total, size, updates in sorted(sizes)
+        if updates * size != total
     ]
 
 
@@ -66,14 +153,14 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
         line["verdict"] = verdict_text(row)
         if warned:
             line["warning"] = warning_text(row)
+        for name in costs:
+            which = "" if len(costs) == 1 else f" {_label(verdicts, name[5:])}"
+            line[f"cost{which}"] = with_error(row[name], row[f"{name}_se"], digits=3)
+            line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
+        line["optimum"] = number(row["optimal_return"])
         all_infeasible = row["infeasible"] == row["seeds"]  # more return is then no gain
         line["difference to none"] = DASH if all_infeasible else with_interval(row, "return_difference")
-        line["optimum"] = number(row["optimal_return"])
-        for name in costs:
-            title = "cost" if len(costs) == 1 else f"cost {_label(verdicts, name[5:])}"
-            line[title] = with_error(row[name], row[f"{name}_se"], digits=3)
-            line[f"limit of {title}" if len(costs) > 1 else "limit"] = number(row[f"deploy_limit_{name[5:]}"])
         line["n"] = str(row["seeds"])
         earned = with_error(row["deployment_return"], row["deployment_return_se"])
         paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"], digits=3) for it in costs]
@@ -140,26 +227,46 @@ def warning_text(row: pd.Series) -> str:
 def answers(verdicts: pd.DataFrame) -> list[str]:
     """Return one sentence per task: how many final policies solve it, by which curricula, and which violate.
 
+    The first sentence says so if there is only one seed.
+
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
-    return [_answer(task, verdicts[verdicts["task"] == task]) for task in dict.fromkeys(verdicts["task"])]
+    tasks = dict.fromkeys(verdicts["task"])
+    first = [ONE_SEED] if len(verdicts) and verdicts["seeds"].max() == 1 else []
+    return [*first, *(_answer(task, verdicts[verdicts["task"] == task]) for task in tasks)]
 
 
 def _answer(task: str, rows: pd.DataFrame) -> str:
     optimum = float(rows["optimal_return"].iloc[0])
     if optimum == -math.inf:
         return f"{task}: no policy keeps the limits."
-    known = not math.isnan(optimum)
     column, one, many = (
-        (SOLVED, "solves it", "solve it") if known else (FEASIBLE, "is feasible", "are feasible")
+        (FEASIBLE, "is feasible", "are feasible")
+        if math.isnan(optimum)
+        else (SOLVED, "solves it", "solve it")
     )
     total, good = int(rows["seeds"].sum()), int(rows[column].sum())
+    policies = f"{total} final policies{_product(rows)}"
     if good == total:
-        return f"{task}: all {total} final policies {many}."
-    head = f"none of {total} final policies {one}" if not good else f"{good} of {total} final policies {many}"
-    parts = [head + (_best(rows, column) if good else ""), *_violations(rows)]
+        return f"{task}: all {policies} {many}."
+    head = f"none of {policies} {one}" if not good else f"{good} of {policies} {many}"
+    parts = [head + (_best(rows, column) if good else ""), *_violations(rows, column)]
     return f"{task}: {'; '.join(parts)}."
+
+
+def _product(rows: pd.DataFrame) -> str:
+    """Say what the final policies of a task are: one per agent, curriculum and seed.
+
+    >>> labels = {"agent": ["cpo", "cpo"], "method": ["none", "step"]}
+    >>> _product(pd.DataFrame(labels | {"seeds": [3, 3]})), _product(pd.DataFrame(labels | {"seeds": [3, 2]}))
+    (' (1 agent x 2 curricula x 3 seeds)', '')
+    """
+    agents, methods, seeds = rows["agent"].nunique(), rows["method"].nunique(), int(rows["seeds"].max())
+    if agents * methods * seeds != rows["seeds"].sum():  # the sweep is not complete
+        return ""
+    numbers = ((agents, "agent", "agents"), (methods, "curriculum", "curricula"), (seeds, "seed", "seeds"))
+    return f" ({' x '.join(f'{count} {one if count == 1 else many}' for count, one, many in numbers)})"
 
 
 def _best(rows: pd.DataFrame, column: str) -> str:
@@ -180,14 +287,45 @@ def _share(counts: pd.DataFrame, method: str, column: str) -> str:
     return f"{int(counts[column][method])} of {int(counts['seeds'][method])}"
 
 
-def _violations(rows: pd.DataFrame) -> list[str]:
-    broken = rows[rows["infeasible"] > 0]
-    if not len(broken):
-        return []
-    methods = [str(method) for method in dict.fromkeys(rows["method"]) if method in set(broken["method"])]
-    who = "every curriculum" if len(methods) == rows["method"].nunique() > 1 else _listed(methods)
-    count, excess = int(broken["infeasible"].sum()), number(float(broken["worst_excess"].max()))
-    return [f"{count} violate{'' if count > 1 else 's'} a limit, by up to {excess} (with {who})"]
+def _violations(rows: pd.DataFrame, column: str) -> list[str]:
+    """Name the curricula of which every policy is infeasible, then each one of which only some are."""
+    counts = rows.groupby("method", sort=False)[[column, "infeasible", "seeds"]].sum()
+    always = [str(method) for method in counts.index[counts["infeasible"] == counts["seeds"]]]
+    sometimes = counts[(counts["infeasible"] > 0) & (counts["infeasible"] < counts["seeds"])]
+    parts, limit = [], _limit_text(rows)
+    if always:
+        chosen = rows[rows["method"].isin(always)]
+        who = "every curriculum" if len(always) == len(counts) > 1 else _listed(always)
+        total = int(chosen["seeds"].sum())
+        verb = "exceed" if len(always) > 1 and who != "every curriculum" else "exceeds"
+        what = "policy" if total == 1 else "policies"
+        parts.append(f"{who} {verb} {limit} by {_excess(chosen)} ({total} of {total} {what})")
+        limit = "it" if limit != SOME_LIMIT else limit
+    for method, count in sometimes.iterrows():
+        chosen = rows[(rows["method"] == method) & (rows["infeasible"] > 0)]
+        done = "solves" if column == SOLVED else "is feasible in"
+        bad, total = int(count["infeasible"]), int(count["seeds"])
+        others = "the other exceeds" if total == 2 and count[column] else f"{bad} exceed{'s' * (bad == 1)}"
+        parts.append(
+            f"{method} {done} {int(count[column])} of {total}, {others} {limit} by {_excess(chosen)}"
+        )
+        limit = "it" if limit != SOME_LIMIT else limit
+    return parts
+
+
+def _limit_text(rows: pd.DataFrame) -> str:
+    """Name the limit of a task, or say ``a limit`` if it has several costs."""
+    names = [str(name) for name in rows if str(name).startswith("deploy_limit_")]
+    limits = {float(value) for name in names for value in rows[name].dropna()}
+    return f"the limit of {limits.pop():g}" if len(limits) == 1 else SOME_LIMIT
+
+
+def _excess(rows: pd.DataFrame) -> str:
+    """Format by how much infeasible policies exceed their limit: a range, if each row is one policy."""
+    low, high = number(float(rows["worst_excess"].min())), number(float(rows["worst_excess"].max()))
+    if (rows["infeasible"] > 1).any():
+        return f"up to {high}"
+    return high if low == high else f"{low} to {high}"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -101,7 +101,7 @@ def _about(rows: pd.DataFrame, claim: Claim) -> pd.DataFrame:
 
 
 def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
-    """Format the result of ``weigh``: "4 of 5 (38–96%)"."""
+    """Format the result of ``weigh``: "mixed", "4 of 5 (38–96%)"."""
     shares = zip(weighed["held"], weighed["trials"], weighed["share_low"], weighed["share_high"], strict=True)
     beside = zip(weighed["deployment_held"], weighed["trials"], strict=True)
     return pd.DataFrame(
@@ -109,6 +109,10 @@ def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
             "section": weighed["section"],
             "claim": weighed["claim"],
             "agent": weighed["agent"],
+            "holds here": [
+                "yes" if held == trials else "mixed" if held else "no"
+                for held, trials in zip(weighed["held"], weighed["trials"], strict=True)
+            ],
             "final policy": [share_text(*share) for share in shares],
             "deployment phase (learning goes on)": [f"{held} of {trials}" for held, trials in beside],
         }

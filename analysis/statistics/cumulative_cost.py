@@ -207,16 +207,16 @@ def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
     """Format the sums of ``cumulative_costs``: one row per GROUP, means over its runs."""
     lines = []
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
-        line = {name: str(label) for name, label in zip(GROUP, group, strict=True)}
-        line |= {"runs": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
+        line = dict(zip(("task", "agent", "curriculum"), map(str, group), strict=True))
+        line |= {"n": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
         for title, name in (
             ("cost", "cost_sum"),
-            ("limits", "limit_sum"),
-            ("over limits", "overshoot_sum"),
-            ("over d_d", "violation_sum"),
-            ("bound for CPO", "bound"),
-            ("discounted", "discounted_bound"),
-            ("ceiling", "ceiling_sum"),
+            ("limits in force", "limit_sum"),
+            ("above limits in force", "overshoot_sum"),
+            ("above the limit", "violation_sum"),
+            ("bound", "bound"),
+            ("discounted bound", "discounted_bound"),
+            ("trivial bound", "ceiling_sum"),
         ):
             line[title] = number(float(runs[name].mean()))
         lines.append(line)

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from recrl.environments.plugins import UntrustedNameError
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import say
+from recrl.orchestrator.cli.output import print_table, say
 from recrl.orchestrator.cli.requests import ListRequest, OptionsRequest, SchemaRequest
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
@@ -20,7 +20,7 @@ from recrl.orchestrator.grid.json_schema import grid_schema
 def run_list(request: ListRequest, console: Console) -> ExitCode:
     """List the tasks, agents or curricula, each with its summary."""
     kind = KINDS["curricula" if request.kind == "methods" else request.kind]
-    console.print(display.text_table([kind.singular, "summary"], listed(kind)))
+    print_table(display.text_table([kind.singular, "summary"], listed(kind)), console)
     say(console, f"\nOptions of one: recrl-sweep options {kind.ours[0]}")
     return ExitCode.OK
 

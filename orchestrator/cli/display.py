@@ -24,6 +24,7 @@ TERMINAL_SECONDS = 1.0
 LINE_SECONDS = 10.0
 LOG_SECONDS = 0.5
 SHOWN_RUNNING = 8
+WRAPPED = ("verdict", "summary")  # columns of sentences, wrapped on a narrow terminal
 
 _STYLES = {
     "complete": "green",
@@ -126,9 +127,7 @@ def status_sentence(progress: SweepProgress) -> str:
 def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress], str]) -> Iterator[str]:
     """Describe every trial with an error: its name, the error, and the place of its log and traceback."""
     for trial in trials:
-        broken = trial.status in (DisplayStatus.FAILED, DisplayStatus.DAMAGED)
-        word = str(trial.status) if broken else "waiting"
-        yield f"{word}: {trial.spec.title}: {trial.record.error or 'no reason was recorded'}"
+        yield f"{trial.status}: {trial.spec.title}: {trial.record.error or 'no reason was recorded'}"
         what = "its files" if trial.status is DisplayStatus.DAMAGED else "log and traceback"
         yield f"        {what}: {folder_of(trial)}"
 
@@ -231,7 +230,7 @@ def _picture(progress: SweepProgress) -> RenderableType:
 
 
 def text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """A table of finished text."""
+    """A table of finished text; where it does not fit, the columns WRAPPED are wrapped."""
     table = _table(*columns)
     for row in rows:
         table.add_row(*map(Text, row))
@@ -252,7 +251,7 @@ def _table(*columns: str) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     for column in columns:
         right = column in ("seed", "done", "steps/s", "CPU", "tries")
-        table.add_column(column, justify="right" if right else "left", no_wrap=True)
+        table.add_column(column, justify="right" if right else "left", no_wrap=column not in WRAPPED)
     return table
 
 

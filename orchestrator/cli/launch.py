@@ -108,6 +108,10 @@ class _Printer(LaunchListener):
         """Print that trials save their state."""
         say(self._console, "Stopping: running trials save their state. Press again to stop at once.")
 
+    def drawing(self) -> None:
+        """Print that figures are being drawn: it takes long."""
+        say(self._console, "Drawing figures ...")
+
     def drawn(self, folder: Path) -> None:
         """Print the place of the figures."""
         say(self._console, f"Figures    {short(folder)}")
@@ -131,13 +135,13 @@ class _Printer(LaunchListener):
 def _say_results(sweep: Sweep, console: Console) -> None:
     """Print return and cost of the final policies."""
     from recrl.analysis.data.sweep_warnings import curriculum_warnings  # noqa: PLC0415
-    from recrl.orchestrator.cli.result_table import CAPTION, result_table  # noqa: PLC0415
+    from recrl.orchestrator.cli.result_table import result_table  # noqa: PLC0415
 
-    table = result_table(sweep)
+    table, caption = result_table(sweep)
     if len(table):
         say(console, "")
         show(table, console)
-        say(console, CAPTION)
+        say(console, caption)
         for sentence in curriculum_warnings(sweep):
             say(console, f"warning: {sentence}")
         say(console, "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +13,15 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.table import Table
 
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.redaction import printable, shown
 
 if TYPE_CHECKING:
     import pandas as pd
+
+UNLIMITED = 100_000  # characters of a line
 
 
 class TextConsole(Console):
@@ -27,6 +31,12 @@ class TextConsole(Console):
         """Render with escaped control characters of texts; colours are Rich's own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=printable(segment.text))
+
+    def on_broken_pipe(self) -> None:
+        """Pass the error on to ``main``; Rich would end the process, as if the user's code had."""
+        if threading.current_thread() is not threading.main_thread():
+            super().on_broken_pipe()
+        raise  # noqa: PLE0704  (Rich calls this while it handles the BrokenPipeError)
 
 
 @contextmanager
@@ -65,4 +75,16 @@ def say(console: Console, sentence: str) -> None:
 
 def show(table: pd.DataFrame, console: Console) -> None:
     """Print a table of finished text."""
-    console.print(display.text_table(list(map(str, table)), table.to_numpy().tolist()))
+    print_table(display.text_table(list(map(str, table)), table.to_numpy().tolist()), console)
+
+
+def print_table(table: Table, console: Console) -> None:
+    """Print a table; a file or a pipe has no width, so nothing is shortened there."""
+    before = console.width
+    if not console.is_terminal:
+        unlimited = console.options.update(max_width=UNLIMITED)
+        console.width = max(before, console.measure(table, options=unlimited).maximum)
+    try:
+        console.print(table)
+    finally:
+        console.width = before

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import say, short
+from recrl.orchestrator.cli.output import print_table, say, short
 from recrl.orchestrator.cli.requests import PlanRequest, ValidateRequest
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -55,7 +55,7 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     at_once, where = room(
         grid.resources, address=request.address, max_concurrent=request.max_concurrent, cores=request.cores
     )
-    console.print(display.plan_table(plan))
+    print_table(display.plan_table(plan), console)
     say(console, "")
     speeds = _measured(plan, console) if request.measure else {}
     say_plan(plan, grid, console, at_once=at_once, where=where, speeds=speeds)

@@ -8,35 +8,48 @@ from collections.abc import Sequence
 import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_names, cost_suffix
-from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
-from recrl.analysis.report.table_formats import number, with_error
-from recrl.analysis.report.verdict_texts import verdict_text
+from recrl.analysis.report.table_formats import names_of, number, with_error
+from recrl.analysis.report.verdict_texts import measured_how, tolerance_sentence, verdict_text
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import count_verdicts
-
-CAPTION = (
-    "Final policies (stochastic), evaluated without learning: means over n seeds, returns ± standard error.\n"
-    "Verdicts as in the report: solved, feasible, or infeasible by how much."
-)
+from recrl.analysis.statistics.verdicts import SOLVED_GAP
 
 
-def result_table(sweep: Sweep) -> pd.DataFrame:
+def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:
     """Return the results as text, one row per task, agent and method; empty without evaluations.
 
     Args:
         sweep: its complete trials are used.
+
+    Returns:
+        The table, and its caption.
     """
     if sweep.evaluations.empty:
-        return pd.DataFrame()
+        return pd.DataFrame(), ""
     rows = count_verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
-    return pd.DataFrame([_line(row, suffixes) for _, row in rows.iterrows()])
+    return pd.DataFrame([_line(row, suffixes) for _, row in rows.iterrows()]), caption(rows)
+
+
+def caption(rows: pd.DataFrame) -> str:
+    """Return two lines: how the numbers were measured, and what the verdicts allow.
+
+    Args:
+        rows: of ``verdict_counts.count_verdicts``.
+    """
+    several = int(rows["seeds"].max()) > 1
+    means = "means over n seeds, returns ± standard error" if several else "one seed (n = 1): no intervals"
+    return (
+        f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"
+        f"Verdicts: solved (feasible, and within {SOLVED_GAP} of the optimum), feasible, or infeasible by "
+        f"how much. {tolerance_sentence(rows)}"
+    )
 
 
 def _line(row: pd.Series, suffixes: Sequence[str]) -> dict[str, str]:
-    line = {name: str(row[name]) for name in GROUP} | {"n": str(row["seeds"])}
+    line = names_of(row) | {"n": str(row["seeds"])}
     line["return"] = with_error(row["episode_return"], row["episode_return_se"])
     for i, which in enumerate(suffixes):
         line[f"cost{which}"] = with_error(row[f"cost_{i}"], math.nan, digits=3)

@@ -9,7 +9,7 @@ import time
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import say, short
+from recrl.orchestrator.cli.output import print_table, say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
 from recrl.orchestrator.cli.sweeps import open_store
@@ -41,7 +41,7 @@ def run_status(request: StatusRequest, console: Console) -> ExitCode:
     specs = store.specs()
     now = progress(specs, store)
     if not request.brief:
-        console.print(display.status_table(now))
+        print_table(display.status_table(now), console)
         say(console, "")
     say(console, f"{store.name}: {display.status_sentence(now)}")
     say_failures(now, store, console)

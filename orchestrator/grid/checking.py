@@ -216,7 +216,10 @@ class _Check:
         choices: dict[int, Choice] = {}
         for index, value in enumerate(_items(self._raw.get(section))):
             entry = _valid(model, value)
-            if entry is None:
+            if entry is None:  # the schema check has reported why; its name may be wrong as well
+                named = _valid(Entry, _named(value))
+                if named is not None:
+                    self._options((section, index), named, options_of)
                 continue
             options = self._options((section, index), entry, options_of)
             if options is None:
@@ -380,6 +383,13 @@ def _valid(model: type[Model], value: Any) -> Model | None:
         return model.model_validate(value)
     except ValidationError:
         return None
+
+
+def _named(value: Any) -> Any:
+    """Return an entry's name and options without its other settings."""
+    return (
+        {key: value[key] for key in ("name", "options") if key in value} if isinstance(value, dict) else value
+    )
 
 
 def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:

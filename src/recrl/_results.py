@@ -68,8 +68,9 @@ def load_policy(
     """Load the policy of a trial's newest checkpoint.
 
     Args:
-        source: a sweep that ``load_sweep`` read from its folder; or the folder of a trial, which
-            ``recrl-sweep logs demo 3f2a --folder`` prints.
+        source: a sweep that ``load_sweep`` read from its folder; or, with ``trial_id``, the sweep's folder,
+            or its name below ``runs``; or the folder of a trial, which ``recrl-sweep logs demo 3f2a
+            --folder`` prints.
         trial_id: of the sweep's trial, from the column ``trial_id`` of ``sweep.trials``.
         seed: of the policy's random numbers; None for a random one.
         trust: whether to follow the trial's import paths. This runs their code: do so only with files whose
@@ -89,9 +90,17 @@ def load_policy(
     """
     from recrl.orchestrator.files.trial_store import TrialStore  # noqa: PLC0415
 
-    folder = Path(source) if isinstance(source, str | Path) else _folder_of(source, trial_id)
+    if not isinstance(source, str | Path):
+        folder = _folder_of(source, trial_id)
+    elif trial_id is None:
+        folder = Path(source)
+    else:
+        folder = _folder_below(source, trial_id)
     if not (folder / "spec.json").exists():
-        raise RecrlError(f"{folder}: is not the folder of a trial; see recrl-sweep logs SWEEP TRIAL --folder")
+        raise RecrlError(
+            f"{folder}: is not the folder of a trial; give the sweep and a trial_id, or see recrl-sweep logs "
+            "SWEEP TRIAL --folder"
+        )
     with following(trust):
         return policy_of(TrialStore(folder), seed=seed)
 
@@ -109,6 +118,20 @@ def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
     if not folder.exists():
         raise RecrlError(f"{spec.title}: has not begun, so there is no policy yet")
     return folder
+
+
+def _folder_below(source: str | Path, trial_id: str) -> Path:
+    """The folder of a trial of the sweep with this name or folder."""
+    from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
+
+    store = find_sweep(Path("runs"), str(source))
+    trial = next((it for it in store.trials() if it.trial_id == trial_id), None)
+    if trial is None:
+        raise RecrlError(
+            f"{store.name}: no trial {trial_id!r} has begun; load_sweep({str(source)!r}).trials has the "
+            "column trial_id"
+        )
+    return trial.folder
 
 
 def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:

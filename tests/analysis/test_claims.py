@@ -56,6 +56,8 @@ def test_the_share_has_wilsons_interval() -> None:
     weighed = weigh(pd.DataFrame([outcome("rivergrid-1a", "linear", 9.5, 5.0)] * 5))
     assert weighed["share_low"].item() == pytest.approx(0.5655, abs=1e-4)  # 1 / (1 + 1.96^2 / 5)
     assert claims_table(weighed)["final policy"].item() == "5 of 5 (57–100%)"
+    table = claims_table(pd.concat([weighed, weighed.assign(held=3), weighed.assign(held=0)]))
+    assert table["holds here"].tolist() == ["yes", "mixed", "no"]
 
 
 def test_the_deployment_phase_is_counted_beside_and_apart() -> None:

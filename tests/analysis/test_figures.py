@@ -18,7 +18,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
-from recrl.analysis.figures.styles import LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
+from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 
@@ -137,6 +137,8 @@ def test_final_policies_lie_under_the_frontier_left_of_the_shaded_region(finishe
     panel = figure.axes[0]
     frontier = np.asarray(lines_of(panel, OPTIMUM_COLOUR)[0].get_xydata())
     assert [5.0, 14.0] in frontier.tolist()
+    feasible = [len(np.asarray(marks.get_facecolors())) for marks in panel.collections]
+    assert feasible[:2] == [3, 3]  # filled
     runs = [np.asarray(marks.get_offsets()).tolist() for marks in panel.collections]
     assert runs[0] == [[4.8, 8.0], [0.5, -15.0], [0.5, -15.0]]  # none
     assert runs[1] == [[4.8, 8.0]] * 3
@@ -175,17 +177,41 @@ def test_diagnostics_show_limit_cost_multiplier_and_noise(finished: Sweep) -> No
     assert [axes.get_title() for axes in figure.axes[:3]] == ["none", "linear", "dynamic"]
     assert [axes.get_ylabel() for axes in figure.axes[::3]] == ["cost", "multiplier", "KL divergence"]
     dynamic = figure.axes[2]
-    assert len(lines_of(dynamic, LIMIT_COLOUR)) == 3
+    assert len(lines_of(dynamic, IN_FORCE_COLOUR)) == 3
+    (limit,) = lines_of(dynamic, LIMIT_COLOUR)
+    assert (
+        limit.get_linestyle()
+        == lines_of(learning_curves.learning_curves(finished, "cpo").axes[2], LIMIT_COLOUR)[0].get_linestyle()
+        == "--"
+    )
     ticks = [line for line in dynamic.get_lines() if line.get_transform() == dynamic.get_xaxis_transform()]
-    at = {float(np.asarray(line.get_xdata())[0]) for line in ticks if line.get_color() != "black"}
-    assert at == {4_000.0, 8_000.0, 12_000.0}
+    (marks,) = (line for line in ticks if line.get_color() != "black")
+    assert list(np.asarray(marks.get_xdata())) == [4_000.0, 8_000.0, 12_000.0]
+    assert marks.get_marker() == "|"
 
 
 def test_diagnostics_mark_recovery_steps(finished: Sweep) -> None:
     case = np.where(finished.updates["end_step"] == 800, 2.0, 1.0)
     sweep = dataclasses.replace(finished, updates=finished.updates.assign(case=case))
     panel = curriculum_diagnostics(sweep, "river-a", "cpo").axes[6]
-    assert [800.0, 800.0] in [list(np.asarray(line.get_xdata())) for line in panel.get_lines()]
+    marks = [line for line in panel.get_lines() if list(np.asarray(line.get_xdata())) == [800.0]]
+    assert [line.get_marker() for line in marks] == ["x"]  # noise has another mark
+
+
+def test_diagnostics_draw_the_target_of_the_kl_divergence(finished: Sweep) -> None:
+    facts = [
+        dataclasses.replace(
+            it,
+            spec=dataclasses.replace(
+                it.spec, agent=dataclasses.replace(it.spec.agent, options={"target_kl": 0.02})
+            ),
+        )
+        for it in finished.facts
+    ]
+    panel = curriculum_diagnostics(dataclasses.replace(finished, facts=tuple(facts)), "river-a", "cpo").axes[
+        6
+    ]
+    assert [0.02, 0.02] in [list(np.asarray(line.get_ydata())) for line in panel.get_lines()]
 
 
 def test_known_methods_look_the_same_in_every_sweep() -> None:

@@ -17,11 +17,11 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
     assert table.iloc[0].to_dict() == {
         "task": "river-a",
         "agent": "ppo-lag",
-        "method": "none",
-        "seeds": "3",
-        "return": "-7.33 ± 7.67",
+        "curriculum": "none",
+        "n": "3",
         "cost": "1.933 ± 1.433",
-        "limit of cost": "5.00",
+        "limit": "5.00",
+        "return": "-7.33 ± 7.67",
         "optimum": "14.00",
         "regret": "21.33 ± 7.67",
         "feasible": "3 of 3",
@@ -37,10 +37,25 @@ def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(fini
 
 
 def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
-    compared = metrics.comparisons(metrics.outcomes(finished), np.random.default_rng(0))
-    table = table_formats.comparison_table(compared, Measure.STOCHASTIC)
+    rows = metrics.outcomes(finished)
+    compared = metrics.comparisons(rows, np.random.default_rng(0))
+    chosen = table_formats.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
+    table = table_formats.comparison_table(chosen)
     assert table["P(higher return)"].str.endswith("†").all()
     assert table["return gained"].iloc[0].startswith("15.33 [-17.65, 48.32]")
+
+
+def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished).query("seed == 0")
+    compared = metrics.comparisons(rows, np.random.default_rng(0))
+    chosen = table_formats.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
+    assert table_formats.row_kinds(chosen) == [""] * len(chosen)
+    chosen.loc[0, "feasible_seeds"] = 0
+    table = table_formats.comparison_table(chosen)
+    assert table_formats.row_kinds(chosen)[:2] == ["infeasible", ""]
+    assert table.loc[0, ["return gained", "P(higher return)"]].tolist() == ["–", "–"]
+    assert "–" not in table.loc[1].tolist()
+    assert not table["P(higher return)"].str.contains("†").any()
 
 
 def test_markdown_and_latex_by_hand() -> None:

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from recrl.analysis.data.labels import KEY
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import html_page, verdict_texts
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 
@@ -71,7 +72,7 @@ def test_the_worst_cost_is_the_one_that_is_furthest_over_its_limit() -> None:
     table = verdict_texts.verdict_table(
         judged([outcome("none", 0, 9.5, 5.5, **others)]).assign(cost_1_se=0.0)
     )
-    assert {"cost 0", "limit of cost 1"} <= set(table)
+    assert {"cost 0", "limit 1"} <= set(table)
 
 
 def test_the_table_says_the_verdict_in_words() -> None:
@@ -111,18 +112,20 @@ def test_one_seed_has_no_interval() -> None:
     [
         (
             ROWS,
-            "river: 3 of 6 final policies solve it, most often with dynamic (2 of 2), against 1 of 2 with "
-            "none; 2 violate a limit, by up to 2.00 (with linear).",
+            "river: 3 of 6 final policies (1 agent x 3 curricula x 2 seeds) solve it, most often with "
+            "dynamic (2 of 2), against 1 of 2 with none; linear exceeds the limit of 5 by up to 2.00 (2 of 2 "
+            "policies).",
         ),
-        (ROWS[4:6], "river: all 2 final policies solve it."),
+        (ROWS[4:6], "river: all 2 final policies (1 agent x 1 curriculum x 2 seeds) solve it."),
         (
             ROWS[2:4],
-            "river: none of 2 final policies solves it; 2 violate a limit, by up to 2.00 (with linear).",
+            "river: none of 2 final policies (1 agent x 1 curriculum x 2 seeds) solves it; linear exceeds "
+            "the limit of 5 by up to 2.00 (2 of 2 policies).",
         ),
         (
             [row | {"optimal_return": math.nan, "optimal": False} for row in ROWS[:4]],
-            "river: 2 of 4 final policies are feasible, most often with none (2 of 2); 2 violate a limit, by "
-            "up to 2.00 (with linear).",
+            "river: 2 of 4 final policies (1 agent x 2 curricula x 2 seeds) are feasible, most often with "
+            "none (2 of 2); linear exceeds the limit of 5 by up to 2.00 (2 of 2 policies).",
         ),
         ([row | {"optimal_return": -math.inf} for row in ROWS], "river: no policy keeps the limits."),
     ],
@@ -131,10 +134,40 @@ def test_a_sentence_a_task(rows: list[dict[str, object]], sentence: str) -> None
     assert verdict_texts.answers(judged(rows)) == [sentence]
 
 
+def test_each_curriculum_that_violates_is_named_with_its_excess() -> None:
+    """One seed, two agents: linear and cosine always violate, dynamic with one agent of two."""
+    rows = [
+        outcome("none", 0, 9.5, 5.0),
+        outcome("none", 0, 9.5, 5.0, agent="ppo"),
+        outcome("linear", 0, 9.5, 9.0),
+        outcome("linear", 0, 9.5, 9.06, agent="ppo"),
+        outcome("cosine", 0, 9.5, 9.0),
+        outcome("cosine", 0, 9.5, 9.0, agent="ppo"),
+        outcome("dynamic", 0, 9.5, 5.084),
+        outcome("dynamic", 0, 9.5, 5.0, agent="ppo"),
+    ]
+    assert verdict_texts.answers(judged(rows)) == [
+        "One seed (n = 1): no intervals, and another seed may give another verdict.",
+        "river: 3 of 8 final policies (2 agents x 4 curricula x 1 seed) solve it, most often with none (2 of "
+        "2); linear and cosine exceed the limit of 5 by 4.00 to 4.06 (4 of 4 policies); dynamic solves 1 of "
+        "2, the other exceeds it by 0.084.",
+    ]
+
+
+def test_each_task_says_what_its_limits_mean(finished: Sweep) -> None:
+    table = judged([outcome("none", 0, 9.5, 5.0, task="river-a")])
+    (sentence,) = verdict_texts.task_sentences(finished, table)
+    assert sentence == (
+        "river-a: A camp and a mine, one cost, closed-form optimum: for testing learners. Limit: 5 per "
+        "episode, allowed 5.05 (1%, exact). Training limit d_t: 100.0, from the grid."
+    )
+
+
 def test_violators_are_marked_by_text_and_colour() -> None:
     table = judged(ROWS)
     html = html_page.verdict_table(verdict_texts.verdict_table(table), verdict_texts.verdict_kinds(table))
-    assert '<tr class="infeasible"><td>river</td>' in html
+    assert '<tr class="infeasible"><td class="name">river</td><td class="name">cpo</td>' in html
+    assert '<td class="name"><small>river cpo</small>linear</td>' in html
     assert '<td class="verdict">infeasible by up to 2.00 (40%)</td>' in unescape(html)
     assert "tr.infeasible" in html_page.STYLE
 

@@ -112,7 +112,7 @@ def test_a_wrong_grid_starts_nothing(
     shown = capsys.readouterr()
     assert shown.out == ""
     first, second, last = shown.err.splitlines()
-    assert first.startswith("grid.yaml:4: methods.1: no teacher is called 'linea'; did you mean 'linear'?")
+    assert first.startswith("grid.yaml:4: methods.1: no curriculum is called 'linea'; did you mean 'linear'?")
     assert second == "grid.yaml:5: seeds: must be a number of seeds from 1 to 10000, or a list, got 0"
     assert last == "2 mistakes in grid.yaml; nothing was started"
     assert not (folder / "runs").exists()
@@ -134,12 +134,16 @@ def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "Figures    runs/small/figures\n" in out
     assert "Starting Ray" not in out
     table = out.partition("\n\n")[2].splitlines()
-    assert table[0].split() == ["task", "agent", "method", "n", "return", "cost", "limit", "verdict"]
+    assert table[0].split() == ["task", "agent", "curriculum", "n", "return", "cost", "limit", "verdict"]
     assert [line.split()[:4] for line in table[1:3]] == [
         ["two-state", "ppo-lag", "none", "1"],
         ["two-state", "ppo-lag", "linear", "1"],
     ]
     assert re.search(r" 2\.00 +(solved|feasible|infeasible by [0-9.]+ \([0-9]+%\)) *$", table[1])
+    assert table[3].startswith("Final policies (stochastic), without learning, computed exactly from the")
+    assert table[3].endswith("; one seed (n = 1): no intervals.")
+    assert table[4].endswith("Feasible: no mean cost exceeds its limit by more than 1%.")
+    assert out.index("Drawing figures ...\n") < out.index("Figures    runs/small/figures\n")
     assert table[-2] == "Report     runs/small/figures/report.html"
     assert "small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n" in out
     assert any((folder / "runs/small/figures").glob("*.png"))
@@ -294,6 +298,20 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
     assert not any(trial.record().status.is_finished for trial in store.trials())
 
 
+def test_a_closed_pipe_ends_a_command_quietly(folder: Path) -> None:
+    """``recrl-sweep list tasks | head -1``: the reader is gone before anything is written."""
+    code = """
+import os, sys
+from recrl.orchestrator.cli.main import main
+reader, writer = os.pipe()
+os.dup2(writer, 1)
+os.close(reader)
+sys.exit(main(["list", "tasks"]))
+"""
+    done = _python(code, folder)
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+
+
 def test_the_module_runs_like_the_script(folder: Path) -> None:
     command = [sys.executable, "-m", "recrl", "--version"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
@@ -360,7 +378,7 @@ def test_logs_of_nobody_and_of_several(
     assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
 
 
-def test_status_says_why_a_trial_waits(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_says_why_a_trial_was_stopped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(folder / "runs", "small")
     spec = grid.trials()[0]
@@ -369,7 +387,11 @@ def test_status_says_why_a_trial_waits(folder: Path, capsys: pytest.CaptureFixtu
     assert main(["status", "--brief"]) == ExitCode.OK  # nothing was launched: no trials are known
     store.write_specs([spec])
     assert main(["status", "--brief"]) == ExitCode.OK
-    assert "\nwaiting: two-state ppo-lag none seed 0: the disk was full\n" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert (
+        "0 waiting, 0 failed, 1 stopped; 0%\nstopped: two-state ppo-lag none seed 0: the disk was full\n"
+        in out
+    )
 
 
 def test_a_disk_that_takes_nothing_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -531,6 +553,14 @@ def test_an_environment_without_costs_is_refused_at_validate(
     _own_room(folder, "room_b", "{'speed': 1.0}", task)
     assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.startswith(sentence)
+
+
+def test_an_export_has_no_policies(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "small.zip"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: small.zip: an export has tables but no policies, logs or trials; give the sweep's "
+        "name or folder\n"
+    )
 
 
 def test_logs_show_return_and_cost(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

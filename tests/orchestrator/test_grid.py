@@ -77,6 +77,14 @@ def test_ten_mistakes_give_ten_located_sentences() -> None:
     ]
 
 
+def test_a_wrong_name_is_reported_beside_a_wrong_limit_of_the_same_task() -> None:
+    wrong = SMALL.replace("{name: two-state, deploy_limits: 2}", "{name: two-stat, deploy_limits: -1}")
+    assert wrong != SMALL
+    first, second = _problems(wrong)
+    assert "tasks.0.name: no task is called 'two-stat'" in first + second
+    assert "tasks.0.deploy_limits: must be" in first + second
+
+
 def test_the_product_is_ordered_with_seeds_outermost() -> None:
     titles = [spec.title for spec in _grid(SMALL).trials()]
     assert titles == [

@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
+from recrl.orchestrator.cli.output import print_table
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.grid.checking import parse_grid
@@ -110,6 +111,23 @@ def test_the_tables_have_a_line_for_every_trial(tmp_path: Path) -> None:
     text = console.file.getvalue()
     for spec in SPECS:
         assert text.count(spec.trial_id) == 2
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_no_number_of_a_table_is_shortened(terminal: bool) -> None:
+    """Only a terminal has a width; there the verdict is wrapped."""
+    verdict = "infeasible by up to 4.06 (406%), which is more than a narrow terminal can show"
+    row = ["rivergrid-1b", "ppo-lag", "exponential", "20", "-128.44 ± 12.34", "5.064", "1.00", verdict]
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=80)
+    table = display.text_table(
+        ["task", "agent", "curriculum", "n", "return", "cost", "limit", "verdict"], [row]
+    )
+    print_table(table, console)
+    assert isinstance(console.file, io.StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert all(number in lines[1] for number in row[:-1])
+    assert (verdict in lines[1]) is not terminal
+    assert console.width == 80
 
 
 @pytest.mark.parametrize("terminal", [True, False])

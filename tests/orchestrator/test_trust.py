@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from recrl.analysis.data import export
+from recrl.analysis.data.optima import optima_of
 from recrl.analysis.report import table_formats
 from recrl.analysis.report.drawing import draw
 from recrl.environments.cmdp import CostLimits
@@ -105,6 +106,27 @@ def test_what_was_not_called_is_said(foreign: Path, capsys: pytest.CaptureFixtur
     assert main(["figures", "small.zip", "--to", "drawn"]) == ExitCode.OK
     note = f"spy:TASK: the optimum is unknown here, because 'spy:TASK' was not imported, {REFUSED}"
     assert note in (foreign / "drawn" / "report.md").read_text()
+
+
+def test_an_optimum_is_unknown_here_only_where_it_is_known_elsewhere(foreign: Path) -> None:
+    """A finite task may have one; of a task without a policy table none is known anywhere."""
+    spec = TrialSpec(
+        task=Choice("spy:TASK"),
+        agent=Choice("ppo-lag"),
+        method=Choice("none"),
+        train_limits=CostLimits((2.0,)),
+        deploy_limits=CostLimits((2.0,)),
+        train_steps=80,
+        deploy_steps=80,
+        num_envs=4,
+        rollout_steps=10,
+        evaluation_episodes=2,
+        seed=0,
+    )
+    with refuse_import_paths():
+        assert optima_of([spec], finite=())[1] == ["spy:TASK: no optimum is known"]
+        (note,) = optima_of([spec], finite={"spy:TASK"})[1]
+    assert note == f"spy:TASK: the optimum is unknown here, because 'spy:TASK' was not imported, {REFUSED}"
 
 
 @pytest.mark.parametrize("name", ["os:system", "spy:TASK"])

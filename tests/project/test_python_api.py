@@ -181,6 +181,12 @@ def test_a_policy_is_loaded_by_its_row_in_trials(
     policy = recrl.load_policy(training.sweep, training.sweep.trials["trial_id"].iloc[0])
     assert repr(policy) == "<Policy of two-state ppo-lag none seed 0 after 4 of 4 updates>"
     assert repr(training) == f"<Training of two-state ppo-lag none seed 0, 4 updates in {training.folder}>"
+    trial_id = training.sweep.trials["trial_id"].iloc[0]
+    assert repr(recrl.load_policy(folder / "one", trial_id)) == repr(policy)
+    with pytest.raises(recrl.RecrlError, match="one: no trial '3f2a' has begun; load_sweep"):
+        recrl.load_policy(folder / "one", "3f2a")
+    with pytest.raises(recrl.RecrlError, match=r"one\.zip: an export has tables but no policies"):
+        recrl.load_policy("one.zip", trial_id)
     with pytest.raises(recrl.RecrlError, match="one: has no trial '3f2a'; "):
         recrl.load_policy(training.sweep, "3f2a")
     assert train().sweep.folder is None
@@ -273,7 +279,7 @@ def test_a_launch_prints_what_the_command_prints(folder: Path, capsys: pytest.Ca
     recrl.launch(GRID, executor="inline", mlflow=False, figures=False)
     out = capsys.readouterr().out
     assert "small: 2 trials: 2 new" in out
-    assert "task       agent    method  n  return" in out
+    assert "task       agent    curriculum  n  return" in out
     assert "\nwarning: hard landing, " in out
     assert main(["status", "--brief", "runs/small"]) == ExitCode.OK
     assert len(recrl.load_sweep("small").trials) == len(recrl.load_sweep("runs/small").trials) == 2

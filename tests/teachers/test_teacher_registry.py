@@ -58,7 +58,7 @@ def test_resolved_settings_validate_to_themselves(name: str) -> None:
 
 
 def test_an_unknown_name_is_told_the_nearest_one() -> None:
-    with pytest.raises(UnknownNameError, match="no teacher is called 'liner'; did you mean 'linear'"):
+    with pytest.raises(UnknownNameError, match="no curriculum is called 'liner'; did you mean 'linear'"):
         make_teacher(spec("liner"))
 
 
