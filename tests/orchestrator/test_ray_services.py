@@ -20,7 +20,7 @@ tasks: [{name: two-state, deploy_limits: 3, options: {horizon: 10}}]
 agents: [{name: ppo-lag, options: {hidden_sizes: [8]}}]
 methods: [linear]
 seeds: 1
-run: {total_steps: 16_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
+run: {total_steps: 24_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
 """
 COMMAND = [
     sys.executable,
