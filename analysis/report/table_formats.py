@@ -73,7 +73,7 @@ def row_kinds(rows: pd.DataFrame) -> list[str]:
     Args:
         rows: seeds and feasible_seeds, as in ``metrics.summary``.
     """
-    return ["infeasible" if row.feasible_seeds < row.seeds else "" for row in rows.itertuples()]
+    return ["infeasible" if infeasible else "" for infeasible in rows["feasible_seeds"] < rows["seeds"]]
 
 
 def names_of(row: pd.Series) -> dict[str, str]:

@@ -137,7 +137,7 @@ def test_final_policies_lie_under_the_frontier_left_of_the_shaded_region(finishe
     panel = figure.axes[0]
     frontier = np.asarray(lines_of(panel, OPTIMUM_COLOUR)[0].get_xydata())
     assert [5.0, 14.0] in frontier.tolist()
-    feasible = [len(np.asarray(marks.get_facecolors())) for marks in panel.collections]
+    feasible = [len(np.asarray(marks.get_facecolor())) for marks in panel.collections]
     assert feasible[:2] == [3, 3]  # filled
     runs = [np.asarray(marks.get_offsets()).tolist() for marks in panel.collections]
     assert runs[0] == [[4.8, 8.0], [0.5, -15.0], [0.5, -15.0]]  # none

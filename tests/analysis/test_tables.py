@@ -46,15 +46,16 @@ def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
 
 
 def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark(finished: Sweep) -> None:
-    rows = metrics.outcomes(finished).query("seed == 0")
+    rows = metrics.outcomes(finished)
+    rows = rows[rows["seed"] == 0]
     compared = metrics.comparisons(rows, np.random.default_rng(0))
     chosen = table_formats.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
     assert table_formats.row_kinds(chosen) == [""] * len(chosen)
     chosen.loc[0, "feasible_seeds"] = 0
     table = table_formats.comparison_table(chosen)
     assert table_formats.row_kinds(chosen)[:2] == ["infeasible", ""]
-    assert table.loc[0, ["return gained", "P(higher return)"]].tolist() == ["–", "–"]
-    assert "–" not in table.loc[1].tolist()
+    assert list(table[["return gained", "P(higher return)"]].iloc[0]) == ["–", "–"]
+    assert "–" not in list(table.iloc[1])
     assert not table["P(higher return)"].str.contains("†").any()
 
 
