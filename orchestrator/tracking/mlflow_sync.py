@@ -32,6 +32,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter
+from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
 from recrl.orchestrator.tracking.positions import exclusive, sync_folder
 from recrl.orchestrator.tracking.runs import SweepRuns
 from recrl.orchestrator.tracking.sweep_sync import SweepSync
@@ -146,8 +147,9 @@ class _View:
             folder = sync_folder(store, uri)
             for path in (folder / "sweep.json", *folder.glob("trial-*.json")):
                 path.unlink(missing_ok=True)
-        self.trials = TrialSync(store, uri, self.runs)
-        self.sweep = SweepSync(store, uri, self.runs, self.trials.summary, write_export)
+        outcomes = FinalOutcomes(store)
+        self.trials = TrialSync(store, uri, self.runs, outcomes)
+        self.sweep = SweepSync(store, uri, self.runs, self.trials.summary, write_export, outcomes=outcomes)
 
 
 @contextmanager

@@ -3,11 +3,13 @@
 Metrics are over environment steps; the part before the slash is the UI's chart section:
 
     train/return, train/cost_0            means over the episodes of an update, training phase
-    train/episodes                        their number
+    perf/episodes                         their number
     deploy/return, deploy/cost_0, ...     the same, deployment phase
     curriculum/limit_0, curriculum/noise  output of the curriculum; also curriculum/temperature, if any
     agent/<name>                          metrics of the agent: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
+    final/return, final/cost_0, final/limit_0    the final policy as in the report (``final_outcomes``): exact
+                                          where the task is finite; once, after the report was drawn
     summary/deploy_return, ..._cost_0     mean over the episodes of the deployment phase; once, at the end
     evaluation/<policy>_return, ..._cost_0    mean over the final evaluation's episodes; once, at the end
 
@@ -37,6 +39,7 @@ from recrl.orchestrator.spec import TrialSpec
 POINTS_PER_METRIC = 100
 MAX_PARAMS = 100  # in one request
 MAX_NOTE = 7_500  # characters; MLflow takes 8,000 in a tag
+MAX_VERDICTS = 5_000  # of them, for the table of verdicts
 
 VIEW = "recrl"  # key of the prepared chart view
 
@@ -49,7 +52,8 @@ VIEW_STATE = {
     "runsHiddenMode": "SHOW_ALL",
     "selectedColumns": [
         *(f"params.`{name}`" for name in ("task", "agent", "method")),
-        *(f"metrics.`{name}`" for name in ("summary/deploy_return", "summary/deploy_cost_0")),
+        *(f"metrics.`{name}`" for name in ("final/return", "final/cost_0", "final/limit_0")),
+        "tags.`recrl.verdict`",
     ],
     "compareRunCharts": [],
     "compareRunSections": [
@@ -61,7 +65,7 @@ VIEW_STATE = {
             "deleted": False,
             "isGenerated": True,
         }
-        for name in ("train", "curriculum", "deploy", "summary", "evaluation", "agent", "perf")
+        for name in ("final", "train", "curriculum", "deploy", "summary", "evaluation", "agent", "perf")
     ],
     "isAccordionReordered": True,
 }
@@ -131,7 +135,7 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
     section = "train" if row["phase"] == Phase.TRAINING else "deploy"
     values = {
         f"{section}/return": float(row["episode_return"]),
-        f"{section}/episodes": float(row["episodes"]),
+        "perf/episodes": float(row["episodes"]),
         "curriculum/noise": float(row["noise"]),
     }
     cpu_seconds = float(row["collect_seconds"]) + float(row["update_seconds"])
@@ -144,7 +148,7 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
             values[f"curriculum/{column}"] = float(row[column])
         else:
             values[f"agent/{_safe(column)}"] = float(row[column])
-    return _points(values, row)
+    return points_of(values, row)
 
 
 def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row) -> list[Point]:
@@ -165,7 +169,7 @@ def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row)
             values[f"summary/deploy_{name}"] = total / int(deployed["episodes"].sum())
         for policy, episodes in evaluation.groupby("policy"):
             values[f"evaluation/{policy}_{name}"] = float(episodes[column].mean())
-    return _points(values, last_row)
+    return points_of(values, last_row)
 
 
 def params(spec: TrialSpec) -> dict[str, str]:
@@ -206,21 +210,42 @@ def charts_page(experiment_id: str) -> str:
     return f"{page}&compareRunsMode=CHART&workflowType=machine_learning"
 
 
-def note(name: str, counts: Mapping[str, int], complete: Sequence[Summary], *, charts: str) -> str:
-    """Return the sweep's note in Markdown: its progress, and a row for each group with complete trials.
+def report_page(experiment_id: str, run_id: str) -> str:
+    """Return the address of the report among a run's artifacts, after the ``#`` of the UI's address."""
+    return f"/experiments/{experiment_id}/runs/{run_id}/artifacts/figures/report.html"
+
+
+def note(
+    name: str,
+    counts: Mapping[str, int],
+    complete: Sequence[Summary],
+    *,
+    charts: str,
+    verdicts: Sequence[str] = (),
+    report: str = "",
+) -> str:
+    """Return the sweep's note in Markdown: verdicts, progress, and a row for each group with complete trials.
 
     Args:
         name: the sweep.
         counts: number of trials by status: complete, running, ...
         complete: one for each complete trial.
         charts: address of the page of charts.
+        verdicts: lines of the table of verdicts; empty before the report is drawn.
+        report: address of the report, or empty.
     """
     total = sum(counts.values())
     states = ", ".join(f"{count} {state}" for state, count in counts.items() if count) or "none yet"
-    lines = [
+    kept = list(verdicts)
+    while sum(map(len, kept)) + len(kept) > MAX_VERDICTS:
+        kept.pop()
+    cut = ["", "More verdicts than fit here: see the report."] if len(kept) < len(verdicts) else []
+    linked = [f"[Report]({report})", ""] if report else []
+    lines = [*kept, *cut, *([""] if kept else []), *linked]
+    lines.append(
         f"**{name}**: {total} trials ({states}). [Charts, seeds averaged]({charts}); "
         "the figures are artifacts of this run."
-    ]
+    )
     names = sorted({value.removeprefix("summary/") for trial in complete for value in trial.values})
     if names:
         heads = ["task", "agent", "method", "seeds", *(value.replace("_", " ") for value in names)]
@@ -240,7 +265,8 @@ def note(name: str, counts: Mapping[str, int], complete: Sequence[Summary], *, c
     return "\n".join(lines)
 
 
-def _points(values: Mapping[str, float], row: Row) -> list[Point]:
+def points_of(values: Mapping[str, float], row: Row) -> list[Point]:
+    """Return the finite values as points at the time and step of a row of ``updates.csv``."""
     milliseconds, step = round(float(row["time"]) * 1000), int(row["end_step"])
     return [
         Point(key, value, milliseconds, step) for key, value in sorted(values.items()) if math.isfinite(value)

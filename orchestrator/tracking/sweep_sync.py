@@ -12,7 +12,8 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
-from recrl.orchestrator.tracking.points import Summary, charts_page, note
+from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes, verdict_lines
+from recrl.orchestrator.tracking.points import Summary, charts_page, note, report_page
 from recrl.orchestrator.tracking.positions import Position, read_position, sync_folder
 from recrl.orchestrator.tracking.runs import SweepRuns
 
@@ -27,6 +28,8 @@ class SweepSync:
         runs: SweepRuns,
         summary: Callable[[TrialStore], Summary | None],
         write_export: ExportWriter | None,
+        *,
+        outcomes: FinalOutcomes,
     ) -> None:
         """Continue from the position of an earlier process.
 
@@ -36,7 +39,9 @@ class SweepSync:
             runs: its runs.
             summary: returns the means of a trial that is complete.
             write_export: writes the export file; None to upload none.
+            outcomes: of the final policies.
         """
+        self._outcomes = outcomes
         self._store = store
         self._runs = runs
         self._summary = summary
@@ -75,6 +80,8 @@ class SweepSync:
             {status: counts[status] for status in DisplayStatus},
             list(summaries),
             charts=f"#{charts_page(self._runs.experiment_id)}",
+            verdicts=verdict_lines(self._outcomes.all()),
+            report=self._report(),
         )
         if position.shown.get("note") != text:
             self._runs.client.log_batch(position.run_id, tags=[RunTag("mlflow.note.content", text)])
@@ -82,6 +89,12 @@ class SweepSync:
             last = max((record.heartbeat for record in records.values()), default=0.0)
             self._runs.set_status(position.run_id, status, last or time.time())
         return replace(position, shown={**position.shown, "note": text, "status": status})
+
+    def _report(self) -> str:
+        """Return the address of the report in MLflow, or empty before it is drawn."""
+        if not (self._store.figures_folder / "report.html").exists():
+            return ""
+        return f"#{report_page(self._runs.experiment_id, self._runs.parent_id)}"
 
     def _records(self) -> dict[str, TrialRecord]:
         """Return the records of all trials by folder name, also of trials that were never started."""

@@ -19,6 +19,7 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
+from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, trial_note
 from recrl.orchestrator.tracking.points import (
     Point,
     Row,
@@ -26,6 +27,7 @@ from recrl.orchestrator.tracking.points import (
     final_points,
     params,
     points,
+    points_of,
     rows_after,
     thinned,
 )
@@ -41,8 +43,9 @@ MAX_ERROR = 5_000  # characters of a failed trial's error
 class TrialSync:
     """Sync of trials to their runs; it keeps the sent positions between passes."""
 
-    def __init__(self, store: SweepStore, uri: str, runs: SweepRuns) -> None:
+    def __init__(self, store: SweepStore, uri: str, runs: SweepRuns, outcomes: FinalOutcomes) -> None:
         self._runs = runs
+        self._outcomes = outcomes
         self._folder = sync_folder(store, uri)
         self._positions: dict[str, Position] = {}
 
@@ -55,7 +58,8 @@ class TrialSync:
         record = trial.record()
         if record.status is TrialState.DAMAGED:
             raise DamagedError(record.error)
-        shown = _shown(trial, record, live=live)
+        outcome = self._outcomes.of(trial.spec) if record.status is TrialState.COMPLETE else None
+        shown = _shown(trial, record, outcome, live=live)
         position = self._position(trial, record)
         if position.shown == shown:
             return 0
@@ -66,9 +70,9 @@ class TrialSync:
             self._runs.delete(position.run_id)
             position = Position(self._runs.create(trial, record))
         new_points, position = _points_to_send(
-            trial, data, position, is_finished=shown["status"] == "FINISHED"
+            trial, data, position, outcome, is_finished=shown["status"] == "FINISHED"
         )
-        position = self._send(trial, record, position, new_points)
+        position = self._send(trial, record, position, new_points, outcome)
         if position.shown.get("status") != shown["status"]:
             self._runs.set_status(position.run_id, shown["status"], record.heartbeat)
         self._save(trial, replace(position, shown=shown))
@@ -83,7 +87,12 @@ class TrialSync:
         return Summary((spec.task.label, spec.agent.label, spec.method.label), position.summary)
 
     def _send(
-        self, trial: TrialStore, record: TrialRecord, position: Position, new_points: Sequence[Point]
+        self,
+        trial: TrialStore,
+        record: TrialRecord,
+        position: Position,
+        new_points: Sequence[Point],
+        outcome: FinalOutcome | None,
     ) -> Position:
         """Send points, params, tags and files.
 
@@ -102,7 +111,12 @@ class TrialSync:
         except OSError:  # points may fit even if there is no room for files
             client.log_batch(run_id, metrics=metrics, params=told)
             raise
-        tags = [RunTag(key, value) for key, value in state_tags(record).items()]
+        told_tags = state_tags(record)
+        if outcome is not None:
+            start = record.start_limits or list(trial.spec.train_limits)
+            text = trial_note(outcome, [float(limit) for limit in start])
+            told_tags |= {"recrl.verdict": outcome.verdict, "mlflow.note.content": text}
+        tags = [RunTag(key, value) for key, value in told_tags.items()]
         client.log_batch(run_id, metrics=metrics, params=told, tags=tags)
         self._runs.without_params.discard(run_id)
         if position.shown.get("error") and not record.error:
@@ -130,9 +144,12 @@ class TrialSync:
         self._positions[trial.folder.name] = position
 
 
-def _shown(trial: TrialStore, record: TrialRecord, *, live: bool) -> dict[str, Any]:
+def _shown(
+    trial: TrialStore, record: TrialRecord, outcome: FinalOutcome | None, *, live: bool
+) -> dict[str, Any]:
     """Return the content of the run besides points; nothing is sent while it does not change."""
-    return {
+    known = {} if outcome is None else {"outcome": repr(outcome)}
+    return known | {
         "status": mlflow_status(record, live=live),
         "attempt": record.attempt,
         "committed": record.committed.get(trial.updates_path.name, 0),
@@ -160,14 +177,17 @@ def _committed_rows(trial: TrialStore, record: TrialRecord) -> bytes | None:
 
 
 def _points_to_send(
-    trial: TrialStore, data: bytes, position: Position, *, is_finished: bool
+    trial: TrialStore, data: bytes, position: Position, outcome: FinalOutcome | None, *, is_finished: bool
 ) -> tuple[list[Point], Position]:
     """Return the points after a position, those of a finished trial's end, and the new position."""
     if is_finished:
         trial.require_whole()
     found, position = _new_points(trial, data, position)
     if is_finished and position.last_row:
-        last = final_points(trial.updates(), trial.evaluation(), _last_row(data, position))
+        row = _last_row(data, position)
+        last = final_points(trial.updates(), trial.evaluation(), row)
+        if outcome is not None:
+            last += points_of(outcome.metrics, row)
         summary = {point.key: point.value for point in last if point.key.startswith("summary/")}
         found, position = [*found, *last], replace(position, summary=summary)
     return found, position

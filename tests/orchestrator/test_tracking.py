@@ -107,7 +107,7 @@ def test_points_are_sorted_into_chart_sections(made_up_sweep: Callable[..., Swee
     }
     assert {point.key: point.value for point in points(row, spec)} == {
         "train/return": -1.5,
-        "train/episodes": 3.0,
+        "perf/episodes": 3.0,
         "curriculum/noise": 0.0,
         "perf/steps_per_second": pytest.approx(400 / 0.4),
         "agent/kl": 0.01,
@@ -479,6 +479,49 @@ def test_figures_are_artifacts_of_the_parent_and_survive_a_rebuild(write: Callab
     sync(store, uri, rebuild=True)
     parent = runs(store)["made-up"].info.run_id
     assert [file.path for file in connect(store).list_artifacts(parent, "figures")] == ["figures/curves.png"]
+
+
+OUTCOMES = """\
+task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal
+river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False
+river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True
+river-a,cpo,dynamic,0,stochastic,True,15.0,9.0625,5.0,False,False
+"""
+
+
+def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]) -> None:
+    """The values come from the table beside the report, so both show the same."""
+    store = write()
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    assert "final/return" not in runs(store)[NONE].data.metrics
+    store.figures_folder.mkdir()
+    (store.figures_folder / "outcomes.csv").write_text(OUTCOMES)
+    (store.figures_folder / "report.html").write_text("<p>")
+    sync(store, uri)
+    shown = runs(store)
+    parent, run = shown["made-up"], shown[DYNAMIC]
+    final = {key: value for key, value in run.data.metrics.items() if key.startswith("final/")}
+    assert final == {"final/return": 15.0, "final/cost_0": 9.0625, "final/limit_0": 5.0}
+    assert [shown[name].data.tags["recrl.verdict"] for name in (NONE, DYNAMIC)] == ["solved", "infeasible"]
+    assert run.data.tags["mlflow.note.content"].startswith(
+        "**infeasible by 4.06**: return 15.00, cost 9.062, limit d_d 5.00, training limit d_t 100.00."
+    )
+    lines = parent.data.tags["mlflow.note.content"].splitlines()
+    assert lines[0].startswith("| task | agent | curriculum | verdict |")
+    assert lines[3] == "| river-a | cpo | dynamic | infeasible by 4.06 | 9.062 | 5.00 | 15.00 | 1 |"
+    page = f"#/experiments/{parent.info.experiment_id}/runs/{parent.info.run_id}/artifacts"
+    assert lines[5] == f"[Report]({page}/figures/report.html)"
+    assert sync(store, uri).points == 0
+    sync(store, uri, rebuild=True)
+    assert runs(store)[NONE].data.metrics["final/cost_0"] == 5.0
+
+
+def test_a_long_table_of_verdicts_leaves_room_for_the_rest() -> None:
+    rows = [f"| task-{index} | cpo | none | solved | 5.00 | 5.00 | 9.50 | 1 |" for index in range(999)]
+    text = note("demo", {"complete": 999}, [], charts="#/charts", verdicts=rows, report="#/report")
+    assert len(text) < 8000
+    assert "More verdicts than fit here: see the report.\n\n[Report](#/report)\n\n**demo**: 999" in text
 
 
 def test_what_is_filmed_after_a_trials_end_reaches_its_run(write: Callable[..., SweepStore]) -> None:

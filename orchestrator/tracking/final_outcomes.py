@@ -1,0 +1,188 @@
+"""Outcome of each trial's final policy, by the same measure as in the report.
+
+The process that draws the report writes ``outcomes.csv`` beside it. This module reads that file. So MLflow
+and the report show the same numbers, and this package does not import the analysis. A trial has an outcome
+once it is complete and the report has been drawn: at the latest at the end of a launch with figures.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.tracking.positions import file_mark
+
+FILE_NAME = "outcomes.csv"  # in the sweep's figures folder
+MEASURE = "stochastic"  # the measure of the report's verdicts
+SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
+
+
+@dataclass(frozen=True)
+class FinalOutcome:
+    """Outcome of one final policy (stochastic, without learning).
+
+    Attributes:
+        group: labels of task, agent and curriculum.
+        seed: of the trial.
+        episode_return: exact where ``exact``, else a mean over episodes.
+        costs: episode costs, likewise, [k].
+        limits: d_d, [k].
+        is_feasible: whether every cost is within its limit and the tolerance.
+        is_solved: whether it is also near a known optimum.
+        exact: whether the values were computed, not sampled.
+    """
+
+    group: tuple[str, str, str]
+    seed: int
+    episode_return: float
+    costs: tuple[float, ...]
+    limits: tuple[float, ...]
+    is_feasible: bool
+    is_solved: bool
+    exact: bool
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in one word, as in the report."""
+        return SOLVED if self.is_solved else FEASIBLE if self.is_feasible else INFEASIBLE
+
+    @property
+    def excess(self) -> float:
+        """Largest cost above its limit."""
+        return max((cost - limit for cost, limit in zip(self.costs, self.limits, strict=True)), default=0.0)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """The values by the names of their metrics."""
+        values = {"final/return": self.episode_return}
+        for i, (cost, limit) in enumerate(zip(self.costs, self.limits, strict=True)):
+            values |= {f"final/cost_{i}": cost, f"final/limit_{i}": limit}
+        return values
+
+
+class FinalOutcomes:
+    """The outcomes of a sweep's complete trials, read again when their file changes."""
+
+    def __init__(self, store: SweepStore) -> None:
+        """Read nothing yet.
+
+        Args:
+            store: the sweep.
+        """
+        self._path = store.figures_folder / FILE_NAME
+        self._mark = ""
+        self._found: dict[tuple[str, str, str, int], FinalOutcome] = {}
+
+    def of(self, spec: TrialSpec) -> FinalOutcome | None:
+        """Return the outcome of a trial; None before the report has it."""
+        self._refresh()
+        method = spec.method.label
+        for label in (method, f"{method} [{spec.group}]"):  # the report adds the group to equal labels
+            found = self._found.get((spec.task.label, spec.agent.label, label, spec.seed))
+            if found is not None:
+                return found
+        return None
+
+    def all(self) -> Sequence[FinalOutcome]:
+        """Return all outcomes, in the report's order."""
+        self._refresh()
+        return list(self._found.values())
+
+    def _refresh(self) -> None:
+        try:
+            mark = file_mark(self._path)
+            if mark == self._mark:
+                return
+            with self._path.open(encoding="utf-8", newline="") as file:
+                rows = [row for row in csv.DictReader(file) if row.get("measure") == MEASURE]
+            outcomes = list(map(_outcome, rows))
+        except FileNotFoundError:
+            mark, outcomes = "", []
+        except (KeyError, TypeError, ValueError):  # another version wrote it, or it is being written
+            return
+        self._mark = mark
+        self._found = {(*it.group, it.seed): it for it in outcomes}
+
+
+def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
+    """Return the description of a trial's run in Markdown: verdict, return, cost, limit, d_t.
+
+    Args:
+        outcome: of its final policy.
+        start_limits: the d_t that its curriculum began with, [k].
+    """
+    how = "computed exactly" if outcome.exact else "means over sampled episodes"
+    by = f" by {_text(outcome.excess)}" if outcome.verdict == INFEASIBLE else ""
+    costs = _listed(outcome.costs, digits=3)
+    return (
+        f"**{outcome.verdict}{by}**: return {_text(outcome.episode_return)}, cost {costs}, "
+        f"limit d_d {_listed(outcome.limits)}, training limit d_t {_listed(start_limits)}.\n\n"
+        f"These are the metrics `final/...` of the final policy (stochastic, without learning), {how}, as in "
+        "the report. `evaluation/...` are means over sampled episodes of the same policy. "
+        "`summary/deploy_...` averages the deployment phase, in which learning goes on."
+    )
+
+
+def verdict_lines(outcomes: Sequence[FinalOutcome]) -> list[str]:
+    """Return the table of verdicts in Markdown, one row per task, agent and curriculum.
+
+    Args:
+        outcomes: of all complete trials.
+    """
+    groups: dict[tuple[str, str, str], list[FinalOutcome]] = {}
+    for outcome in outcomes:
+        groups.setdefault(outcome.group, []).append(outcome)
+    if not groups:
+        return []
+    heads = ("task", "agent", "curriculum", "verdict", "cost", "limit", "return", "n")
+    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
+    for group, seeds in groups.items():
+        costs = [_mean(values) for values in zip(*(it.costs for it in seeds), strict=True)]
+        cells = (_verdicts(seeds), _listed(costs, digits=3), _listed(seeds[0].limits))
+        earned = _text(_mean([it.episode_return for it in seeds]))
+        lines.append("| " + " | ".join([*group, *cells, earned, str(len(seeds))]) + " |")
+    return lines
+
+
+def _verdicts(seeds: Sequence[FinalOutcome]) -> str:
+    """Count the verdicts of a group's seeds: ``solved 2 of 5, infeasible 3 of 5 by up to 0.28``."""
+    parts = []
+    for verdict in (SOLVED, FEASIBLE, INFEASIBLE):
+        chosen = [it for it in seeds if it.verdict == verdict]
+        if chosen:
+            count = f" {len(chosen)} of {len(seeds)}" if len(chosen) < len(seeds) else ""
+            up_to = "up to " if len(chosen) > 1 else ""
+            by = f" by {up_to}{_text(max(it.excess for it in chosen))}" if verdict == INFEASIBLE else ""
+            parts.append(f"{verdict}{count}{by}")
+    return ", ".join(parts)
+
+
+def _outcome(row: Mapping[str, str]) -> FinalOutcome:
+    costs = sorted(name for name in row if re.fullmatch(r"cost_\d+", name) and row[name])
+    return FinalOutcome(
+        group=(row["task"], row["agent"], row["method"]),
+        seed=int(row["seed"]),
+        episode_return=float(row["episode_return"]),
+        costs=tuple(float(row[name]) for name in costs),
+        limits=tuple(float(row[f"deploy_limit_{name.removeprefix('cost_')}"]) for name in costs),
+        is_feasible=row["feasible"] == "True",
+        is_solved=row["optimal"] == "True",
+        exact=row["exact"] == "True",
+    )
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values)
+
+
+def _listed(values: Sequence[float], *, digits: int = 2) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
+def _text(value: float) -> str:
+    return f"{value:.3f}" if 0.0 < abs(value) < 0.1 else f"{value:.2f}"
