@@ -23,10 +23,9 @@ environment, and checks that the last observation is the same.
 from __future__ import annotations
 
 import copy
-import difflib
 import functools
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -37,7 +36,7 @@ from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
-from recrl.environments.plugins import import_module, require_trust
+from recrl.environments.plugins import check_keywords, import_module, require_trust
 from recrl.environments.vector import CMDPVectorEnv
 
 Environment = gymnasium.Env[Any, Any]
@@ -327,9 +326,8 @@ def make_from_callable(
     Raises:
         ValueError: the callable does not take an option.
     """
-    keywords = options.model_dump()
-    _check_keywords(factory, name, keywords)
-    return SyncCMDPVectorEnv(name, [functools.partial(factory, **keywords)] * num_envs)
+    check_keywords(factory, name, options.model_dump())
+    return SyncCMDPVectorEnv(name, [functools.partial(factory, **options.model_dump())] * num_envs)
 
 
 def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
@@ -346,23 +344,6 @@ def draw_from_callable(factory: Callable[..., Environment], name: str, options: 
     if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
         keywords["render_mode"] = "rgb_array"
     return factory(**keywords)
-
-
-def _check_keywords(factory: Callable[..., Environment], name: str, keywords: Mapping[str, Any]) -> None:
-    """Check that a callable takes the keywords; its signature has the known ones."""
-    try:
-        parameters = inspect.signature(factory).parameters.values()
-    except (TypeError, ValueError):  # a callable without a signature
-        return
-    if any(each.kind is each.VAR_KEYWORD for each in parameters):
-        return
-    known = [each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
-    for key in keywords:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            options = f"its options: {', '.join(known)}" if known else "it has no options"
-            raise ValueError(f"{name} takes no option {key!r}{hint} ({options})")
 
 
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):

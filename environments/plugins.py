@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import inspect
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -154,9 +155,36 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
         require_trust(name)
         return load_attribute(name)
     known = sorted({*ours, *plugged})
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
     raise UnknownNameError(
-        f"no {kind} is called {name!r}{hint} "
+        f"no {kind} is called {name!r}{nearest(name, known)} "
         f"(known: {', '.join(known)}; or an import path package.module:attribute)"
     )
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """Return ``; did you mean 'window'?``, or nothing if no known name is near."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def check_keywords(function: Callable[..., Any], name: str, keywords: Mapping[str, Any]) -> None:
+    """Check that a user's callable takes the keywords, as far as its signature says.
+
+    Args:
+        function: the callable.
+        name: of what it makes, for the error.
+        keywords: the options for it.
+
+    Raises:
+        ValueError: it takes no such option.
+    """
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # a callable without a signature
+        return
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return
+    known = [each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
+    for key in (key for key in keywords if key not in known):
+        options = f"its options: {', '.join(known)}" if known else "it has no options"
+        raise ValueError(f"{name} takes no option {key!r}{nearest(key, known)} ({options})")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from recrl.environments.plugins import nearest
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import read_name
 from recrl.orchestrator.remote.remote_sweep import sweeps_at
-from recrl.orchestrator.validation import nearest
 
 EXPORT_SUFFIX = ".zip"
 

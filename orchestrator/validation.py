@@ -6,7 +6,6 @@ nearest known one.
 
 from __future__ import annotations
 
-import difflib
 import json
 import typing
 from collections.abc import Iterator, Mapping
@@ -14,6 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from recrl.environments.plugins import nearest
 from recrl.orchestrator.located_yaml import Place
 
 _SENTENCES: Mapping[str, str] = {
@@ -89,12 +89,6 @@ def as_written(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def nearest(name: str, known: list[str]) -> str:
-    """Return ``; did you mean 'window'?``, or nothing if no known name is near."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
-
-
 def _unknown_key(key: str, known: list[str]) -> str:
     hint = nearest(key, known) or (f" (known: {', '.join(known)})" if known else "")
     return f"unknown key{hint}"
@@ -109,3 +103,19 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
         if found is not None:
             return found
     return None
+
+
+class NotJsonError(Exception):
+    """A value cannot be written as JSON."""
+
+
+def require_json(value: Mapping[str, Any]) -> None:
+    """Check that a mapping can be written as JSON.
+
+    Raises:
+        NotJsonError: it holds other values, or numbers that are not finite.
+    """
+    try:
+        json.dumps(value, allow_nan=False)
+    except ValueError as error:
+        raise NotJsonError(str(error)) from error

@@ -156,7 +156,7 @@ class RecentEpisodes:
     def __init__(self, window: int, num_costs: int) -> None:
         self._window = window
         self._updates: list[tuple[Floats, npt.NDArray[np.int64]]] = []
-        self._nothing = np.empty((0, num_costs)), np.empty(0, np.int64)
+        self._no_costs = np.empty((0, num_costs))
 
     def add(self, costs: Floats, lengths: npt.NDArray[np.int64]) -> Episodes:
         """Include the episodes that finished in an update, and return those of the window.
@@ -169,14 +169,20 @@ class RecentEpisodes:
             self._updates.append((costs, lengths))
         while sum(len(each) for each, _ in self._updates[1:]) >= self._window:
             del self._updates[0]
-        state = self.state_dict()
-        return Episodes(state["costs"], state["lengths"], len(costs))
+        return Episodes(*self._window_of_episodes(), len(costs))
+
+    def _window_of_episodes(self) -> tuple[Floats, npt.NDArray[np.int64]]:
+        """Return costs [E, k] and lengths [E] of all episodes of the window."""
+        costs = [self._no_costs, *(costs for costs, _ in self._updates)]
+        lengths = [np.empty(0, np.int64), *(lengths for _, lengths in self._updates)]
+        return np.concatenate(costs), np.concatenate(lengths)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the window's episodes, and the number of episodes of each of its updates."""
+        costs, lengths = self._window_of_episodes()
         return {
-            "costs": np.concatenate([self._nothing[0], *(costs for costs, _ in self._updates)]),
-            "lengths": np.concatenate([self._nothing[1], *(lengths for _, lengths in self._updates)]),
+            "costs": costs,
+            "lengths": lengths,
             "episodes": np.array([len(costs) for costs, _ in self._updates], np.int64),
         }
 

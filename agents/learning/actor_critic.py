@@ -84,7 +84,7 @@ class ActorCritic:
         self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
-        self._measure = (
+        self._constraint = (
             TailCost(config.cvar_level, cmdp.num_costs)
             if config.constraint == "cvar"
             else MeanCost(config.constraint_window)
@@ -95,7 +95,7 @@ class ActorCritic:
             "critic_optimiser": self._critic_optimiser,
             "value_scale": self._value_scale,
             "recent_episodes": self._recent,
-            "constraint": self._measure,
+            "constraint": self._constraint,
             **rule.parts,
         }
 
@@ -144,7 +144,7 @@ class ActorCritic:
             most_observations=config.minibatch_size,
         )
         episodes = self._recent.add(episode_costs, rollout.finished_lengths())
-        measured = self._measure.measure(rollout, episodes, limits)
+        measured = self._constraint.measure(rollout, episodes, limits)
         estimates = self._estimate(rollout, measured.step_costs, batch)
         advantages = estimates.advantages
         constraints = Constraints.of(measured, episodes.lengths, limits)

@@ -17,11 +17,11 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticUndefined
 
 from recrl.agents.registry import AGENTS, find_agent
-from recrl.environments.plugins import UnknownNameError
+from recrl.environments.plugins import UnknownNameError, nearest
 from recrl.environments.registry import TASKS, find_task, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.grid.file_models import Entry, Limits, Resources, Run, TaskEntry
-from recrl.orchestrator.validation import model_in, nearest
+from recrl.orchestrator.validation import model_in
 from recrl.teachers.registry import TEACHERS, find_teacher
 
 REQUIRED = "required"

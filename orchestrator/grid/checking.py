@@ -19,7 +19,6 @@ budget, T ``rollout_steps``. Limits are undiscounted costs per episode.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -29,22 +28,15 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from recrl.agents.registry import agent_config
 from recrl.environments.cmdp import CMDPSpec, CostLimits
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError, trusted_attribute
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError, nearest, trusted_attribute
 from recrl.environments.registry import task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
 from recrl.orchestrator.grid.building import TASK_MARK, BuildError, build_own, cmdp_of
 from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
-from recrl.orchestrator.grid.file_models import (
-    Entry,
-    GridFile,
-    Limits,
-    Run,
-    SweepName,
-    TaskEntry,
-)
+from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, SweepName, TaskEntry
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice
-from recrl.orchestrator.validation import as_written, nearest, sentences
+from recrl.orchestrator.validation import NotJsonError, as_written, require_json, sentences
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000
@@ -122,10 +114,6 @@ def _read(path: Path) -> bytes:
         raise GridError([f"{path}: {missing(path)}"]) from error
     except (OSError, ValueError) as error:
         raise GridError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from error
-
-
-class NotJsonError(Exception):
-    """The options cannot be written as JSON."""
 
 
 class _Check:
@@ -234,7 +222,7 @@ class _Check:
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
         try:
             options = options_of(entry.name, entry.options).model_dump(mode="json")
-            _require_json(options)
+            require_json(options)
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
                 self.add((*place, "options", *inner), sentence)
@@ -398,13 +386,6 @@ def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:
         return type(options_of(name, {}))
     except (ValidationError, *USERS_ERRORS):
         return None
-
-
-def _require_json(options: Mapping[str, Any]) -> None:
-    try:
-        json.dumps(options, allow_nan=False)
-    except ValueError as error:
-        raise NotJsonError(str(error)) from error
 
 
 def _items(value: Any) -> list[Any]:

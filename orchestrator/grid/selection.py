@@ -60,7 +60,7 @@ def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> t
     Raises:
         RecrlError: no trial of the grid has a given key or value.
     """
-    from recrl.orchestrator.validation import nearest  # noqa: PLC0415  (imports pydantic)
+    from recrl.environments.plugins import nearest  # noqa: PLC0415
 
     for key, values in wanted.items():
         if key not in SELECTABLE:

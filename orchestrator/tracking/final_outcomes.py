@@ -66,14 +66,13 @@ class FinalOutcome:
 
 
 class FinalOutcomes:
-    """The outcomes of a sweep's complete trials, read again when their file changes."""
+    """The outcomes of a sweep's complete trials, as of the last report; read again when the file changes.
+
+    Args:
+        store: the sweep.
+    """
 
     def __init__(self, store: SweepStore) -> None:
-        """Read nothing yet.
-
-        Args:
-            store: the sweep.
-        """
         self._path = store.figures_folder / FILE_NAME
         self._mark = ""
         self._found: dict[tuple[str, str, str, int], FinalOutcome] = {}
