@@ -26,6 +26,7 @@ from recrl.environments.cmdp import CostLimits, Floats
 from recrl.environments.registry import optimal_return
 
 COST, LIMIT = "shown_cost", "shown_limit"  # columns of the cost in a row of panels
+FILL = 0.4  # opacity of the marks of feasible policies; the others are white inside
 FAR_COST = 10.0  # times the limit: points beyond are drawn at the right edge
 
 
@@ -144,7 +145,7 @@ def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far
             chosen["episode_return"].to_numpy(np.float64),
             s=(9.0 - 1.3 * min(position, 5)) ** 2,
             marker=style.marker,
-            facecolors=[style.colour if feasible else "none" for feasible in chosen["feasible"]],
+            facecolors=[(style.colour, FILL) if feasible else "white" for feasible in chosen["feasible"]],
             edgecolors=style.colour,
             linewidths=1.1,
             clip_on=False,

@@ -74,7 +74,7 @@ tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
   pre { white-space: pre-wrap; font-size: 7pt; }
   figure, tr { break-inside: avoid; }
   h2, summary { break-after: avoid; }
-  details { break-before: auto; }
+  details { border-top: 0; }
 }
 """
 NAMES = ("task", "agent", "curriculum")
