@@ -241,15 +241,16 @@ def note(
         kept.pop()
     cut = ["", "More verdicts than fit here: see the report."] if len(kept) < len(verdicts) else []
     linked = [f"[Report]({report})", ""] if report else []
-    lines = [*kept, *cut, *([""] if kept else []), *linked]
+    head = ["**Final policies** (stochastic, without learning), as in the report:", ""] if kept else []
+    lines = [*head, *kept, *cut, *([""] if kept else []), *linked]
     lines.append(
         f"**{name}**: {total} trials ({states}). [Charts, seeds averaged]({charts}); "
         "the figures are artifacts of this run."
     )
     names = sorted({value.removeprefix("summary/") for trial in complete for value in trial.values})
     if names:
-        heads = ["task", "agent", "method", "seeds", *(value.replace("_", " ") for value in names)]
-        lines += ["", "Means over the deployment phase of complete trials:", ""]
+        heads = ["task", "agent", "curriculum", "n", *(value.replace("_", " ") for value in names)]
+        lines += ["", "**Deployment phase**, in which learning goes on: means over complete trials.", ""]
         lines += ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for group in sorted({trial.group for trial in complete}):
         trials = [trial.values for trial in complete if trial.group == group]

@@ -508,10 +508,11 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
         "**infeasible by 4.06**: return 15.00, cost 9.062, limit d_d 5.00, training limit d_t 100.00."
     )
     lines = parent.data.tags["mlflow.note.content"].splitlines()
-    assert lines[0].startswith("| task | agent | curriculum | verdict |")
-    assert lines[3] == "| river-a | cpo | dynamic | infeasible by 4.06 | 9.062 | 5.00 | 15.00 | 1 |"
+    assert lines[:2] == ["**Final policies** (stochastic, without learning), as in the report:", ""]
+    assert lines[2].startswith("| task | agent | curriculum | verdict |")
+    assert lines[5] == "| river-a | cpo | dynamic | infeasible by 4.06 | 9.062 | 5.00 | 15.00 | 1 |"
     page = f"#/experiments/{parent.info.experiment_id}/runs/{parent.info.run_id}/artifacts"
-    assert lines[5] == f"[Report]({page}/figures/report.html)"
+    assert lines[7] == f"[Report]({page}/figures/report.html)"
     assert sync(store, uri).points == 0
     sync(store, uri, rebuild=True)
     assert runs(store)[NONE].data.metrics["final/cost_0"] == 5.0
