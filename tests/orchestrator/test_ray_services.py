@@ -20,7 +20,7 @@ tasks: [{name: two-state, deploy_limits: 3, options: {horizon: 10}}]
 agents: [{name: ppo-lag, options: {hidden_sizes: [8]}}]
 methods: [linear]
 seeds: 1
-run: {total_steps: 24_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
+run: {total_steps: 100_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
 """
 COMMAND = [
     sys.executable,
@@ -65,7 +65,7 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
     [victim] = [pid for pid in descendants(driver.pid, "") if comm(pid) == title]
     os.kill(victim, signal.SIGKILL)
     _, errors = driver.communicate(timeout=100.0)
-    assert driver.returncode == 4
+    assert driver.returncode == 4, errors
     expected = r"[0-9]+ has died; nothing that was saved is lost, and the same launch continues\n"
     assert re.fullmatch("(recrl-sweep: )?" + re.escape(said) + expected, errors)
     assert not store.is_locked()
@@ -74,8 +74,8 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
         time.sleep(0.1)
     assert comm(trial) == ""
     again = launch(tmp_path)
-    again.communicate(timeout=300.0)
-    assert again.returncode == 0
+    _, errors = again.communicate(timeout=300.0)
+    assert again.returncode == 0, errors
     assert [trial.record().status for trial in store.trials()] == [TrialState.COMPLETE]
 
 
@@ -88,8 +88,8 @@ def test_what_a_killed_launch_left_of_ray_is_ended_by_the_next_one(tmp_path: Pat
     driver.kill()
     driver.communicate()
     again = launch(tmp_path)
-    again.communicate(timeout=300.0)
-    assert again.returncode == 0
+    _, errors = again.communicate(timeout=300.0)
+    assert again.returncode == 0, errors
     end = time.monotonic() + 30.0  # a killed process of a busy machine needs a moment
     while any(comm(pid) for pid in processes) and time.monotonic() < end:
         time.sleep(0.2)
