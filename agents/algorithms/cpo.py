@@ -13,6 +13,7 @@ Notation: N samples, k costs, P parameters, delta the trust region's size, H its
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from recrl.agents.algorithms.own_options import CPOConfig
+from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
@@ -88,6 +90,8 @@ def constrained_step(
     solve: Callable[[StepProblem], DualSolution],
     config: TrustRegionConfig,
     generator: np.random.Generator,
+    *,
+    integral: ViolationIntegral,
 ) -> dict[str, float]:
     """Take one step in the trust region; skip it if nothing is known about the constraints.
 
@@ -97,27 +101,36 @@ def constrained_step(
         solve: the step of the linearised problem.
         config: the trust region, conjugate gradients and line search.
         generator: for the choice of the metric's samples.
+        integral: of the violations; changed in place.
 
     Returns:
-        Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages.
+        Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages,
+        ``violation_integral_i`` in episode cost.
     """
     constraints = experience.constraints
     multipliers = np.full_like(constraints.limits, NAN)
     if not constraints.known:
         stayed = {"policy_steps": 0.0, "case": NAN, "line_search_steps": NAN, "step_norm": 0.0}
-        return {**stayed, **indexed("multiplier", multipliers)}
+        return {**stayed, **indexed("multiplier", multipliers), **indexed("violation_integral", multipliers)}
     centred = experience.advantages - experience.advantages.mean(axis=0)
     centred[:, 0] /= reward_spread(centred)  # does not change the step, only the unit of the multipliers
     model = LocalModel(policy, experience, centred)
     active = ActiveConstraints.of(constraints)
+    active = replace(active, violations=integral.corrected(active.index, active.violations))
     metric = model.metric(config, generator)
     problem, solved = linearise(model, active, metric, config)
     solution = solve(problem)
+    integral.note_step(active.index, problem.unmet(solution))
     is_acceptable = acceptance(model, active, solution, config.target_kl)
     metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
     multipliers[:] = 0.0
     multipliers[active.index] = solution.multipliers
-    return {**metrics, "case": float(solution.case), **indexed("multiplier", multipliers)}
+    return {
+        **metrics,
+        "case": float(solution.case),
+        **indexed("multiplier", multipliers),
+        **indexed("violation_integral", integral.values * constraints.episode_length),
+    }
 
 
 def linearise(
@@ -180,17 +193,20 @@ def acceptance(
 class ConstrainedPolicyOptimisation:
     """The rule of ``cpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
-    def __init__(self, config: CPOConfig) -> None:
+    def __init__(self, config: CPOConfig, num_costs: int) -> None:
         self._config = config
-        self.parts: dict[str, Stateful] = {}
+        self._integral = ViolationIntegral(config.violation_integral_gain, num_costs)
+        self.parts: dict[str, Stateful] = {"violation_integral": self._integral}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one constrained trust-region step; skip it if nothing is known about the constraints."""
-        return constrained_step(policy, experience, solve_dual, self._config, generator)
+        return constrained_step(
+            policy, experience, solve_dual, self._config, generator, integral=self._integral
+        )
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """Make a new CPO agent."""
-    return fresh_agent(cmdp, config, seed, lambda _: ConstrainedPolicyOptimisation(config))
+    return fresh_agent(cmdp, config, seed, lambda _: ConstrainedPolicyOptimisation(config, cmdp.num_costs))

@@ -129,12 +129,29 @@ class IPOConfig(AscentConfig):
     )
 
 
+ViolationIntegralGain = Annotated[
+    NonNegative,
+    Field(
+        description="K of the integral of the violations, per update. Costs fall by less than the "
+        "linear model predicts; the integral corrects that (ours; paper 0)."
+    ),
+]
+
+
 class CPOConfig(TrustRegionConfig):
     """Settings of ``cpo``, constrained policy optimisation."""
+
+    paper: ClassVar[Mapping[str, Any]] = {**TrustRegionConfig.paper, "violation_integral_gain": 0.0}
+
+    violation_integral_gain: ViolationIntegralGain = 0.1
 
 
 class PCPOConfig(TrustRegionConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""
+
+    paper: ClassVar[Mapping[str, Any]] = {**TrustRegionConfig.paper, "violation_integral_gain": 0.0}
+
+    violation_integral_gain: ViolationIntegralGain = 0.1
 
 
 class TRPOConfig(TrustRegionConfig):

@@ -23,6 +23,7 @@ import numpy as np
 
 from recrl.agents.algorithms.cpo import constrained_step
 from recrl.agents.algorithms.own_options import PCPOConfig
+from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.policies import StochasticPolicy
@@ -65,17 +66,21 @@ def projected_step(problem: StepProblem) -> DualSolution:
 class ProjectionBasedConstrainedPolicyOptimisation:
     """The rule of ``pcpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
-    def __init__(self, config: PCPOConfig) -> None:
+    def __init__(self, config: PCPOConfig, num_costs: int) -> None:
         self._config = config
-        self.parts: dict[str, Stateful] = {}
+        self._integral = ViolationIntegral(config.violation_integral_gain, num_costs)
+        self.parts: dict[str, Stateful] = {"violation_integral": self._integral}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one projected step; skip it if nothing is known about the constraints."""
-        return constrained_step(policy, experience, projected_step, self._config, generator)
+        return constrained_step(
+            policy, experience, projected_step, self._config, generator, integral=self._integral
+        )
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """Make a new PCPO agent."""
-    return fresh_agent(cmdp, config, seed, lambda _: ProjectionBasedConstrainedPolicyOptimisation(config))
+    rule = ProjectionBasedConstrainedPolicyOptimisation(config, cmdp.num_costs)
+    return fresh_agent(cmdp, config, seed, lambda _: rule)

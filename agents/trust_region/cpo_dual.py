@@ -41,6 +41,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 
@@ -89,6 +90,13 @@ class StepProblem:
         return (
             self.violations - solution.gradient_weight * self.mixed - self.gram @ solution.constraint_weights
         )
+
+    def unmet(self, solution: DualSolution) -> npt.NDArray[np.bool_]:
+        """Return which constraints a step does not meet, to first order and beyond rounding, [k]."""
+        reach = np.sqrt(2.0 * self.radius * np.maximum(np.diag(self.gram), 0.0))
+        rounding = FEASIBILITY_TOLERANCE * (reach + np.abs(self.violations))
+        unmet: npt.NDArray[np.bool_] = self.after(solution) > rounding
+        return unmet
 
 
 @dataclass(frozen=True, eq=False)

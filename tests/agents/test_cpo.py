@@ -47,7 +47,7 @@ def improve(
         np.zeros(2),
         math.nan if math.isnan(gaps[0]) else LENGTH,
     )
-    rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
+    rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=0.0), 2)
     experience = Experience.of(policy, batch, advantages, constraints)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
     old = StochasticPolicy(3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0))

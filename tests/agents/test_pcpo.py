@@ -111,7 +111,9 @@ def test_every_projected_step_stays_in_the_trust_region(num_costs: int) -> None:
 
 def rule_of(name: str, num_costs: int) -> PolicyRule:
     if name == "pcpo":
-        return ProjectionBasedConstrainedPolicyOptimisation(PCPOConfig(target_kl=DELTA))
+        return ProjectionBasedConstrainedPolicyOptimisation(
+            PCPOConfig(target_kl=DELTA, violation_integral_gain=0.0), num_costs
+        )
     if name == "crpo":
         return ConstraintRectifiedPolicyOptimisation(CRPOConfig(target_kl=DELTA))
     return TRPOLagrangian(TRPOLagConfig(target_kl=DELTA), num_costs)

@@ -44,7 +44,7 @@ def rule_of(name: str, policy: StochasticPolicy) -> PolicyRule:
         return ProximalPolicyOptimisation(PPOConfig(target_kl=DELTA), policy)
     if name == "trpo":
         return TrustRegionPolicyOptimisation(TRPOConfig(target_kl=DELTA))
-    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA))
+    return ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=0.0), 2)
 
 
 def improved(

@@ -1,0 +1,74 @@
+"""The integral of the violations: its arithmetic, its anti-wind-up, and the steady error that it removes."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from recrl.agents.algorithms.pcpo import projected_step
+from recrl.agents.constraints.violation_integral import ViolationIntegral
+from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
+
+BOTH = np.array([0, 1])
+
+
+def test_the_integral_adds_violations_and_stays_above_zero() -> None:
+    integral = ViolationIntegral(0.25, 2)
+    assert integral.corrected(BOTH, np.array([0.4, -1.0])).tolist() == [0.5, -1.0]
+    assert integral.corrected(BOTH, np.array([0.8, 2.0])).tolist() == pytest.approx([1.1, 2.5])
+    assert integral.corrected(BOTH, np.array([-0.4, -4.0])).tolist() == pytest.approx([-0.2, -4.0])
+
+
+def test_a_cost_without_a_limit_keeps_its_integral() -> None:
+    integral = ViolationIntegral(0.5, 2)
+    integral.corrected(BOTH, np.array([1.0, 1.0]))
+    assert integral.corrected(np.array([1]), np.array([1.0])).tolist() == [2.0]
+    assert integral.values.tolist() == [0.5, 1.0]
+
+
+def test_it_does_not_grow_after_a_step_that_did_not_meet_the_constraint() -> None:
+    integral = ViolationIntegral(0.5, 2)
+    integral.corrected(BOTH, np.array([1.0, 1.0]))
+    integral.note_step(BOTH, np.array([True, False]))
+    assert integral.corrected(BOTH, np.array([1.0, 1.0])).tolist() == [1.5, 2.0]
+    integral.note_step(BOTH, np.array([True, False]))
+    assert integral.corrected(BOTH, np.array([-0.4, 0.0])).tolist() == pytest.approx([-0.1, 1.0])
+
+
+def test_a_restored_integral_goes_on_exactly() -> None:
+    first, second = ViolationIntegral(0.3, 2), ViolationIntegral(0.3, 2)
+    first.corrected(BOTH, np.array([1.0, 0.1]))
+    first.note_step(BOTH, np.array([True, False]))
+    second.load_state_dict(first.state_dict())
+    new = np.array([0.7, 0.3])
+    assert first.corrected(BOTH, new).tolist() == second.corrected(BOTH, new).tolist()
+
+
+@pytest.mark.parametrize("solve", [solve_dual, projected_step])
+def test_unmet_says_which_constraint_the_trust_region_is_too_small_for(
+    solve: Callable[[StepProblem], DualSolution],
+) -> None:
+    # A step of length sqrt(2 * 0.5) = 1 along b, of length 2, decreases the cost by at most 2.
+    for violation, expected in [(-5.0, False), (0.0, False), (1.9, False), (2.1, True)]:
+        problem = StepProblem(1.0, np.array([-2.0]), np.array([[4.0]]), np.array([violation]), 0.5)
+        assert problem.unmet(solve(problem)).tolist() == [expected]
+
+
+@pytest.mark.parametrize(("gain", "settled"), [(0.0, 0.6), (0.1, 0.0)])
+def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_realised(
+    gain: float, settled: float
+) -> None:
+    # Each update the rest of the step raises the cost by 0.3, unpredicted, and half the predicted fall comes
+    # true: J' = J + 0.3 - (c + I) / 2. Without I it stands still at c = 0.6.
+    integral = ViolationIntegral(gain, 1)
+    cost, limit = 3.0, 2.0
+    for _ in range(400):
+        problem = StepProblem(
+            1.0, np.array([-1.0]), np.eye(1), integral.corrected(BOTH[:1], np.array([cost - limit])), 50.0
+        )
+        solution = solve_dual(problem)
+        assert solution.case is StepCase.CONSTRAINED
+        integral.note_step(BOTH[:1], problem.unmet(solution))
+        predicted = problem.after(solution) - problem.violations
+        cost += 0.3 + 0.5 * float(predicted[0])
+    assert cost - limit == pytest.approx(settled, abs=1e-6)
