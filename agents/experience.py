@@ -64,16 +64,20 @@ class ActiveConstraints:
     Attributes:
         index: their indices, [j].
         violations: c, (constrained value - limit) / mean episode length, [j].
+        sizes: sqrt(d^2 + s^2) / mean episode length, s the standard error of the mean cost, [j].
     """
 
     index: npt.NDArray[np.int64]
     violations: Floats
+    sizes: Floats
 
     @classmethod
     def of(cls, constraints: Constraints) -> ActiveConstraints:
         """Return the finite constraints, in the unit of the surrogates: cost per step."""
         index = np.flatnonzero(np.isfinite(constraints.limits))
-        return cls(index, constraints.gaps[index] / constraints.episode_length)
+        sizes = np.hypot(constraints.limits[index], constraints.standard_errors[index])
+        length = constraints.episode_length
+        return cls(index, constraints.gaps[index] / length, sizes / length)
 
 
 @dataclass(frozen=True, eq=False)

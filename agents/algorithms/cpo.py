@@ -116,7 +116,7 @@ def constrained_step(
     centred[:, 0] /= reward_spread(centred)  # does not change the step, only the unit of the multipliers
     model = LocalModel(policy, experience, centred)
     active = ActiveConstraints.of(constraints)
-    active = replace(active, violations=integral.corrected(active.index, active.violations))
+    active = replace(active, violations=integral.corrected(active.index, active.violations, active.sizes))
     metric = model.metric(config, generator)
     problem, solved = linearise(model, active, metric, config)
     solution = solve(problem)

@@ -5,12 +5,16 @@ cost. Both come from one rollout, and the step follows the noise of b. So the co
 predicted, and it settles above the limit, where the realised fall balances the rise that the rest of the step
 causes. An integral term removes this steady error, as in every controller:
 
-    I <- max(I + K c, 0),  and the step solves b.x + c + I <= 0.
+    I <- max(I + K min(c, e), 0),  and the step solves b.x + c + I <= 0.
 
-If the last step did not meet its constraint, because the trust region is too small, a larger I would change
+e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost, bounds what a violation adds. An episode
+costs at least 0, so c is at least -d, but an untrained policy may exceed the limit by any amount. Without the
+bound a few such updates would add more than hundreds of later ones could subtract, and an agent that has long
+kept the limit would still avoid all cost. The multipliers' integral is bounded likewise
+(``multiplier_rules.pid``). If the last step did not meet its constraint, because the trust region is too small, a larger I would change
 nothing, and would delay the return to the reward. Then I does not grow (anti-wind-up).
 
-c and I are in the unit of the surrogates, cost per step, so the units of the task do not matter. K = 0 is the
+c, e and I are in the unit of the surrogates, cost per step, so the units of the task do not matter. K = 0 is the
 published algorithm.
 
 Notation: k costs, j of the k limits are finite.
@@ -45,14 +49,15 @@ class ViolationIntegral:
         """I, cost per step, at least 0, [k]."""
         return self._integral.copy()
 
-    def corrected(self, index: npt.NDArray[np.int64], violations: Floats) -> Floats:
+    def corrected(self, index: npt.NDArray[np.int64], violations: Floats, sizes: Floats) -> Floats:
         """Include new violations; return c + I, [j].
 
         Args:
             index: of the costs that have a limit, [j].
             violations: c, cost per step, [j].
+            sizes: e, the largest violation that counts, cost per step, at least 0, [j].
         """
-        change = self._gain * violations
+        change = self._gain * np.minimum(violations, sizes)
         grows = np.where(self._unmet[index], np.minimum(change, 0.0), change)
         self._integral[index] = np.maximum(self._integral[index] + grows, 0.0)
         corrected: Floats = violations + self._integral[index]

@@ -99,8 +99,9 @@ def test_without_a_finished_episode_the_policy_stays() -> None:
 
 def test_violations_enter_in_cost_per_step() -> None:
     constraints = Constraints(
-        np.array([25.0, math.inf, 1.0]), np.array([50.0, -math.inf, -0.5]), np.zeros(3), 1000.0
+        np.array([25.0, math.inf, 1.0]), np.array([50.0, -math.inf, -0.5]), np.array([60.0, 0.0, 0.0]), 1000.0
     )
     active = ActiveConstraints.of(constraints)
     assert active.index.tolist() == [0, 2]
     assert active.violations.tolist() == pytest.approx([0.05, -0.0005])
+    assert active.sizes.tolist() == pytest.approx([0.065, 0.001])

@@ -10,38 +10,46 @@ from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 
 BOTH = np.array([0, 1])
+LARGE = np.array([100.0, 100.0])
 
 
 def test_the_integral_adds_violations_and_stays_above_zero() -> None:
     integral = ViolationIntegral(0.25, 2)
-    assert integral.corrected(BOTH, np.array([0.4, -1.0])).tolist() == [0.5, -1.0]
-    assert integral.corrected(BOTH, np.array([0.8, 2.0])).tolist() == pytest.approx([1.1, 2.5])
-    assert integral.corrected(BOTH, np.array([-0.4, -4.0])).tolist() == pytest.approx([-0.2, -4.0])
+    assert integral.corrected(BOTH, np.array([0.4, -1.0]), LARGE).tolist() == [0.5, -1.0]
+    assert integral.corrected(BOTH, np.array([0.8, 2.0]), LARGE).tolist() == pytest.approx([1.1, 2.5])
+    assert integral.corrected(BOTH, np.array([-0.4, -4.0]), LARGE).tolist() == pytest.approx([-0.2, -4.0])
+
+
+def test_a_violation_counts_no_more_than_its_bound() -> None:
+    integral = ViolationIntegral(0.5, 2)
+    corrected = integral.corrected(BOTH, np.array([7.0, 1.0]), np.array([2.0, 2.0]))
+    assert corrected.tolist() == [8.0, 1.5]
+    assert integral.values.tolist() == [1.0, 0.5]
 
 
 def test_a_cost_without_a_limit_keeps_its_integral() -> None:
     integral = ViolationIntegral(0.5, 2)
-    integral.corrected(BOTH, np.array([1.0, 1.0]))
-    assert integral.corrected(np.array([1]), np.array([1.0])).tolist() == [2.0]
+    integral.corrected(BOTH, np.array([1.0, 1.0]), LARGE)
+    assert integral.corrected(np.array([1]), np.array([1.0]), LARGE[1:]).tolist() == [2.0]
     assert integral.values.tolist() == [0.5, 1.0]
 
 
 def test_it_does_not_grow_after_a_step_that_did_not_meet_the_constraint() -> None:
     integral = ViolationIntegral(0.5, 2)
-    integral.corrected(BOTH, np.array([1.0, 1.0]))
+    integral.corrected(BOTH, np.array([1.0, 1.0]), LARGE)
     integral.note_step(BOTH, np.array([True, False]))
-    assert integral.corrected(BOTH, np.array([1.0, 1.0])).tolist() == [1.5, 2.0]
+    assert integral.corrected(BOTH, np.array([1.0, 1.0]), LARGE).tolist() == [1.5, 2.0]
     integral.note_step(BOTH, np.array([True, False]))
-    assert integral.corrected(BOTH, np.array([-0.4, 0.0])).tolist() == pytest.approx([-0.1, 1.0])
+    assert integral.corrected(BOTH, np.array([-0.4, 0.0]), LARGE).tolist() == pytest.approx([-0.1, 1.0])
 
 
 def test_a_restored_integral_goes_on_exactly() -> None:
     first, second = ViolationIntegral(0.3, 2), ViolationIntegral(0.3, 2)
-    first.corrected(BOTH, np.array([1.0, 0.1]))
+    first.corrected(BOTH, np.array([1.0, 0.1]), LARGE)
     first.note_step(BOTH, np.array([True, False]))
     second.load_state_dict(first.state_dict())
     new = np.array([0.7, 0.3])
-    assert first.corrected(BOTH, new).tolist() == second.corrected(BOTH, new).tolist()
+    assert first.corrected(BOTH, new, LARGE).tolist() == second.corrected(BOTH, new, LARGE).tolist()
 
 
 @pytest.mark.parametrize("solve", [solve_dual, projected_step])
@@ -64,7 +72,11 @@ def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_rea
     cost, limit = 3.0, 2.0
     for _ in range(400):
         problem = StepProblem(
-            1.0, np.array([-1.0]), np.eye(1), integral.corrected(BOTH[:1], np.array([cost - limit])), 50.0
+            1.0,
+            np.array([-1.0]),
+            np.eye(1),
+            integral.corrected(BOTH[:1], np.array([cost - limit]), LARGE[:1]),
+            50.0,
         )
         solution = solve_dual(problem)
         assert solution.case is StepCase.CONSTRAINED
