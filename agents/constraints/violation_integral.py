@@ -7,15 +7,17 @@ causes. An integral term removes this steady error, as in every controller:
 
     I <- max(I + K min(c, e), 0),  and the step solves b.x + c + I <= 0.
 
-e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost, bounds what a violation adds. An episode
-costs at least 0, so c is at least -d, but an untrained policy may exceed the limit by any amount. Without the
-bound a few such updates would add more than hundreds of later ones could subtract, and an agent that has long
-kept the limit would still avoid all cost. The multipliers' integral is bounded likewise
-(``multiplier_rules.pid``). If the last step did not meet its constraint, because the trust region is too small, a larger I would change
+e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost, bounds what a violation adds. An
+episode costs at least 0, so c is at least -d, but an untrained policy may exceed the limit by any amount.
+Without the bound a few such updates would add more than hundreds of later ones could subtract, and an agent
+that has long kept the limit would still avoid all cost. The multipliers' integral is bounded likewise
+(``multiplier_rules.pid``).
+
+If the last step did not meet its constraint, because the trust region is too small, a larger I would change
 nothing, and would delay the return to the reward. Then I does not grow (anti-wind-up).
 
-c, e and I are in the unit of the surrogates, cost per step, so the units of the task do not matter. K = 0 is the
-published algorithm.
+c, e and I are in the unit of the surrogates, cost per step, so the units of the task do not matter. K = 0 is
+the published algorithm.
 
 Notation: k costs, j of the k limits are finite.
 """
