@@ -34,8 +34,8 @@ from torch import Tensor
 from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.batch import LearningBatch, to_tensor
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
+from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed, no_steps
 from recrl.agents.learning.surrogates import (

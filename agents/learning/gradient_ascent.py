@@ -20,8 +20,8 @@ from torch import Tensor
 
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Distribution, mean_divergence
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful
 from recrl.agents.networks.flat_parameters import Adam

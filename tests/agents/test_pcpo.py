@@ -19,7 +19,7 @@ from recrl.agents.algorithms.own_options import CRPOConfig, PCPOConfig, TRPOLagC
 from recrl.agents.algorithms.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal

@@ -13,9 +13,9 @@ from recrl.agents.algorithms.ppo import ProximalPolicyOptimisation
 from recrl.agents.algorithms.trpo import TrustRegionPolicyOptimisation, step_up
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import penalised_advantages
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Categorical
 from recrl.agents.learning.gradient_ascent import Objective, gradient_ascent, with_entropy, with_prices
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal
