@@ -3,7 +3,7 @@
 ``step`` is called for each environment, on any of MuJoCo's threads: it sets the action, takes ten physics
 steps and computes observation, reward and cost. It reads no other environment, so results depend neither on
 their number nor on the threads. Resets and new goals are sampled elsewhere
-(``recrl.environments.safety_gym.batch``).
+(``recrl.environments.safety_gym.safety_gym_batch``).
 
 A record ``ENVIRONMENT`` holds the state of one environment. The record ``TASK`` holds what all environments
 of a task share. Their sizes fit every task.

@@ -28,7 +28,7 @@ from recrl.environments.safety_gym.compiled_step import (
 from recrl.environments.safety_gym.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
 from recrl.environments.safety_gym.layout import keepouts
 from recrl.environments.safety_gym.scene import Scene
-from recrl.environments.safety_gym.tasks import (
+from recrl.environments.safety_gym.task_definitions import (
     GOAL_HEIGHT,
     GRAVITY,
     GREMLIN_TRAVEL,

@@ -35,9 +35,9 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.simulation.machine_code import compiled_for_batch, mj_forward, mj_rnePostConstraint
-from recrl.environments.velocity.batch import VelocityBatch
 from recrl.environments.velocity.physics import copy_fields, derive, physics_at
-from recrl.environments.velocity.tasks import VELOCITY_TASKS, VelocityTask
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS, VelocityTask
+from recrl.environments.velocity.velocity_batch import VelocityBatch
 
 TOLERANCE = 1e-5
 STAGES = (0.5, 0.5, 1.0)

@@ -10,7 +10,7 @@ import pytest
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.compiled_step import add_to_lidar, turned
-from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import rotation_matrices, upright
 
 

@@ -16,10 +16,10 @@ from gymnasium.utils.env_checker import check_env
 from recrl.environments.cmdp import Floats
 from recrl.environments.registry import find_task, make_drawn
 from recrl.environments.simulation.camera import RenderingUnavailableError
-from recrl.environments.velocity.batch import VelocityBatch
-from recrl.environments.velocity.environments import VelocityEnv, VelocityVectorEnv
 from recrl.environments.velocity.model import make_model
-from recrl.environments.velocity.tasks import VELOCITY_TASKS
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS
+from recrl.environments.velocity.velocity_batch import VelocityBatch
+from recrl.environments.velocity.velocity_environments import VelocityEnv, VelocityVectorEnv
 from tests.benchmarks.velocity_parity import compare_velocity_recording
 
 TASKS = list(VELOCITY_TASKS)

@@ -17,7 +17,7 @@ MODULES = [
 
 
 def test_modules_of_subpackages_are_found_too() -> None:
-    assert "recrl.environments.velocity.batch" in MODULES
+    assert "recrl.environments.velocity.velocity_batch" in MODULES
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -33,7 +33,7 @@ from recrl.environments.simulation.environment_batch import EnvironmentBatch, Ob
 from recrl.environments.simulation.mujoco_batch import Simulations
 from recrl.environments.velocity.model import make_model
 from recrl.environments.velocity.physics import advance, derive, physics_record
-from recrl.environments.velocity.tasks import HORIZON, Booleans, VelocityTask
+from recrl.environments.velocity.task_definitions import HORIZON, Booleans, VelocityTask
 
 TORSO = 1
 """The torso's body; body 0 is the floor."""

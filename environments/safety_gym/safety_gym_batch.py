@@ -35,8 +35,8 @@ from recrl.environments.safety_gym.compiled_step import (
 )
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.scene import make_scene, upright
+from recrl.environments.safety_gym.task_definitions import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
 from recrl.environments.safety_gym.task_record import allocate, places_of_objects, task_record
-from recrl.environments.safety_gym.tasks import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
 from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
 from recrl.environments.simulation.mujoco_batch import Simulations
 
