@@ -25,16 +25,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import (
-    ENVIRONMENT,
-    NOT_YET,
-    acceptable,
-    perceive,
-    review,
-    step,
-)
+from recrl.environments.safety_gym.compiled_step import acceptable, perceive, review, step
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.scene import make_scene, upright
+from recrl.environments.safety_gym.step_records import ENVIRONMENT, NOT_YET
 from recrl.environments.safety_gym.task_definitions import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
 from recrl.environments.safety_gym.task_record import allocate, places_of_objects, task_record
 from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
