@@ -11,8 +11,8 @@ import threading
 from collections.abc import Sequence
 from typing import Protocol
 
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.sweep_place import SweepPlace
 
 
 class Executor(Protocol):

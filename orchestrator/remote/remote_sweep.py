@@ -23,21 +23,21 @@ from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
 from recrl.orchestrator.files.atomic_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.remote.commit_upload import Upload, working_copy
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.remote.patience import patiently, repeatedly
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
+from recrl.orchestrator.remote.retries import repeat_until, retry_while_down
 from recrl.orchestrator.remote.stop_object import StopObject
-from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.sweep_place import SweepPlace
 
 PULL_SECONDS = 10.0  # between two reads of the running trials
 PULLS_AT_ONCE = 8
@@ -136,7 +136,7 @@ class RemoteSweep(SweepPlace):
     def working_copy(
         self, spec: TrialSpec, should_stop: Callable[[], bool]
     ) -> AbstractContextManager[TrialStore]:
-        """See ``SweepPlace`` and ``upload.working_copy``."""
+        """See ``SweepPlace`` and ``commit_upload.working_copy``."""
         return working_copy(self.trial(spec.folder_name), spec, should_stop)
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:
@@ -226,10 +226,10 @@ class RemoteSweep(SweepPlace):
         Raises:
             StorageError: the store cannot be read at the end.
         """
-        follow = partial(repeatedly, self._pull_trials, every=every, hint="the trials continue")
-        with beside(follow, name="local copy"):
+        follow = partial(repeat_until, self._pull_trials, every=every, hint="the trials continue")
+        with background_thread(follow, name="local copy"):
             yield
-        patiently(self._pull_trials, stop.is_set)
+        retry_while_down(self._pull_trials, stop.is_set)
 
     def publish(self) -> None:
         """Send the sweep's own files.

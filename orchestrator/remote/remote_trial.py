@@ -4,7 +4,7 @@
         commit-<number>     record, new rows and checkpoint: see ``commit_format``
         alive.json          while the attempt works: its record, every few seconds
 
-A trial runs in a folder of its machine, like any trial; ``upload`` sends each commit. Rules. Readers check
+A trial runs in a folder of its machine, like any trial; ``commit_upload`` sends each commit. Rules. Readers check
 the lengths and digests of a commit; a truncated commit is ignored. Every attempt writes below its own name
 and depends on no other. So late writes of a node that was lost do no damage and are not read: only the newest
 attempt with a commit is. An attempt starts from the newest commit of earlier ones, so that the results are

@@ -24,9 +24,9 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import PlannedAction, make_plan
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 
 GRID = """\
@@ -58,8 +58,8 @@ def run(store: SweepStore, *, updates: int | None = None, **options: Any) -> Swe
 
     executor: Executor = InlineExecutor() if updates is None else Stopping()
     grid = parse_grid(GRID.encode(), source="grid.yaml")
-    settings = LaunchSettings(grid, SweepPlace(store), executor, **options)
-    return launch(settings, stop=threading.Event())
+    settings = SweepRunSettings(grid, SweepPlace(store), executor, **options)
+    return run_sweep(settings, stop=threading.Event())
 
 
 def results(store: SweepStore) -> dict[str, bytes]:
