@@ -168,7 +168,7 @@ def _run_trials(settings: SweepRunSettings, specs: Sequence[TrialSpec], stop: th
     finally:
         _leave_none_running(specs, place.store)
         try:
-            place.settle(specs)
+            place.send_dead_trials(specs)
         except StorageError as error:  # must not hide an earlier error
             logger.warning("%s; the end of its trials is recorded on this machine only", error)
 

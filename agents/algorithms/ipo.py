@@ -34,7 +34,12 @@ from torch import Tensor
 from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
+from recrl.agents.learning.gradient_ascent import (
+    FirstOrderRule,
+    Objective,
+    gradient_ascent,
+    normalised_by_penalties,
+)
 from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed, no_steps
@@ -111,7 +116,9 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:
-            return with_prices(barrier_surrogate_objective(part.batch, rewards, costs, violations, config))
+            return normalised_by_penalties(
+                barrier_surrogate_objective(part.batch, rewards, costs, violations, config)
+            )
 
         metrics = gradient_ascent(
             policy, self._optimiser, experience, objective, config=config, generator=generator

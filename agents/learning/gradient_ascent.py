@@ -62,7 +62,7 @@ def with_entropy(
     return objective
 
 
-def with_prices(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
+def normalised_by_penalties(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
     """Make an objective of a function of the ratios that also returns the total weight of its penalties.
 
     The objective is divided by 1 + that weight, because the gradients of penalties are proportional to their

@@ -133,7 +133,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         passed = (places - self.places) / self.seconds
         self.places = places
         self.steps += 1
-        rewards, velocities, costs = self.judge(passed, self._actions)
+        rewards, velocities, costs = self.rewards_and_costs(passed, self._actions)
         terminated = self.fallen()
         broken = self.simulations.broken() if self.simulations.any_broken() else None
         if broken is not None:
@@ -143,7 +143,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         finished = np.flatnonzero(terminated | truncated)
         return Outcome(rewards, costs, velocities, terminated, truncated, broken, finished)
 
-    def judge(self, passed: Floats, actions: Floats) -> tuple[Floats, Floats, Floats]:
+    def rewards_and_costs(self, passed: Floats, actions: Floats) -> tuple[Floats, Floats, Floats]:
         """Compute rewards, velocities and costs of a step.
 
         Args:

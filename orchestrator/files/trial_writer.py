@@ -79,7 +79,7 @@ class TrialWriter:
             tree = self._newest_usable()
             if tree is None:
                 for file in self._rows:
-                    file.take_up(Extent())
+                    file.resume_after(Extent())
             for file in self._rows:
                 if self.record.committed.get(file.path.name, 0) > file.length:
                     self.store.move_aside(file.path, copy=True)
@@ -104,7 +104,7 @@ class TrialWriter:
             else:
                 if found is not None:
                     continue
-                if all(file.take_up(_extent_in(tree, file.path.name)) for file in self._rows):
+                if all(file.resume_after(_extent_in(tree, file.path.name)) for file in self._rows):
                     found = tree
                     continue
                 logger.warning("%s: its rows are missing; it is renamed", path)
@@ -207,7 +207,7 @@ class TrialWriter:
                 **changes,
             )
             for file, done in zip(self._rows, written, strict=True):
-                file.settle(done)
+                file.mark_committed(done)
             for old in self.store.checkpoints()[KEPT_CHECKPOINTS:]:
                 old.unlink()
 

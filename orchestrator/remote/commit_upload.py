@@ -41,7 +41,7 @@ class Upload:
 
         Args:
             remote: the target.
-            trial: the source, after ``RemoteTrial.take_up``.
+            trial: the source, after ``RemoteTrial.download_for_attempt``.
         """
         self._remote = remote
         self._trial = trial
@@ -190,7 +190,7 @@ def working_copy(
     """
     with scratch_folder(tempfile.gettempdir()) as folder:
         trial = TrialStore(folder / spec.folder_name)
-        retry_while_down(lambda: remote.take_up(trial), should_stop)
+        retry_while_down(lambda: remote.download_for_attempt(trial), should_stop)
         upload = Upload(remote, trial)
         try:
             with background_thread(partial(_follow, upload), name="upload"):

@@ -240,7 +240,7 @@ class RemoteSweep(SweepPlace):
         for path in _sweep_files(self.store):
             self.objects.write(path.name, path.read_bytes())
 
-    def settle(self, specs: Sequence[TrialSpec]) -> None:
+    def send_dead_trials(self, specs: Sequence[TrialSpec]) -> None:
         """Send the status of trials whose processes died, which only this machine knows.
 
         Nothing is sent once another launch has taken over the sweep: its attempts may be running.
@@ -254,9 +254,9 @@ class RemoteSweep(SweepPlace):
         """
         if not self.lease.belongs_to_another():
             for spec in specs:
-                self._settle(spec)
+                self._send_dead_trial(spec)
 
-    def _settle(self, spec: TrialSpec) -> None:
+    def _send_dead_trial(self, spec: TrialSpec) -> None:
         trial = self.store.trial(spec)
         record = trial.record()
         if record.token or record.status not in (TrialState.FAILED, TrialState.WAITING):

@@ -153,7 +153,7 @@ def test_effort_and_health_are_weighed_as_gymnasium_does() -> None:
     assert [task.healthy_reward for task in VELOCITY_TASKS.values()] == [1, 0, 1, 5, 0, 1]
     batch = VelocityBatch(VELOCITY_TASKS["SafetyHumanoidVelocity"], 1)
     actions = np.full((1, batch.model.nu), 0.2)
-    rewards, velocities, costs = batch.judge(np.array([[0.8, 0.6]]), actions)
+    rewards, velocities, costs = batch.rewards_and_costs(np.array([[0.8, 0.6]]), actions)
     assert rewards[0] == pytest.approx(1.25 * 0.8 - 0.1 * 17 * 0.04 + 5.0)
     assert velocities[0] == pytest.approx(1.0)
     assert costs[0] == 0.0

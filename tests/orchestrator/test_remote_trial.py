@@ -59,7 +59,7 @@ class Machine:
 
     def __init__(self, remote: RemoteTrial, folder: Path) -> None:
         self.trial = TrialStore(folder / SPEC.folder_name)
-        remote.take_up(self.trial)
+        remote.download_for_attempt(self.trial)
         self.upload = Upload(remote, self.trial)
         self.writer: TrialWriter = self.trial.begin(SPEC)
         self.restored = self.writer.restore()
