@@ -53,14 +53,14 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 
 
 def barrier(slack: Tensor, *, sharpness: float, slope: float) -> Tensor:
-    """Return the barrier phi of each slack, any shape; ``sharpness`` is t and ``slope`` is kappa."""
+    """Return the barrier phi of each slack, in its shape; ``sharpness`` is t and ``slope`` is kappa."""
     edge = 1.0 / (sharpness * slope)
     inside = torch.log(slack.clamp(min=edge)) / sharpness
     return inside + slope * (slack - edge).clamp(max=0.0)
 
 
 def slopes(slack: npt.NDArray[np.floating], config: IPOConfig) -> Floats:
-    """Return the derivatives of the barriers, which weight the costs: 1 / (t s), or kappa."""
+    """Return the barriers' derivatives at slacks s, [j], the weights of costs: 1 / (t s), or kappa; [j]."""
     edge = 1.0 / (config.barrier_sharpness * config.barrier_slope)
     charged = 1.0 / (config.barrier_sharpness * np.maximum(slack, edge))
     return np.asarray(charged, dtype=np.float64)

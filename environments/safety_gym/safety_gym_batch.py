@@ -39,7 +39,7 @@ Integers = npt.NDArray[np.int64]
 _NOBODY = np.zeros(0, np.intp)
 
 
-class Outcome(NamedTuple):
+class SafetyGymOutcome(NamedTuple):
     """Result of one step.
 
     Attributes:
@@ -63,7 +63,7 @@ class Outcome(NamedTuple):
     finished: npt.NDArray[np.intp]
 
 
-class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
+class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
     """B environments of one Safety Gym task; see ``EnvironmentBatch``.
 
     Args:
@@ -136,14 +136,14 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         self._action[...] = actions
         return acceptable(self._address)
 
-    def advance(self) -> Outcome:
+    def advance(self) -> SafetyGymOutcome:
         """Take one step in every environment, with the actions that were set."""
         self.simulations.apply(step, self._address)
         results, flags = self._memory.results.copy(), self._memory.flags.copy()
         rewards, costs, terms = results[0], results[1:2], results[2:]
         goal_met, broken, terminated, truncated = flags[0], flags[1], flags[2], flags[3]
         if not (self.simulations.any_stopped or 1 in flags.tobytes()):
-            return Outcome(rewards, costs, terms, goal_met, terminated, truncated, None, _NOBODY)
+            return SafetyGymOutcome(rewards, costs, terms, goal_met, terminated, truncated, None, _NOBODY)
         broken |= self.simulations.stopped
         rewards[broken] = EXCEPTION_REWARD
         results[1:, broken] = 0.0
@@ -157,7 +157,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         truncated &= ~terminated
         finished = np.flatnonzero(terminated | truncated)
         failed = broken if broken.any() else None
-        return Outcome(rewards, costs, terms, goal_met, terminated, truncated, failed, finished)
+        return SafetyGymOutcome(rewards, costs, terms, goal_met, terminated, truncated, failed, finished)
 
     def observations(self) -> Observations:
         """The last observations, [B, size]."""

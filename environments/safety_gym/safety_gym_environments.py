@@ -36,7 +36,7 @@ from recrl.environments.simulation.mujoco_environments import (
 )
 
 if TYPE_CHECKING:
-    from recrl.environments.safety_gym.safety_gym_batch import Outcome, SafetyGymBatch
+    from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch, SafetyGymOutcome
 
 
 class SafetyGymOptions(BaseModel):
@@ -84,7 +84,7 @@ def observation_components(task: SafetyTask) -> tuple[ObservationComponent, ...]
     )
 
 
-def _info(terms: tuple[str, ...], cost: str, outcome: Outcome) -> dict[str, Any]:
+def _info(terms: tuple[str, ...], cost: str, outcome: SafetyGymOutcome) -> dict[str, Any]:
     info: dict[str, Any] = {term: outcome.terms[row] for row, term in enumerate(terms)}
     info["cost"] = (outcome.terms if cost == "per_hazard" else outcome.costs).T
     info["goal_met"] = outcome.goal_met

@@ -39,7 +39,7 @@ TORSO = 1
 """The torso's body; body 0 is the floor."""
 
 
-class Outcome(NamedTuple):
+class VelocityOutcome(NamedTuple):
     """Result of one step.
 
     Attributes:
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
     finished: npt.NDArray[np.intp]
 
 
-class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
+class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
     """B environments of one velocity task; see ``EnvironmentBatch``.
 
     Args:
@@ -125,7 +125,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         self._actions[...] = actions
         return bool(np.abs(self._actions).max() <= self.bound)  # False with NaN
 
-    def advance(self) -> Outcome:
+    def advance(self) -> VelocityOutcome:
         """Take one step with every robot, with the actions that were set."""
         self._controls[...] = self._actions
         self.simulations.apply(advance, self.address)
@@ -141,7 +141,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
             terminated |= broken
         truncated = (self.steps >= self.horizon) & ~terminated
         finished = np.flatnonzero(terminated | truncated)
-        return Outcome(rewards, costs, velocities, terminated, truncated, broken, finished)
+        return VelocityOutcome(rewards, costs, velocities, terminated, truncated, broken, finished)
 
     def rewards_and_costs(self, passed: Floats, actions: Floats) -> tuple[Floats, Floats, Floats]:
         """Compute rewards, velocities and costs of a step.

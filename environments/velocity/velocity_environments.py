@@ -27,7 +27,7 @@ from recrl.environments.simulation.mujoco_environments import (
 from recrl.environments.velocity.task_definitions import HORIZON, VELOCITY_TASKS, VelocityTask
 
 if TYPE_CHECKING:
-    from recrl.environments.velocity.velocity_batch import Outcome, VelocityBatch
+    from recrl.environments.velocity.velocity_batch import VelocityBatch, VelocityOutcome
 
 COST_NAMES = ("cost",)
 
@@ -49,7 +49,7 @@ class VelocityOptions(BaseModel):
     )
 
 
-def _info(outcome: Outcome) -> dict[str, Any]:
+def _info(outcome: VelocityOutcome) -> dict[str, Any]:
     info: dict[str, Any] = {"cost": outcome.costs[:, None], "velocity": outcome.velocities}
     if outcome.broken is not None:
         info["cost_exception"] = outcome.broken.astype(np.float64)

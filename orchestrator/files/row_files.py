@@ -106,7 +106,9 @@ class RowFile:
         self._rows.append(csv_line([row[name] for name in self.columns]))
 
     def write(self) -> tuple[int, Any]:
-        """Write the rows of the next commit after the committed bytes, and sync; ``mark_committed`` commits them.
+        """Write the rows of the next commit after the committed bytes, and sync.
+
+        The rows count as committed after ``mark_committed``.
 
         Raises:
             DamagedError: the file has fewer bytes than are committed.

@@ -5,10 +5,10 @@
         alive.json          while the attempt works: its record, every few seconds
 
 A trial runs in a folder of its machine, like any trial; ``commit_upload`` sends each commit. Rules. Readers
-check the lengths and digests of a commit; a truncated commit is ignored. Every attempt writes below its own name
-and depends on no other. So late writes of a node that was lost do no damage and are not read: only the newest
-attempt with a commit is. An attempt starts from the newest commit of earlier ones, so that the results are
-those of a trial that never moved. It makes a commit of its own, then deletes the others. An attempt that
+check the lengths and digests of a commit; a truncated commit is ignored. Every attempt writes below its own
+name and depends on no other. So late writes of a node that was lost do no damage and are not read: only the
+newest attempt with a commit is. An attempt starts from the newest commit of earlier ones, so that the results
+are those of a trial that never moved. It makes a commit of its own, then deletes the others. An attempt that
 finds a newer one ends.
 
 Trials continue while a store is down. Unsent commits are sent later, and a trial is complete when its last
