@@ -154,7 +154,7 @@ def test_the_step_serves_the_constraints_within_the_trust_region(name: str, spac
 
 
 @pytest.mark.parametrize("name", ["pcpo", "crpo"])
-def test_without_a_finished_episode_a_student_without_multipliers_stays(name: str) -> None:
+def test_without_a_finished_episode_an_agent_without_multipliers_stays(name: str) -> None:
     metrics, change = improved(name, SPACES[0], [math.nan, math.nan], [1.0, 1.0])
     assert not change.any()
     assert metrics["policy_steps"] == metrics["step_norm"] == 0.0

@@ -164,7 +164,7 @@ def test_a_violated_constraint_is_mended_and_no_limit_is_no_penalty(name: str) -
 
 
 @pytest.mark.parametrize("name", ["p3o", "ipo"])
-def test_without_a_finished_episode_a_student_without_multipliers_stays(name: str) -> None:
+def test_without_a_finished_episode_an_agent_without_multipliers_stays(name: str) -> None:
     metrics, moved = improved(name, math.nan)
     assert not moved
     assert metrics["policy_steps"] == 0.0
