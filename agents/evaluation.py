@@ -138,7 +138,7 @@ def film(
     # Some simulators take signed seeds only.
     observation, _ = environment.reset(seed=int(environment_seed.generate_state(1)[0] >> 1))
     episode_return, costs = 0.0, np.zeros(num_costs)
-    yield Shot(_picture(environment), 0, episode_return, costs)
+    yield Shot(_frame(environment), 0, episode_return, costs)
     for step in range(1, MAX_FILMED_STEPS + 1):
         flat = gymnasium.spaces.flatten(environment.observation_space, observation)
         chosen = chooser.act(np.asarray(flat, np.float32)[None], generator)
@@ -147,12 +147,12 @@ def film(
         episode_return += float(reward)
         costs = costs + np.asarray(info["cost"], np.float64).reshape(-1)
         if step % every == 0 or terminated or truncated:
-            yield Shot(_picture(environment), step, episode_return, costs)
+            yield Shot(_frame(environment), step, episode_return, costs)
         if terminated or truncated:
             return
 
 
-def _picture(environment: gymnasium.Env[Any, Any]) -> npt.NDArray[np.uint8]:
+def _frame(environment: gymnasium.Env[Any, Any]) -> npt.NDArray[np.uint8]:
     drawn: Any = environment.render()
     if not (isinstance(drawn, np.ndarray) and drawn.dtype == np.uint8 and drawn.shape[2:] == (3,)):
         kind = f"{drawn.dtype} {drawn.shape}" if isinstance(drawn, np.ndarray) else type(drawn).__name__

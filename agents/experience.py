@@ -15,8 +15,8 @@ from torch import Tensor
 
 from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.learning.advantages import reward_spread, scaled_advantages
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Distribution
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
 

@@ -179,7 +179,7 @@ class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 
     Args:
         environment: its observations are vectors, and its ``observation_components`` declare the lidars, as
-            in ``recrl.environments.safety_gym.environments``.
+            in ``recrl.environments.safety_gym.safety_gym_environments``.
         components: the slices of an observation, for an environment that does not declare them.
         scales: length scales in metres.
 

@@ -12,12 +12,12 @@ from __future__ import annotations
 import gymnasium
 
 from recrl.environments.rivergrid.maps import MAPS
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
-from recrl.environments.velocity.tasks import VELOCITY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS
 
 RIVER_GRID = "recrl.environments.rivergrid.minigrid_env:RiverGridEnv"
-SAFETY_GYM = "recrl.environments.safety_gym.environments"
-VELOCITY = "recrl.environments.velocity.environments"
+SAFETY_GYM = "recrl.environments.safety_gym.safety_gym_environments"
+VELOCITY = "recrl.environments.velocity.velocity_environments"
 
 
 def register_all() -> None:

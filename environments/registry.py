@@ -19,9 +19,9 @@ from pydantic import BaseModel, ConfigDict
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.plugins import load_attribute, resolve
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.environments.velocity.tasks import VELOCITY_TASKS
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS
 
 if TYPE_CHECKING:
     import gymnasium
@@ -120,9 +120,9 @@ TASKS: dict[str, Task] = {
     **{
         name: Task(
             summary=f"Safety Gym: the {task.robot} {SAFETY_GYM[task.goal]}{OBSTACLES[task.level]}.",
-            options="recrl.environments.safety_gym.environments:SafetyGymOptions",
-            make="recrl.environments.safety_gym.environments:make_safety_gym",
-            drawn="recrl.environments.safety_gym.environments:draw_safety_gym",
+            options="recrl.environments.safety_gym.safety_gym_environments:SafetyGymOptions",
+            make="recrl.environments.safety_gym.safety_gym_environments:make_safety_gym",
+            drawn="recrl.environments.safety_gym.safety_gym_environments:draw_safety_gym",
             sample_options={"horizon": 12},
         )
         for name, task in SAFETY_TASKS.items()
@@ -131,9 +131,9 @@ TASKS: dict[str, Task] = {
         name: Task(
             summary=f"Safety-Gymnasium: {task.robot} runs, at a cost of 1 in each step "
             f"above {task.threshold} m/s.",
-            options="recrl.environments.velocity.environments:VelocityOptions",
-            make="recrl.environments.velocity.environments:make_velocity",
-            drawn="recrl.environments.velocity.environments:draw_velocity",
+            options="recrl.environments.velocity.velocity_environments:VelocityOptions",
+            make="recrl.environments.velocity.velocity_environments:make_velocity",
+            drawn="recrl.environments.velocity.velocity_environments:draw_velocity",
             sample_options={"horizon": 12},
         )
         for name, task in VELOCITY_TASKS.items()

@@ -1,8 +1,8 @@
 """Executors run the trials of a sweep.
 
 An executor runs specs and writes all results to the sweep's files; it returns nothing. Results are read from
-the files, so an executor may die at any time. Ray is one executor (``ray.executor``); ``InlineExecutor`` runs
-the trials one after the other in this process: for tests, debuggers and machines without Ray.
+the files, so an executor may die at any time. Ray is one executor (``ray.ray_executor``). ``InlineExecutor``
+runs the trials one after the other in this process: for tests, debuggers and machines without Ray.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import threading
 from collections.abc import Sequence
 from typing import Protocol
 
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.sweep_place import SweepPlace
 
 
 class Executor(Protocol):

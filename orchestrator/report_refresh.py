@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 FIRST_SECONDS = 120.0
@@ -38,7 +38,7 @@ def refreshing(
         interval_seconds: least time between two drawings.
     """
     work = partial(_refresh, store, first_seconds, interval_seconds)
-    with beside(work, name="report"):
+    with background_thread(work, name="report"):
         yield
 
 

@@ -56,7 +56,7 @@ from typing import Any, Literal
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.dynamic_options import DynamicConfig
-from recrl.teachers.start import StartMeasurement
+from recrl.teachers.start_limits import StartMeasurement
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState, already_seen, progress
 from recrl.teachers.windows import WindowStatistics, extend, last_two_windows
 

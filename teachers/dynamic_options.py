@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from recrl.teachers.start import START_FRACTION
+from recrl.teachers.start_limits import START_FRACTION
 from recrl.teachers.windows import WindowUnit
 
 # The literal pseudocode. The paper does not give W and eps_pi: W is five updates of 16 episodes.

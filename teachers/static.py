@@ -16,7 +16,7 @@ from dataclasses import replace
 from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep
-from recrl.teachers.start import START_FRACTION, StartMeasurement
+from recrl.teachers.start_limits import START_FRACTION, StartMeasurement
 from recrl.teachers.teacher import (
     ProgressReport,
     TeacherSpec,

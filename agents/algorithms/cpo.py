@@ -26,8 +26,8 @@ from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import reward_spread
-from recrl.agents.learning.batch import to_tensor
 from recrl.agents.learning.distributions import Distribution, mean_divergence
+from recrl.agents.learning.learning_batch import to_tensor
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.learning.surrogates import surrogate

@@ -69,7 +69,7 @@ def most_violated(gaps: Floats, spreads: Floats, tolerance: float) -> int | None
     return int(np.argmax(np.where(violated, gaps / spreads, -np.inf)))
 
 
-def step_down(problem: StepProblem, corrected: int, config: CRPOConfig) -> DualSolution:
+def cost_step(problem: StepProblem, corrected: int, config: CRPOConfig) -> DualSolution:
     """Return the module's step that decreases one of the j costs."""
     squared = float(problem.gram[corrected, corrected])
     weights = np.zeros_like(problem.violations)
@@ -83,7 +83,7 @@ def step_down(problem: StepProblem, corrected: int, config: CRPOConfig) -> DualS
     return DualSolution(StepCase.RECOVERY, 0.0, weights, np.full_like(weights, np.nan), (corrected,))
 
 
-def step_up(problem: StepProblem, config: CRPOConfig) -> DualSolution:
+def reward_step(problem: StepProblem, config: CRPOConfig) -> DualSolution:
     """Return the module's step that increases the reward; violations, if any, are within the tolerance."""
     nothing, size = np.zeros_like(problem.violations), 0.0
     if problem.squared_gradient > NO_INFLUENCE:
@@ -132,9 +132,9 @@ class ConstraintRectifiedPolicyOptimisation:
         problem, solved = linearise(model, active, model.metric(config, generator), config)
         multipliers = np.zeros_like(constraints.limits)
         if corrected is None:
-            solution = step_up(problem, config)
+            solution = reward_step(problem, config)
         else:
-            solution = step_down(problem, int(np.searchsorted(active.index, corrected)), config)
+            solution = cost_step(problem, int(np.searchsorted(active.index, corrected)), config)
             multipliers[corrected] = np.inf  # as if this were the only constraint
         is_acceptable = improvement(model, corrected, config.target_kl)
         metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)

@@ -34,8 +34,13 @@ from torch import Tensor
 from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.batch import LearningBatch, to_tensor
-from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
+from recrl.agents.learning.gradient_ascent import (
+    FirstOrderRule,
+    Objective,
+    gradient_ascent,
+    normalised_by_penalties,
+)
+from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed, no_steps
 from recrl.agents.learning.surrogates import (
@@ -48,14 +53,14 @@ from recrl.environments.cmdp import CMDPSpec, Floats
 
 
 def barrier(slack: Tensor, *, sharpness: float, slope: float) -> Tensor:
-    """Return the barrier phi of each slack, any shape; ``sharpness`` is t and ``slope`` is kappa."""
+    """Return the barrier phi of each slack, in its shape; ``sharpness`` is t and ``slope`` is kappa."""
     edge = 1.0 / (sharpness * slope)
     inside = torch.log(slack.clamp(min=edge)) / sharpness
     return inside + slope * (slack - edge).clamp(max=0.0)
 
 
 def slopes(slack: npt.NDArray[np.floating], config: IPOConfig) -> Floats:
-    """Return the derivatives of the barriers, which weight the costs: 1 / (t s), or kappa."""
+    """Return the barriers' derivatives at slacks s, [j], the weights of costs: 1 / (t s), or kappa; [j]."""
     edge = 1.0 / (config.barrier_sharpness * config.barrier_slope)
     charged = 1.0 / (config.barrier_sharpness * np.maximum(slack, edge))
     return np.asarray(charged, dtype=np.float64)
@@ -111,7 +116,9 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
         rewards, costs, violations = experience.in_reward_spreads()
 
         def objective(part: Experience) -> Objective:
-            return with_prices(barrier_surrogate_objective(part.batch, rewards, costs, violations, config))
+            return normalised_by_penalties(
+                barrier_surrogate_objective(part.batch, rewards, costs, violations, config)
+            )
 
         metrics = gradient_ascent(
             policy, self._optimiser, experience, objective, config=config, generator=generator

@@ -24,8 +24,13 @@ from torch import Tensor
 from recrl.agents.algorithms.own_options import P3OConfig
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.batch import LearningBatch, to_tensor
-from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_prices
+from recrl.agents.learning.gradient_ascent import (
+    FirstOrderRule,
+    Objective,
+    gradient_ascent,
+    normalised_by_penalties,
+)
+from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed, no_steps
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
@@ -82,7 +87,7 @@ class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
             surrogate_objective = penalised_surrogate_objective(
                 part.batch, rewards, costs, violations, clip=config.clip, factor=config.penalty_factor
             )
-            return with_prices(surrogate_objective)
+            return normalised_by_penalties(surrogate_objective)
 
         metrics = gradient_ascent(
             policy, self._optimiser, experience, objective, config=config, generator=generator

@@ -23,8 +23,8 @@ from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import penalised_advantages
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate

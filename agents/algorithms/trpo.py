@@ -27,7 +27,7 @@ from recrl.agents.trust_region.line_search import line_search
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
-def step_up(
+def trust_region_step(
     policy: StochasticPolicy,
     experience: Experience,
     objective: Floats,
@@ -98,7 +98,7 @@ class TrustRegionPolicyOptimisation:
     ) -> dict[str, float]:
         """Take one step on the reward's surrogate."""
         rewards, _ = scaled_advantages(experience.advantages)
-        metrics = step_up(policy, experience, rewards, self._config, generator)
+        metrics = trust_region_step(policy, experience, rewards, self._config, generator)
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 
 

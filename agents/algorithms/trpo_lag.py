@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from recrl.agents.algorithms.own_options import TRPOLagConfig
-from recrl.agents.algorithms.trpo import step_up
+from recrl.agents.algorithms.trpo import trust_region_step
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
@@ -37,7 +37,7 @@ class TRPOLagrangian:
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
         penalty = self._multipliers.update(experience)
-        metrics = step_up(
+        metrics = trust_region_step(
             policy,
             experience,
             penalty.advantages,

@@ -28,10 +28,10 @@ from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, Tai
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import generalised_advantages, next_values
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.estimates import Estimates, row_targets
 from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
 from recrl.agents.learning.scales import RunningScale, quotient
@@ -253,7 +253,7 @@ class ActorCritic:
         return {"value_loss_reward": float(mean[0])} | indexed("value_loss_cost", mean[1:])
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32]) -> dict[str, float]:
-        """Make the policy more random once; see ``recrl.agents.learning.noise``."""
+        """Make the policy more random once; see ``recrl.agents.learning.noise_scales``."""
         with self._on_its_device():
             metrics = self._policy.add_noise(noise, self._encoder(observations), self._config.noise_form)
         self._policy.publish()

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from recrl.agents.learning.batch import LearningBatch, to_tensor
+from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
 from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.learning.scales import quotient
 from recrl.environments.cmdp import Floats

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.observation_features import Encoder
-from recrl.agents.policy_module import PolicyModule
+from recrl.agents.torch_export import PolicyModule
 from recrl.environments.cmdp import Floats
 
 

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Distribution, mean_divergence
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful
 from recrl.agents.networks.flat_parameters import Adam
@@ -62,7 +62,7 @@ def with_entropy(
     return objective
 
 
-def with_prices(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
+def normalised_by_penalties(surrogate_objective: Callable[[Tensor], tuple[Tensor, float]]) -> Objective:
     """Make an objective of a function of the ratios that also returns the total weight of its penalties.
 
     The objective is divided by 1 + that weight, because the gradients of penalties are proportional to their

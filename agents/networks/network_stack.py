@@ -34,11 +34,22 @@ class Stack(Protocol):
         ...
 
     def output_change(self, activations: Sequence[Tensor], change: Sequence[Tensor]) -> Tensor:
-        """The derivative of the outputs along a change of the parameters, [C, U, out]."""
+        """Return the derivative of the outputs along a change of the parameters, [C, U, out].
+
+        Args:
+            activations: of one block of U rows, from ``activations``.
+            change: of each parameter, in its shape, as from ``FlatParameters.pieces``.
+        """
         ...
 
     def pull_back(self, activations: Sequence[Tensor], slope: Tensor, *, add: bool = False) -> None:
-        """Write the derivative of a loss by the parameters to the gradient block."""
+        """Write the derivative of a loss by the parameters to the gradient block.
+
+        Args:
+            activations: of one block of U rows, from ``activations``.
+            slope: derivative of the loss by the outputs, [C, U, out].
+            add: whether to add to the gradient block instead of overwriting it.
+        """
         ...
 
 

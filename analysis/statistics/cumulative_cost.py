@@ -92,9 +92,8 @@ def policy_costs(
         end_step, cost, limit, ceiling, bound, discounted_excess (of the update that made the policy, 0 for
         the first), discounted_bound: the summands of the module's sums; NaN if unknown.
     """
-    costs = (
-        updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)
-    )  # no episode ended: as for the policy before
+    # no episode ended: as for the policy before
+    costs = updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)
     limits = updates[f"limit_{cost}"].to_numpy(np.float64)
     ceiling = math.inf if sizes is None else sizes.ceiling
     first = costs[0] if sizes is None else ceiling
@@ -121,7 +120,10 @@ def policy_costs(
 
 
 def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, discount: float) -> Floats:
-    """Return eps of each update: the largest possible value, or the agent's measured one if smaller."""
+    """Return eps of each update, [updates], in discounted cost.
+
+    It is the largest possible value, infinite if unknown, or the agent's measured one if smaller.
+    """
     largest = math.inf if sizes is None else sizes.largest_cost / (1.0 - discount)
     name = f"cost_advantage_max_{cost}"
     seen = updates[name].to_numpy(np.float64) if name in updates else np.full(len(updates), math.inf)

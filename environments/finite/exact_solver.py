@@ -220,7 +220,7 @@ def _minimise(
 
 
 def _occupation(model: FiniteCMDP, policy: Floats) -> Floats:
-    """x_t(s, a) of a policy [H, S, A], in the policy's shape."""
+    """Return x_t(s, a), the probability of state s and action a in step t of a policy; both are [H, S, A]."""
     occupation = np.zeros((model.horizon, model.num_states, model.num_actions))
     distribution: Floats = model.start
     successors = model.successors.reshape(-1)
@@ -233,7 +233,10 @@ def _occupation(model: FiniteCMDP, policy: Floats) -> Floats:
 
 
 def _conditional(occupation: Floats) -> Floats:
-    """pi_t(a | s) = x_t(s, a) / sum_a x_t(s, a); uniform in states that are never visited."""
+    """Return the policy of an occupation x, both [H, S, A]; it is uniform in states that are never visited.
+
+    pi_t(a | s) = x_t(s, a) / sum_a x_t(s, a).
+    """
     mass = occupation.sum(axis=2, keepdims=True)
     policy: Floats = np.full_like(occupation, 1.0 / occupation.shape[2])
     np.divide(occupation, mass, out=policy, where=mass > 1e-12)

@@ -25,7 +25,13 @@ import numpy as np
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.scene import gremlin_xml
-from recrl.environments.safety_gym.tasks import GREMLIN_HEIGHT, GREMLIN_TRAVEL, HORIZON, SUBSTEPS, SafetyTask
+from recrl.environments.safety_gym.task_definitions import (
+    GREMLIN_HEIGHT,
+    GREMLIN_TRAVEL,
+    HORIZON,
+    SUBSTEPS,
+    SafetyTask,
+)
 
 ON_COURSE = 0.005
 """Distance to f(t), metres, within which the body may become another gremlin."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.tasks import ROBOT_KEEPOUT, SafetyTask
+from recrl.environments.safety_gym.task_definitions import ROBOT_KEEPOUT, SafetyTask
 from recrl.environments.simulation.machine_code import compiled_for_arrays
 
 TRIES = 100

@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyGymBatch
 from recrl.environments.safety_gym.gremlins import gremlin_course
+from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch
 from recrl.environments.safety_gym.scene import rotation_matrices, scene_xml, upright
-from recrl.environments.safety_gym.tasks import GOAL_HEIGHT, LIDAR_BINS
+from recrl.environments.safety_gym.task_definitions import GOAL_HEIGHT, LIDAR_BINS
 from recrl.environments.simulation.rendering import MujocoRenderer
 
 Colour = tuple[float, float, float]

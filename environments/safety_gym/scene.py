@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.tasks import GREMLIN_HEIGHT, ROBOT_HEIGHT, SafetyTask
+from recrl.environments.safety_gym.task_definitions import GREMLIN_HEIGHT, ROBOT_HEIGHT, SafetyTask
 
 SLEEP_TOLERANCE = 5e-5
 VASE_SINK = 4e-5

@@ -1,6 +1,6 @@
 """The record of a task for compiled code: constants, addresses, and offsets in MuJoCo's structures.
 
-The record is declared in ``recrl.environments.safety_gym.compiled_step``.
+The record is declared in ``recrl.environments.safety_gym.step_records``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import (
+from recrl.environments.safety_gym.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
+from recrl.environments.safety_gym.layout import keepouts
+from recrl.environments.safety_gym.scene import Scene
+from recrl.environments.safety_gym.step_records import (
     ENVIRONMENT,
     KINDS,
     MAX_BODIES,
@@ -25,10 +28,7 @@ from recrl.environments.safety_gym.compiled_step import (
     TASK,
     TERMS,
 )
-from recrl.environments.safety_gym.gremlins import ALERT, IDLE_PLACE, ON_COURSE, Course, gremlin_course
-from recrl.environments.safety_gym.layout import keepouts
-from recrl.environments.safety_gym.scene import Scene
-from recrl.environments.safety_gym.tasks import (
+from recrl.environments.safety_gym.task_definitions import (
     GOAL_HEIGHT,
     GRAVITY,
     GREMLIN_TRAVEL,

@@ -30,7 +30,7 @@ class Named(Protocol):
         ...
 
 
-class Outcome(Protocol):
+class StepOutcome(Protocol):
     """Result of one step of all environments."""
 
     @property
@@ -55,7 +55,7 @@ class Outcome(Protocol):
 
 
 TaskT = TypeVar("TaskT", bound=Named)
-OutcomeT = TypeVar("OutcomeT", bound=Outcome)
+OutcomeT = TypeVar("OutcomeT", bound=StepOutcome)
 
 
 class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):

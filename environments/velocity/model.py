@@ -15,7 +15,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from recrl.environments.velocity.tasks import VelocityTask
+from recrl.environments.velocity.task_definitions import VelocityTask
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 

@@ -31,7 +31,7 @@ PHYSICS = np.dtype(
         ("forces", np.bool_),  # whether contact forces on bodies are computed
         ("fields", np.int64),  # number of copied fields
         ("offset", np.int64, (MAX_FIELDS,)),  # in mjData
-        ("size", np.int64, (MAX_FIELDS,)),  # size
+        ("size", np.int64, (MAX_FIELDS,)),  # numbers of one environment
         ("copy", np.int64, (MAX_FIELDS,)),  # address of [B, size]
     ],
     align=True,
@@ -61,7 +61,13 @@ def physics_record(frame_skip: int, copies: dict[str, Floats], *, forces: bool) 
 
 @compiled
 def copy_fields(physics: Any, data: int, index: int) -> None:
-    """Copy the fields that MuJoCo computed last."""
+    """Copy the fields that MuJoCo computed last to the arrays of ``physics_record``.
+
+    Args:
+        physics: the record ``PHYSICS``.
+        data: address of one environment's ``mjData``.
+        index: of that environment, the row of each array [B, size].
+    """
     for place in range(physics.fields):
         size = physics.size[place]
         source = _doubles(_addresses(data + physics.offset[place], 1)[0], size)

@@ -7,7 +7,7 @@ import copy
 import mujoco
 
 from recrl.environments.simulation.rendering import MujocoRenderer
-from recrl.environments.velocity.batch import TORSO, VelocityBatch
+from recrl.environments.velocity.velocity_batch import TORSO, VelocityBatch
 
 CAMERA_ELEVATION = -20.0
 

@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from recrl.agents.algorithms.trpo import step_up
+from recrl.agents.algorithms.trpo import trust_region_step
 from recrl.agents.learning.actor_critic import fresh_agent
 from recrl.agents.learning.advantages import SMALLEST_STD
 from recrl.agents.learning.policy_rule import indexed
@@ -28,7 +28,7 @@ class FixedMultiplier:
         advantages /= advantages.std(axis=0).clip(SMALLEST_STD)
         multipliers = self.config.multiplier * (experience.constraints.gaps > 0.0)  # [k]
         objective = advantages[:, 0] - advantages[:, 1:] @ multipliers
-        metrics = step_up(policy, experience, objective, self.config, generator)
+        metrics = trust_region_step(policy, experience, objective, self.config, generator)
         return {**metrics, **indexed("multiplier", multipliers)}
 
 

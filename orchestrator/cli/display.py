@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread as beside
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import Estimate, Plan, PlannedAction
 from recrl.orchestrator.spec import TrialState

@@ -23,9 +23,9 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.plan import Plan
 from recrl.orchestrator.grid.selection import parse_only
-from recrl.orchestrator.launching import LaunchListener, LaunchOptions, LaunchOutcome, launch_grid
+from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, LaunchOutcome, launch_grid
 from recrl.orchestrator.redaction import redacted
-from recrl.orchestrator.sweep import SweepResult
+from recrl.orchestrator.run_sweep import SweepResult
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 

@@ -16,7 +16,7 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, unmeasured
 from recrl.orchestrator.grid.selection import parse_only
-from recrl.orchestrator.launching import room
+from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.provenance.code_changes import other_code_sentence
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialState

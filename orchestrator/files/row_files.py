@@ -64,7 +64,7 @@ class RowFile:
         """Whether the columns are fixed."""
         return bool(self.columns)
 
-    def take_up(self, extent: Extent) -> bool:
+    def resume_after(self, extent: Extent) -> bool:
         """Resume the file after its first bytes, if their digest is right.
 
         Args:
@@ -106,7 +106,9 @@ class RowFile:
         self._rows.append(csv_line([row[name] for name in self.columns]))
 
     def write(self) -> tuple[int, Any]:
-        """Write the rows of the next commit after the committed bytes, and sync; ``settle`` commits them.
+        """Write the rows of the next commit after the committed bytes, and sync.
+
+        The rows count as committed after ``mark_committed``.
 
         Raises:
             DamagedError: the file has fewer bytes than are committed.
@@ -128,7 +130,7 @@ class RowFile:
         extended.update(data)
         return self.length + len(data), extended
 
-    def settle(self, written: tuple[int, Any]) -> None:
+    def mark_committed(self, written: tuple[int, Any]) -> None:
         """Mark the result of ``write`` as committed."""
         self.length, self._hash = written
         self._rows.clear()

@@ -55,7 +55,6 @@ from pathlib import Path
 from typing import IO, Any
 
 from recrl.orchestrator.errors import DamagedError, StorageError, SweepBusyError
-from recrl.orchestrator.files.aside import move_aside
 from recrl.orchestrator.files.atomic_files import (
     read_sealed,
     read_whole,
@@ -65,6 +64,7 @@ from recrl.orchestrator.files.atomic_files import (
     write_sealed,
 )
 from recrl.orchestrator.files.locks import look_at_lock, open_lock
+from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.trial_files import Below
 from recrl.orchestrator.files.trial_store import TrialStore

@@ -17,9 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from recrl.orchestrator.errors import DamagedError, StorageError
-from recrl.orchestrator.files.aside import move_aside
 from recrl.orchestrator.files.atomic_files import parsed_object, read_whole, write_sealed
 from recrl.orchestrator.files.locks import locked
+from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.row_files import Extent, digest_of
 from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_reader import RECORD_FORMAT, SPEC_FORMAT, TrialReader

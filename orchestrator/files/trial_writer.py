@@ -23,7 +23,7 @@ from recrl.environments.cmdp import EpisodeStats
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError, RowError
 from recrl.orchestrator.files import checkpoint_format
 from recrl.orchestrator.files.atomic_files import write_atomically, write_sealed
-from recrl.orchestrator.files.row_files import Extent, RowFile, rows_text
+from recrl.orchestrator.files.row_files import Extent, RowFile, csv_line, rows_text
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -79,7 +79,7 @@ class TrialWriter:
             tree = self._newest_usable()
             if tree is None:
                 for file in self._rows:
-                    file.take_up(Extent())
+                    file.resume_after(Extent())
             for file in self._rows:
                 if self.record.committed.get(file.path.name, 0) > file.length:
                     self.store.move_aside(file.path, copy=True)
@@ -104,7 +104,7 @@ class TrialWriter:
             else:
                 if found is not None:
                     continue
-                if all(file.take_up(_extent_in(tree, file.path.name)) for file in self._rows):
+                if all(file.resume_after(_extent_in(tree, file.path.name)) for file in self._rows):
                     found = tree
                     continue
                 logger.warning("%s: its rows are missing; it is renamed", path)
@@ -124,14 +124,14 @@ class TrialWriter:
         if not self._episodes.has_header:
             names = (f"cost_{i}" for i in range(costs)), (f"limit_{i}" for i in range(limits))
             self._episodes.columns = (*EPISODE_COLUMNS, *names[0], *names[1])
-            self._episodes.add_text(",".join(self._episodes.columns) + "\n")
+            self._episodes.add_text(csv_line(self._episodes.columns))
         if len(EPISODE_COLUMNS) + costs + limits != len(self._episodes.columns) or costs != limits:
             raise RowError(
                 f"{self._task}: an episode has {costs} costs and {limits} limits, earlier ones had "
                 f"{len(self._episodes.columns) - len(EPISODE_COLUMNS)} together"
             )
         cells = (*_episode_values(episode), *episode.costs, *episode.limits.values)
-        self._episodes.add_text(",".join(map(str, cells)) + "\n")
+        self._episodes.add_text(csv_line(cells))
 
     def append_update(self, row: Mapping[str, Any]) -> None:
         """Add an update's row to the next commit; all rows of a trial have the same keys, in any order.
@@ -207,7 +207,7 @@ class TrialWriter:
                 **changes,
             )
             for file, done in zip(self._rows, written, strict=True):
-                file.settle(done)
+                file.mark_committed(done)
             for old in self.store.checkpoints()[KEPT_CHECKPOINTS:]:
                 old.unlink()
 

@@ -14,9 +14,9 @@ from typing import Any
 import ray
 
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.sweep_place import SweepPlace
 
 HEARTBEAT_READ_SECONDS = 2.0  # smallest time between two reads of the heartbeats
 STARTUP_GRACE_FACTOR = 5  # startup grace period, in multiples of ``silence_seconds``

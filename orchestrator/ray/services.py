@@ -21,7 +21,7 @@ from typing import Any
 
 import ray
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.exit_codes import ExitCode
 
@@ -110,7 +110,7 @@ class LostServices:
         Args:
             cluster: the connection to it.
         """
-        with beside(self._look, name="Ray's services"), cluster:
+        with background_thread(self._look, name="Ray's services"), cluster:
             self._services = _services()
             try:
                 yield

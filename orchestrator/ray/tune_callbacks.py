@@ -22,13 +22,13 @@ from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import StorageError, TeacherUnavailableError
 from recrl.orchestrator.files.stop_file import StopSign
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import first_line
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.services import LostServices
 from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.sweep_place import SweepPlace
 
 LONGEST_PAUSE_SECONDS = 0.5  # in which Ray is not asked whether a trial has ended
 PAUSE_SHARE = 0.01  # of the time since a trial last began or ended

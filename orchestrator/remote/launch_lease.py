@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import StorageError, SweepBusyError
 from recrl.orchestrator.remote.object_store import ObjectStore
 
@@ -66,7 +66,7 @@ class LaunchLease:
         self._token = str(own["token"])
         try:
             self._objects.delete([STOP_REQUEST])
-            with beside(partial(self._hold, own, stop), name="launch"):
+            with background_thread(partial(self._hold, own, stop), name="launch"):
                 yield
         finally:
             try:

@@ -23,21 +23,21 @@ from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
 from recrl.orchestrator.files.atomic_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.remote.commit_upload import Upload, working_copy
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.remote.patience import patiently, repeatedly
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
+from recrl.orchestrator.remote.retries import repeat_until, retry_while_down
 from recrl.orchestrator.remote.stop_object import StopObject
-from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.sweep_place import SweepPlace
 
 PULL_SECONDS = 10.0  # between two reads of the running trials
 PULLS_AT_ONCE = 8
@@ -136,7 +136,7 @@ class RemoteSweep(SweepPlace):
     def working_copy(
         self, spec: TrialSpec, should_stop: Callable[[], bool]
     ) -> AbstractContextManager[TrialStore]:
-        """See ``SweepPlace`` and ``upload.working_copy``."""
+        """See ``SweepPlace`` and ``commit_upload.working_copy``."""
         return working_copy(self.trial(spec.folder_name), spec, should_stop)
 
     def new_stop_sign(self) -> AbstractContextManager[StopSign]:
@@ -226,10 +226,10 @@ class RemoteSweep(SweepPlace):
         Raises:
             StorageError: the store cannot be read at the end.
         """
-        follow = partial(repeatedly, self._pull_trials, every=every, hint="the trials continue")
-        with beside(follow, name="local copy"):
+        follow = partial(repeat_until, self._pull_trials, every=every, hint="the trials continue")
+        with background_thread(follow, name="local copy"):
             yield
-        patiently(self._pull_trials, stop.is_set)
+        retry_while_down(self._pull_trials, stop.is_set)
 
     def publish(self) -> None:
         """Send the sweep's own files.
@@ -240,7 +240,7 @@ class RemoteSweep(SweepPlace):
         for path in _sweep_files(self.store):
             self.objects.write(path.name, path.read_bytes())
 
-    def settle(self, specs: Sequence[TrialSpec]) -> None:
+    def send_dead_trials(self, specs: Sequence[TrialSpec]) -> None:
         """Send the status of trials whose processes died, which only this machine knows.
 
         Nothing is sent once another launch has taken over the sweep: its attempts may be running.
@@ -254,9 +254,9 @@ class RemoteSweep(SweepPlace):
         """
         if not self.lease.belongs_to_another():
             for spec in specs:
-                self._settle(spec)
+                self._send_dead_trial(spec)
 
-    def _settle(self, spec: TrialSpec) -> None:
+    def _send_dead_trial(self, spec: TrialSpec) -> None:
         trial = self.store.trial(spec)
         record = trial.record()
         if record.token or record.status not in (TrialState.FAILED, TrialState.WAITING):

@@ -4,11 +4,11 @@
         commit-<number>     record, new rows and checkpoint: see ``commit_format``
         alive.json          while the attempt works: its record, every few seconds
 
-A trial runs in a folder of its machine, like any trial; ``upload`` sends each commit. Rules. Readers check
-the lengths and digests of a commit; a truncated commit is ignored. Every attempt writes below its own name
-and depends on no other. So late writes of a node that was lost do no damage and are not read: only the newest
-attempt with a commit is. An attempt starts from the newest commit of earlier ones, so that the results are
-those of a trial that never moved. It makes a commit of its own, then deletes the others. An attempt that
+A trial runs in a folder of its machine, like any trial; ``commit_upload`` sends each commit. Rules. Readers
+check the lengths and digests of a commit; a truncated commit is ignored. Every attempt writes below its own
+name and depends on no other. So late writes of a node that was lost do no damage and are not read: only the
+newest attempt with a commit is. An attempt starts from the newest commit of earlier ones, so that the results
+are those of a trial that never moved. It makes a commit of its own, then deletes the others. An attempt that
 finds a newer one ends.
 
 Trials continue while a store is down. Unsent commits are sent later, and a trial is complete when its last
@@ -55,7 +55,7 @@ class RemoteTrial:
         self.objects = objects
         self.name = name
 
-    def take_up(self, trial: TrialStore) -> None:
+    def download_for_attempt(self, trial: TrialStore) -> None:
         """Download the newest commit to an empty folder, for another attempt.
 
         Raises:
@@ -101,8 +101,8 @@ class RemoteTrial:
         with trial.locked():
             here = trial.record()
             silent = record.status is TrialState.RUNNING
-            judged = here.token == "" and here.attempt >= record.attempt and silent
-            if not judged and here != record:
+            ended_here = here.token == "" and here.attempt >= record.attempt and silent
+            if not ended_here and here != record:
                 trial.write_record(record)
 
     def _pull(self, trial: TrialStore, keys: Sequence[str], *, checkpoints: bool) -> Commit | None:

@@ -141,7 +141,7 @@ class SweepRuns:
         return found
 
     def _own_runs(self) -> list[Run]:
-        """Yield the runs of this sweep, page by page."""
+        """Return all runs of this sweep; MLflow sends them in pages."""
         query = f"tags.`recrl.sweep_id` = '{self._tags['recrl.sweep_id']}'"
         runs: list[Run] = []
         token: str | None = None

@@ -63,7 +63,7 @@ def run_trial(
         Exception: raised by the task, the agent or the teacher, with a note on the update; the last commit is
             intact.
     """
-    life = _Life(writer)
+    life = _SignsOfLife(writer)
     heartbeat = Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS)
     with heartbeat.beating():  # preparation may take minutes
         trial = life.of(Trial(spec, writer, teacher))
@@ -88,7 +88,7 @@ def run_trial(
     return TrialState.COMPLETE
 
 
-class _Life:
+class _SignsOfLife:
     """Content of a trial's heartbeat: its progress, and its speed over the last updates."""
 
     def __init__(self, writer: TrialWriter) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import partial
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import LostLeaseError, StorageError
 
 LEAST_WORK_SECONDS = 1e-3  # least CPU time between two beats; checking for signals uses less
@@ -38,7 +38,7 @@ class Heartbeat:
     def beating(self) -> AbstractContextManager[None]:
         """Beat beside the thread that calls this, until the end of the ``with`` block."""
         clock = time.pthread_getcpuclockid(threading.get_ident())
-        return beside(partial(self._run, clock), name="heartbeat")
+        return background_thread(partial(self._run, clock), name="heartbeat")
 
     def check(self) -> None:
         """Raise LostLeaseError if a beat did: another attempt runs the trial."""

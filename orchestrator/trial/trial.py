@@ -146,7 +146,7 @@ class Trial:
         }
         self._writer.append_update({**row, **self._own_metrics(metrics, row)})
         if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
-            logger.info("%s", self._told(row))
+            logger.info("%s", self._log_line(row))
         self._next_step(episodes, rollout.observations)
 
     def save(self) -> None:
@@ -246,7 +246,7 @@ class Trial:
         ):
             self._event(HARD_LANDING, limits=before.to_json(), deploy_limits=after.to_json())
 
-    def _told(self, row: Mapping[str, Any]) -> str:
+    def _log_line(self, row: Mapping[str, Any]) -> str:
         """Format return and costs of an update as a log line."""
         head = f"update {self.update} of {self.spec.num_updates}, {row['phase']}:"
         if not row["episodes"]:

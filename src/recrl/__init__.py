@@ -22,9 +22,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from recrl._launching import Training, launch, train, validate
     from recrl._results import Policy, load_policy, load_sweep
     from recrl._tasks import make, make_env
+    from recrl._train_and_launch import Training, launch, train, validate
     from recrl.orchestrator.errors import GridError, RecrlError
 
     __version__: str
@@ -48,14 +48,14 @@ _PLACES = {
     "GridError": "recrl.orchestrator.errors",
     "Policy": "recrl._results",
     "RecrlError": "recrl.orchestrator.errors",
-    "Training": "recrl._launching",
-    "launch": "recrl._launching",
+    "Training": "recrl._train_and_launch",
+    "launch": "recrl._train_and_launch",
     "load_policy": "recrl._results",
     "load_sweep": "recrl._results",
     "make": "recrl._tasks",
     "make_env": "recrl._tasks",
-    "train": "recrl._launching",
-    "validate": "recrl._launching",
+    "train": "recrl._train_and_launch",
+    "validate": "recrl._train_and_launch",
 }
 
 

@@ -104,7 +104,7 @@ def test_equal_seeds_give_equal_bytes(agent: str) -> None:
     assert flattened(first.agent.state_dict()) == flattened(second.agent.state_dict())
 
 
-def test_every_student_begins_with_the_same_policy() -> None:
+def test_every_agent_begins_with_the_same_policy() -> None:
     policies = [Lessons(agent, "two-state").agent.state_dict()["policy"] for agent in AGENTS]
     for policy in policies[1:]:
         np.testing.assert_array_equal(policy, policies[0])
@@ -137,7 +137,7 @@ def test_actions_have_the_shape_and_type_of_the_seam(agent: str, task: str) -> N
 
 @every_agent
 @every_task
-def test_the_student_knows_no_limit_of_its_own(agent: str, task: str) -> None:
+def test_the_agent_knows_no_limit_of_its_own(agent: str, task: str) -> None:
     one, other = Lessons(agent, task), Lessons(agent, task)
     rollout, episodes = one.collect()
     costs = episode_costs(episodes, one.num_costs)
@@ -151,7 +151,7 @@ def test_the_student_knows_no_limit_of_its_own(agent: str, task: str) -> None:
 
 @every_agent
 @every_task
-def test_noise_returns_the_same_metrics_and_keeps_the_student_learning(agent: str, task: str) -> None:
+def test_noise_returns_the_same_metrics_and_keeps_the_agent_learning(agent: str, task: str) -> None:
     lessons = Lessons(agent, task)
     lessons.update()
     rollout, _ = lessons.collect()
@@ -223,7 +223,7 @@ MINIBATCHES = {"compaction": False, "minibatch_size": 16, "critic_passes": 2}
 
 @every_agent
 @pytest.mark.parametrize("task", ["two-state-2", "continuous-bandit"])
-def test_a_student_of_minibatches_resumes_bit_for_bit(agent: str, task: str) -> None:
+def test_an_agent_of_minibatches_resumes_bit_for_bit(agent: str, task: str) -> None:
     has_metric = "metric_samples" in agent_config(agent, {}).model_dump()
     options = MINIBATCHES | ({"metric_samples": 20} if has_metric else {})
     lessons = Lessons(agent, task, options)
@@ -274,7 +274,7 @@ def test_memory_is_flat_in_the_length_of_a_run(agent: str, options: dict[str, An
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @every_agent
 @every_task
-def test_a_student_on_a_gpu_learns_what_one_on_a_cpu_learns(agent: str, task: str) -> None:
+def test_an_agent_on_a_gpu_learns_what_one_on_a_cpu_learns(agent: str, task: str) -> None:
     on_cpu = Lessons(agent, task)
     with torch.device("cuda"):
         on_gpu = Lessons(agent, task)

@@ -18,17 +18,17 @@ def test_validating_options_imports_no_torch() -> None:
     assert done.stdout == "False\n"
 
 
-def test_an_unknown_student_is_met_with_the_nearest_known() -> None:
+def test_an_unknown_agent_is_met_with_the_nearest_known() -> None:
     with pytest.raises(UnknownNameError, match=r"no agent is called 'ppo-lagg'; did you mean 'ppo-lag'\?"):
         find_agent("ppo-lagg")
 
 
-def test_a_students_import_path_must_lead_to_an_entry() -> None:
+def test_an_agents_import_path_must_lead_to_an_entry() -> None:
     with pytest.raises(ValueError, match="agent 'json:dumps' must be an AgentEntry, got function"):
         find_agent("json:dumps")
 
 
-def test_an_import_path_finds_a_students_entry(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_import_path_finds_an_agents_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("recrl.agents.registry.MINE", AGENTS["cpo"], raising=False)
     assert find_agent("recrl.agents.registry:MINE") is AGENTS["cpo"]
 

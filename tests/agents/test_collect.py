@@ -163,7 +163,7 @@ def test_environments_with_a_step_of_their_own_take_it() -> None:
         collector.collect(ShownTabular(2, 2), np.random.default_rng(0))
 
 
-def test_a_student_acts_by_the_masses_that_it_shows() -> None:
+def test_an_agent_acts_by_the_masses_that_it_shows() -> None:
     environments = make_vector("rivergrid-1a", 4)
     agent = make_agent("ppo", environments.cmdp, {}, np.random.SeedSequence(0))
     assert isinstance(agent, InvertedPolicy)
@@ -181,7 +181,7 @@ def test_a_student_acts_by_the_masses_that_it_shows() -> None:
     assert agent.act(observations, np.random.default_rng(1)).tolist() == expected
 
 
-def test_gaussian_actions_are_clipped_for_the_task_and_kept_for_the_student() -> None:
+def test_gaussian_actions_are_clipped_for_the_task_and_kept_for_the_agent() -> None:
     collector = collector_of("continuous-bandit", num_envs=1, num_steps=1)
     rollout, _ = collector.collect(Constantly(np.array([3.0], np.float32)), np.random.default_rng(0))
     assert rollout.actions.tolist() == [[[3.0]]]
@@ -215,7 +215,7 @@ def test_observations_of_every_supported_space_become_rows() -> None:
     assert observation_rows(MultiBinary(2), np.array([[1, 0]], np.int8)).tolist() == [[1.0, 0.0]]
 
 
-def test_a_space_that_no_student_handles_is_refused() -> None:
+def test_a_space_that_no_agent_handles_is_refused() -> None:
     with pytest.raises(UnsupportedSpaceError, match="observation space must be Discrete, Box or MultiBinary"):
         observation_size(Dict({}))
     with pytest.raises(UnsupportedSpaceError, match="action space must be Discrete or a Box of floats"):

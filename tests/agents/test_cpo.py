@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
-from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.surrogates import surrogate
 from recrl.environments.cmdp import Floats
 

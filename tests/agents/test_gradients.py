@@ -14,10 +14,10 @@ from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.algorithms.p3o import penalised_surrogate_objective
 from recrl.agents.algorithms.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.gradient_ascent import Objective, with_entropy
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.agents.networks import tanh_stack

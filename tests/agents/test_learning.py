@@ -80,7 +80,7 @@ def last_quarter(lesson: Lesson, seed: int) -> tuple[float, Floats]:
         for seed in range(lesson.seeds)
     ],
 )
-def test_a_student_reaches_the_constrained_optimum(lesson: Lesson, seed: int) -> None:
+def test_an_agent_reaches_the_constrained_optimum(lesson: Lesson, seed: int) -> None:
     optimum = optimal_return(lesson.task, {}, CostLimits(lesson.limits))
     unconstrained = optimal_return(lesson.task, {}, CostLimits.unlimited(len(lesson.limits)))
     assert optimum is not None and unconstrained is not None

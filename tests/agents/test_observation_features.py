@@ -11,7 +11,7 @@ from recrl.agents.observation_features import Encoder, ProximityObservation, Run
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec, ObservationComponent
 from recrl.environments.registry import make_vector
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 
 SPEED = ObservationComponent("speed", 1)
 WALLS = ObservationComponent("walls_lidar", 2, lidar_range=3.0)

@@ -11,15 +11,15 @@ from scipy.optimize import nnls
 
 from recrl.agents.algorithms.crpo import (
     ConstraintRectifiedPolicyOptimisation,
+    cost_step,
     most_violated,
-    step_down,
-    step_up,
+    reward_step,
 )
 from recrl.agents.algorithms.own_options import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.algorithms.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal
@@ -156,7 +156,7 @@ def test_the_step_serves_the_constraints_within_the_trust_region(name: str, spac
 
 
 @pytest.mark.parametrize("name", ["pcpo", "crpo"])
-def test_without_a_finished_episode_a_student_without_multipliers_stays(name: str) -> None:
+def test_without_a_finished_episode_an_agent_without_multipliers_stays(name: str) -> None:
     metrics, change = improved(name, SPACES[0], [math.nan, math.nan], [1.0, 1.0])
     assert not change.any()
     assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
@@ -174,7 +174,7 @@ def crpo_sizes(gradient: list[float], violation: float, kl_price: float) -> tupl
     g, costs = np.array(gradient), EAST[None]
     problem = StepProblem(float(g @ g), -costs @ g, costs @ costs.T, np.array([violation]), 0.5)
     config = CRPOConfig(kl_price=kl_price)
-    return step_up(problem, config).gradient_weight, step_down(problem, 0, config).constraint_weights[0]
+    return reward_step(problem, config).gradient_weight, cost_step(problem, 0, config).constraint_weights[0]
 
 
 def test_crpos_steps_end_at_the_limit_where_nothing_is_left_to_gain() -> None:
@@ -197,8 +197,8 @@ def test_crpos_steps_are_as_long_as_the_trust_region_far_from_limits_and_without
 
 def test_crpo_rests_where_nothing_can_be_changed() -> None:
     nothing = StepProblem(0.0, np.zeros(1), np.zeros((1, 1)), np.array([0.1]), 0.5)
-    assert step_up(nothing, CRPOConfig()).gradient_weight == 0.0
-    assert step_down(nothing, 0, CRPOConfig()).constraint_weights.tolist() == [0.0]
+    assert reward_step(nothing, CRPOConfig()).gradient_weight == 0.0
+    assert cost_step(nothing, 0, CRPOConfig()).constraint_weights.tolist() == [0.0]
 
 
 def test_crpo_mends_what_is_most_violated_in_its_own_spread() -> None:

@@ -9,7 +9,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
 from recrl.agents.learning.distributions import Categorical, Gaussian, mean_divergence
-from recrl.agents.learning.noise import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.learning.noise_scales import matching_log_std, matching_scale, off_greedy_mass
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
 from recrl.agents.networks.architecture import NetworkForm, orthogonal
 from recrl.agents.networks.tanh_stack import TanhStack

@@ -10,12 +10,17 @@ from gymnasium.spaces import Box, Discrete, Space
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.own_options import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.algorithms.ppo import ProximalPolicyOptimisation
-from recrl.agents.algorithms.trpo import TrustRegionPolicyOptimisation, step_up
+from recrl.agents.algorithms.trpo import TrustRegionPolicyOptimisation, trust_region_step
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import penalised_advantages
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Categorical
-from recrl.agents.learning.gradient_ascent import Objective, gradient_ascent, with_entropy, with_prices
+from recrl.agents.learning.gradient_ascent import (
+    Objective,
+    gradient_ascent,
+    normalised_by_penalties,
+    with_entropy,
+)
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal
@@ -92,7 +97,9 @@ def test_with_a_price_of_the_kl_a_step_is_as_long_as_the_gain_is_large_up_to_the
         objective = size * (advantages[:, 0] - advantages[:, 0].mean())
         generator = np.random.default_rng(0)
         config = TRPOConfig(target_kl=DELTA)
-        return step_up(policy, experience, objective, config, generator, kl_price=kl_price)["step_norm"]
+        return trust_region_step(policy, experience, objective, config, generator, kl_price=kl_price)[
+            "step_norm"
+        ]
 
     edge = stepped(1.0, kl_price=0.0)
     assert stepped(1e-3, kl_price=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
@@ -164,7 +171,7 @@ def test_an_entropy_bonus_adds_the_mean_entropy_in_nats() -> None:
 def test_a_priced_gain_is_divided_by_one_and_its_price() -> None:
     _, batch, _ = sampled(SPACES[0])
     uniform = Categorical(torch.log_softmax(torch.zeros(len(batch.unique_observations), 4), dim=1))
-    objective = with_prices(lambda ratios: (ratios.sum(), 3.0))
+    objective = normalised_by_penalties(lambda ratios: (ratios.sum(), 3.0))
     assert float(objective(uniform, torch.ones(2))) == 0.5
 
 

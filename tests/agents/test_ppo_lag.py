@@ -12,7 +12,7 @@ from recrl.agents.algorithms.ppo_lag import SURROGATE_OBJECTIVES, PPOLagrangian
 from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import scaled_advantages
-from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal

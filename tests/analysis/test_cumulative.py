@@ -103,7 +103,7 @@ def test_a_negative_budget_is_refused(finished: Sweep) -> None:
         cumulative_cost.admissible_limits(pd.DataFrame(), finished, budget=-1.0)
 
 
-def test_lemma_1_is_not_said_of_other_students(finished: Sweep) -> None:
+def test_lemma_1_is_not_said_of_other_agents(finished: Sweep) -> None:
     rows = cumulative_cost.cumulative_costs(finished)
     assert rows.loc[rows["agent"] == "ppo-lag", ["bound", "discounted_excess_sum"]].isna().all(axis=None)
     assert rows["ceiling_sum"].notna().all()

@@ -85,7 +85,7 @@ def test_curricula_show_every_run_and_the_mean(finished: Sweep) -> None:
     assert max(line.get_linewidth() for line in dynamic) > 3 * min(line.get_linewidth() for line in dynamic)
 
 
-def test_a_students_task_that_has_not_run_has_an_empty_panel_of_limits(finished: Sweep) -> None:
+def test_an_agents_task_that_has_not_run_has_an_empty_panel_of_limits(finished: Sweep) -> None:
     missing = (finished.updates["task"] == "river-a") & (finished.updates["agent"] == "cpo")
     rest = dataclasses.replace(finished, updates=finished.updates[~missing])
     titles = [axes.get_title(loc="left") for axes in learning_curves.curricula(rest).axes]

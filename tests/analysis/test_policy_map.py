@@ -72,7 +72,7 @@ def test_arrows_go_where_the_policies_go(river_sweep: Sweep) -> None:
     assert squares == {(x, 6) for x in range(1, 7)} | {(x, 7) for x in range(1, 8)}
 
 
-def test_a_student_without_a_table_has_no_map(river_sweep: Sweep) -> None:
+def test_an_agent_without_a_table_has_no_map(river_sweep: Sweep) -> None:
     assert policy_maps(river_sweep, "ppo-lag") is None
 
 

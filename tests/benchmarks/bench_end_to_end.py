@@ -39,7 +39,7 @@ from recrl.agents.registry import agent_config, make_agent
 from recrl.agents.shared_options import ActorCriticConfig
 from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
-from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.vector import CMDPVectorEnv
 
 UPDATE, SAFETY_GYM = (

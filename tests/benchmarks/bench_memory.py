@@ -22,10 +22,10 @@ from pathlib import Path
 
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import local_cluster
-from recrl.orchestrator.ray.executor import RayExecutor
+from recrl.orchestrator.ray.ray_executor import RayExecutor
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.client import tracking_uri
 from tests.benchmarks.bench_overhead import car_trial, family

@@ -23,11 +23,11 @@ import ray
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import local_cluster
-from recrl.orchestrator.ray.executor import RayExecutor
+from recrl.orchestrator.ray.ray_executor import RayExecutor
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 

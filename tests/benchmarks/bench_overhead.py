@@ -31,7 +31,7 @@ import torch
 
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.launching import SYNC_INTERVAL_SECONDS
+from recrl.orchestrator.launch_grid import SYNC_INTERVAL_SECONDS
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.client import tracking_uri

@@ -24,14 +24,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import SweepPlace
-from recrl.orchestrator.ray import executor
+from recrl.orchestrator.ray import ray_executor
 from recrl.orchestrator.ray.clusters import local_cluster
-from recrl.orchestrator.ray.executor import RayExecutor
+from recrl.orchestrator.ray.ray_executor import RayExecutor
 from recrl.orchestrator.ray.teacher_service import start_teacher_service
 from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.sweep_place import SweepPlace
 from tests.benchmarks.bench_memory import name_of
 from tests.benchmarks.bench_overhead import car_trial, family
 
@@ -44,15 +44,15 @@ NICENESS = {"worker_niceness": 0}  # of trials: on a busy machine they would get
 @contextmanager
 def settings(*, ours: bool) -> Iterator[None]:
     """Start clusters with our settings meanwhile, or without."""
-    before: Mapping[str, Any] = {name: getattr(executor, name) for name in ("SELDOM", "LEFT_OUT")}
+    before: Mapping[str, Any] = {name: getattr(ray_executor, name) for name in ("SELDOM", "LEFT_OUT")}
     now = {**before, "SELDOM": {**before["SELDOM"], **NICENESS}}
     for name, value in (now if ours else {"SELDOM": NICENESS, "LEFT_OUT": {}}).items():
-        setattr(executor, name, value)
+        setattr(ray_executor, name, value)
     try:
         yield
     finally:
         for name, value in before.items():
-            setattr(executor, name, value)
+            setattr(ray_executor, name, value)
 
 
 def used() -> dict[tuple[int, int], tuple[str, float]]:
@@ -102,7 +102,7 @@ def watch_trials(specs: Sequence[TrialSpec], root: Path, title: str, seconds: fl
         show_shares(title, seconds, len(specs))
         stop.set()
 
-    with beside(watch, name="watch"):
+    with background_thread(watch, name="watch"):
         RayExecutor(num_cpus=len(specs)).run(specs, SweepPlace(store), stop)
 
 

@@ -36,11 +36,11 @@ import mujoco.batch
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyGymBatch
-from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.gremlins import leads
+from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import PARKED
-from recrl.environments.safety_gym.tasks import HORIZON, SAFETY_TASKS, SUBSTEPS
+from recrl.environments.safety_gym.task_definitions import HORIZON, SAFETY_TASKS, SUBSTEPS
 
 NUM_ENVS, MANY_ENVS = 16, 64
 STEPS = 5

@@ -26,7 +26,7 @@ from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 
 STEPS_PER_UPDATE = 3200
-STUDENT_METRICS = (
+AGENT_METRICS = (
     *("kl", "entropy", "clip_fraction", "policy_steps", "multiplier_0", "cost_gap_0", "surrogate_reward"),
     *("surrogate_cost_0", "value_loss_reward", "value_loss_cost_0", "cost_advantage_max_0", "case"),
 )
@@ -66,7 +66,7 @@ def write_sweep(root: Path, *, trials: int, updates: int) -> SweepStore:
                     "update_seconds": 0.02,
                     "cost_0": float(generator.gamma(5.0)),
                     "limit_0": 65.0 - 60.0 * update / updates,
-                    **{name: float(generator.normal()) for name in STUDENT_METRICS},
+                    **{name: float(generator.normal()) for name in AGENT_METRICS},
                 }
             )
         writer.commit({}, update=updates, env_steps=updates * STEPS_PER_UPDATE)

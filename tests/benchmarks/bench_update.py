@@ -32,8 +32,8 @@ from gymnasium.spaces import Box
 
 from recrl.agents.agent import Rollout
 from recrl.agents.collection import Collector, episode_costs
-from recrl.agents.learning.batch import find_repeated
 from recrl.agents.learning.critics import Critics
+from recrl.agents.learning.learning_batch import find_repeated
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.networks.architecture import NetworkForm, xavier
 from recrl.agents.networks.flat_parameters import Adam

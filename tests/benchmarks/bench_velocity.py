@@ -26,9 +26,9 @@ import mujoco
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.velocity.batch import VelocityBatch
-from recrl.environments.velocity.environments import VelocityVectorEnv
-from recrl.environments.velocity.tasks import VELOCITY_TASKS
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS
+from recrl.environments.velocity.velocity_batch import VelocityBatch
+from recrl.environments.velocity.velocity_environments import VelocityVectorEnv
 
 NUM_ENVS = 16
 STEPS = 5

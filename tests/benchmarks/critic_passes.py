@@ -1,4 +1,4 @@
-"""What fewer passes of the critics cost: how well they tell the next rollout, and what the student learns.
+"""What fewer passes of the critics cost: how well they tell the next rollout, and what the agent learns.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/critic_passes.py --folder results/learning
 
@@ -24,7 +24,7 @@ import torch
 from recrl.agents.agent import Rollout
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.learning.actor_critic import ActorCritic
-from recrl.agents.learning.batch import LearningBatch
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector
@@ -32,7 +32,7 @@ from recrl.environments.registry import make_vector
 NUM_ENVS, NUM_STEPS = 20, 1000
 STEP = CurriculumStep(CostLimits((25.0,)))
 COLUMNS = [
-    "student",
+    "agent",
     "passes",
     "metric_samples",
     "seed",
@@ -55,12 +55,12 @@ def explained(agent: ActorCritic, rollout: Rollout) -> Floats:
     return share
 
 
-def learn(student: str, task: str, passes: int, *, samples: int, seed: int, updates: int) -> pd.DataFrame:
+def learn(agent_name: str, task: str, passes: int, *, samples: int, seed: int, updates: int) -> pd.DataFrame:
     """A row an update."""
     environment_seed, agent_seed, policy_seed = np.random.SeedSequence(seed).spawn(3)
     environments = make_vector(task, NUM_ENVS)
-    options = {"critic_passes": passes} | ({"metric_samples": samples} if student == "cpo" else {})
-    agent = make_agent(student, environments.cmdp, options, agent_seed)
+    options = {"critic_passes": passes} | ({"metric_samples": samples} if agent_name == "cpo" else {})
+    agent = make_agent(agent_name, environments.cmdp, options, agent_seed)
     assert isinstance(agent, ActorCritic)
     collector = Collector(environments, num_steps=NUM_STEPS)
     collector.reset(seed=int(environment_seed.generate_state(1)[0]))
@@ -75,7 +75,7 @@ def learn(student: str, task: str, passes: int, *, samples: int, seed: int, upda
         seconds = time.process_time() - before
         earned = float(np.mean([episode.episode_return for episode in episodes]))
         steps = update * NUM_ENVS * NUM_STEPS
-        rows.append((student, passes, samples, seed, steps, earned, float(costs.mean()), *told, seconds))
+        rows.append((agent_name, passes, samples, seed, steps, earned, float(costs.mean()), *told, seconds))
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
@@ -83,7 +83,7 @@ def main() -> None:
     """Learn, write and print."""
     parser = argparse.ArgumentParser(description="What fewer passes of the critics cost.")
     parser.add_argument("--task", default="PointGoal1")
-    parser.add_argument("--students", nargs="+", default=["cpo"])
+    parser.add_argument("--agents", nargs="+", default=["cpo"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--passes", nargs="+", type=int, default=[5, 4, 3])
     parser.add_argument("--metric-samples", type=int, default=2048)
@@ -92,12 +92,12 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     found = []
-    for student in arguments.students:
+    for agent_name in arguments.agents:
         for seed in arguments.seeds:
             for passes in arguments.passes:
                 found.append(
                     learn(
-                        student,
+                        agent_name,
                         arguments.task,
                         passes,
                         samples=arguments.metric_samples,
@@ -107,7 +107,7 @@ def main() -> None:
                 )
                 means = found[-1].tail(arguments.updates // 2).mean(numeric_only=True)
                 print(
-                    f"{student} {arguments.task} passes {passes} seed {seed}: return "
+                    f"{agent_name} {arguments.task} passes {passes} seed {seed}: return "
                     f"{means['episode_return']:.2f}, cost {means['cost']:.1f}, explained "
                     f"{means['explained_reward']:.3f} / {means['explained_cost']:.3f}, update "
                     f"{means['update_cpu_seconds']:.2f} s",

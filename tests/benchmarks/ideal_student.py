@@ -1,4 +1,4 @@
-"""What keeps agents from a dry way beside a narrow river: their samples, or what they see?
+"""What keeps agents from a safe path beside a cheap shortcut: their samples, or what they see?
 
     OMP_NUM_THREADS=1 python tests/benchmarks/ideal_student.py [--maps 13 14 16 23]
 
@@ -12,7 +12,7 @@ hardly goes it hardly learns. With ``pose`` every (x, y, heading) has features o
 with ``coordinates``, one-hot x, y and heading, what is learnt of a tile is learnt of its row and column.
 Printed: return / cost / share of episodes that reach the goal, exact, over the task's 200 steps, and whether
 the policy is within 0.2 of J*(0) at a cost of at most 0.05 once its temperature tau, which falls in equal
-ratios, is at its end. "Linear": whether logits linear in the coordinates could walk the best dry way at all
+ratios, is at its end. "Linear": whether logits linear in the coordinates could walk the best safe path at all
 (a linear program).
 """
 

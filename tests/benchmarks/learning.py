@@ -101,16 +101,16 @@ class Lesson:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-STUDENTS = ("ppo-lag", "cpo", "trpo-lag", "pcpo", "focops", "p3o", "ipo", "crpo")
+AGENT_NAMES = ("ppo-lag", "cpo", "trpo-lag", "pcpo", "focops", "p3o", "ipo", "crpo")
 # While no other way is known the river is worth 16 of reward, at a limit of 1; by the default gains (1 and
 # 0.1 at that limit) the policy may be deterministic before that price is reached.
 STEEP_MULTIPLIERS = {"multiplier_proportional": 5.0, "multiplier_step": 0.2}
 OPTIONS = {agent: STEEP_MULTIPLIERS for agent in ("ppo-lag", "trpo-lag", "focops")}
 LESSONS = [
-    *(Lesson(agent, "two-state", 200) for agent in STUDENTS),
-    *(Lesson(agent, "two-state-2", 400) for agent in STUDENTS),
-    *(Lesson(agent, "gates", 120, OPTIONS.get(agent, {})) for agent in STUDENTS),
-    *(Lesson(agent, "gates-2", 300, OPTIONS.get(agent, {})) for agent in STUDENTS),
+    *(Lesson(agent, "two-state", 200) for agent in AGENT_NAMES),
+    *(Lesson(agent, "two-state-2", 400) for agent in AGENT_NAMES),
+    *(Lesson(agent, "gates", 120, OPTIONS.get(agent, {})) for agent in AGENT_NAMES),
+    *(Lesson(agent, "gates-2", 300, OPTIONS.get(agent, {})) for agent in AGENT_NAMES),
 ]
 
 
@@ -163,7 +163,7 @@ def mean_value(values: list[Value]) -> Value:
 def main() -> None:
     """Print the table of some agents, or of all."""
     parser = argparse.ArgumentParser(description="How close agents come to the constrained optimum.")
-    parser.add_argument("agents", nargs="*", metavar="STUDENT")
+    parser.add_argument("agents", nargs="*", metavar="AGENT")
     parser.add_argument("--only", nargs="+", default=[], metavar="TASK")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--csv", type=Path)

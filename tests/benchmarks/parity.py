@@ -27,9 +27,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyGymBatch
 from recrl.environments.safety_gym.gremlins import gremlin_course
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS, SafetyTask
+from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS, SafetyTask
 
 CHUNK = 128
 TOLERANCE = 1e-5

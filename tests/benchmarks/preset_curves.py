@@ -5,7 +5,7 @@
 The task is the two-state CMDP of ``learning.py``, of which the optimum J*(d) is known. It shows that both
 learn, and what an update of each costs, not which is better.
 
-Writes ``presets.csv`` (a row an update: student, preset, seed, env_steps, episode_return, cost) and
+Writes ``presets.csv`` (a row an update: agent, preset, seed, env_steps, episode_return, cost) and
 ``presets.png``.
 """
 
@@ -31,16 +31,16 @@ import matplotlib.pyplot as plt
 
 LEARNING = runpy.run_path(str(Path(__file__).parent / "learning.py"))
 TASK = "two-state"
-STUDENTS = ("ppo-lag", "cpo")
+AGENT_NAMES = ("ppo-lag", "cpo")
 PRESETS = ("recommended", "paper")
 
 
-def learn(student: str, preset: str, seed: int, updates: int) -> pd.DataFrame:
+def learn(agent_name: str, preset: str, seed: int, updates: int) -> pd.DataFrame:
     """The exact value of the policy after each update, and the CPU seconds of all updates so far."""
     exercise = LEARNING["EXERCISES"][TASK]
     environment_seed, agent_seed, policy_seed = np.random.SeedSequence(seed).spawn(3)
     environments = make_vector(exercise.task, exercise.num_envs, options=exercise.options)
-    agent = make_agent(student, environments.cmdp, {"preset": preset}, agent_seed)
+    agent = make_agent(agent_name, environments.cmdp, {"preset": preset}, agent_seed)
     collector = Collector(environments, num_steps=exercise.num_steps)
     collector.reset(seed=int(environment_seed.generate_state(1)[0]))
     generator = np.random.default_rng(policy_seed)
@@ -52,20 +52,20 @@ def learn(student: str, preset: str, seed: int, updates: int) -> pd.DataFrame:
         seconds += time.process_time() - before
         value = LEARNING["true_value"](agent, environments)
         steps = update * environments.num_envs * exercise.num_steps
-        rows.append((student, preset, seed, steps, value.episode_return, value.costs[0], seconds))
-    columns = ["student", "preset", "seed", "env_steps", "episode_return", "cost", "update_cpu_seconds"]
+        rows.append((agent_name, preset, seed, steps, value.episode_return, value.costs[0], seconds))
+    columns = ["agent", "preset", "seed", "env_steps", "episode_return", "cost", "update_cpu_seconds"]
     return pd.DataFrame(rows, columns=columns)
 
 
 def draw(rows: pd.DataFrame, path: Path) -> None:
-    """Return and cost against environment steps: a line a seed, a colour a preset, a row a student."""
+    """Return and cost against environment steps: a line a seed, a colour a preset, a row an agent."""
     exercise = LEARNING["EXERCISES"][TASK]
     figure, panels = plt.subplots(
-        len(STUDENTS), 2, figsize=(9.0, 5.6), sharex=True, layout="constrained", squeeze=False
+        len(AGENT_NAMES), 2, figsize=(9.0, 5.6), sharex=True, layout="constrained", squeeze=False
     )
-    for student, line in zip(STUDENTS, panels, strict=True):
+    for agent_name, line in zip(AGENT_NAMES, panels, strict=True):
         for preset, colour in zip(PRESETS, ("C0", "C1"), strict=True):
-            runs = rows[(rows["student"] == student) & (rows["preset"] == preset)]
+            runs = rows[(rows["agent"] == agent_name) & (rows["preset"] == preset)]
             per_update = 1e3 * runs.groupby("seed")["update_cpu_seconds"].max().sum() / len(runs)
             label = f"{preset} ({per_update:.0f} ms an update)"
             for _, run in runs.groupby("seed"):
@@ -83,8 +83,8 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
                 color="0.4",
                 annotation_clip=False,
             )
-        line[0].set(ylabel="return", title=student)
-        line[1].set(ylabel="cost", title=student)
+        line[0].set(ylabel="return", title=agent_name)
+        line[1].set(ylabel="cost", title=agent_name)
         line[0].legend(frameon=False, loc="lower right")
     for panel in panels[-1]:
         panel.set_xlabel("environment steps")
@@ -102,8 +102,8 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = pd.concat(
         [
-            learn(student, preset, seed, arguments.updates)
-            for student in STUDENTS
+            learn(agent_name, preset, seed, arguments.updates)
+            for agent_name in AGENT_NAMES
             for preset in PRESETS
             for seed in arguments.seeds
         ]
@@ -111,7 +111,7 @@ def main() -> None:
     arguments.folder.mkdir(parents=True, exist_ok=True)
     rows.to_csv(arguments.folder / "presets.csv", index=False, float_format="%.5g")
     draw(rows, arguments.folder / "presets.png")
-    last = rows.groupby(["student", "preset", "seed"]).last()
+    last = rows.groupby(["agent", "preset", "seed"]).last()
     print(last.to_string(float_format=lambda value: f"{value:.3f}"))
 
 

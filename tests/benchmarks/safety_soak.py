@@ -13,7 +13,7 @@ import sys
 
 import numpy as np
 
-from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 
 NUM_ENVS = 64
 HELD_STEPS = 25

@@ -15,8 +15,8 @@ import math
 import numpy as np
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.batch import SafetyGymBatch
-from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import rotation_matrices
 
 HELD_STEPS = 25

@@ -35,9 +35,9 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.simulation.machine_code import compiled_for_batch, mj_forward, mj_rnePostConstraint
-from recrl.environments.velocity.batch import VelocityBatch
 from recrl.environments.velocity.physics import copy_fields, derive, physics_at
-from recrl.environments.velocity.tasks import VELOCITY_TASKS, VelocityTask
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS, VelocityTask
+from recrl.environments.velocity.velocity_batch import VelocityBatch
 
 TOLERANCE = 1e-5
 STAGES = (0.5, 0.5, 1.0)
@@ -163,7 +163,7 @@ def _compare_episode(task: VelocityTask, episode: dict[str, npt.NDArray[Any]]) -
     batch.qpos[...], batch.qvel[...] = episode["qpos"], episode["qvel"]
     passed = np.vstack((np.zeros((1, task.axes)), np.diff(places, axis=0) / batch.seconds))
     actions = np.vstack((np.zeros_like(episode["action"][:1]), episode["action"]))
-    rewards, _, costs = batch.judge(passed, actions)
+    rewards, _, costs = batch.rewards_and_costs(passed, actions)
     # In single precision, as ours are; contact forces are compared relatively.
     recorded = episode["obs"].astype(np.float32).astype(np.float64)
     apart = np.abs(batch.observations() - recorded) / np.maximum(1.0, np.abs(recorded))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 
 SLACK = 1e-12
 

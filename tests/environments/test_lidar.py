@@ -9,9 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import add_to_lidar, turned
-from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.lidar import add_to_lidar
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import rotation_matrices, upright
+from recrl.environments.safety_gym.step_records import turned
 
 
 def reading(*places: tuple[float, float]) -> npt.NDArray[np.float32]:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from recrl.environments.safety_gym.scene import make_scene
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.simulation.machine_code import array_at, compiled_for_batch, kept, mj_forward, mj_step
 from recrl.environments.simulation.mujoco_batch import Simulations
 

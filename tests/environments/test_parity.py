@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from tests.benchmarks.parity import compare_recording
 
 RECORDINGS = Path(__file__).parents[1] / "parity"

@@ -13,9 +13,9 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from recrl.environments.safety_gym.environments import SafetyGymEnv, SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymEnv, SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import rotation_matrices
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 
 SIZES = {"Goal": (40, 72, 72), "Button": (56, 88, 88), "Push": (56, 88, 88)}
 LEVEL_2 = [name for name in SAFETY_TASKS if name.startswith("Car") and name.endswith("2")]
@@ -258,7 +258,7 @@ def test_broken_physics_ends_the_episode_with_a_penalty(
 def test_an_episode_ends_when_there_is_no_room_for_a_goal(monkeypatch: pytest.MonkeyPatch) -> None:
     environment = SafetyGymEnv("CarGoal0")
     environment.reset(seed=0)
-    monkeypatch.setattr("recrl.environments.safety_gym.batch.sample_goal", lambda *_: None)
+    monkeypatch.setattr("recrl.environments.safety_gym.safety_gym_batch.sample_goal", lambda *_: None)
     terminated, info = False, {"goal_met": False}
     while not terminated:
         assert not info["goal_met"]

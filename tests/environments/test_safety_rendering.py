@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from recrl.environments.safety_gym.environments import SafetyGymEnv, SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymEnv, SafetyGymVectorEnv
 from recrl.environments.simulation.camera import RenderingUnavailableError
 
 

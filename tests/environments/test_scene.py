@@ -12,8 +12,8 @@ import pytest
 from recrl.environments.safety_gym.compiled_step import step
 from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.scene import make_scene, rotation_matrices, scene_xml, upright
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.safety_gym.task_record import allocate, task_record
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
 
 SENSORS = """
 <accelerometer name="accelerometer" site="robot_middle"/>

@@ -14,9 +14,9 @@ import pytest
 from numba.core import types
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.environments import SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import make_scene
-from recrl.environments.safety_gym.tasks import SAFETY_TASKS
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.simulation.machine_code import array_at, compiled_for_batch
 from recrl.environments.simulation.mujoco_batch import PhysicsError, Simulations
 

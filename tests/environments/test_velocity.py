@@ -16,10 +16,10 @@ from gymnasium.utils.env_checker import check_env
 from recrl.environments.cmdp import Floats
 from recrl.environments.registry import find_task, make_drawn
 from recrl.environments.simulation.camera import RenderingUnavailableError
-from recrl.environments.velocity.batch import VelocityBatch
-from recrl.environments.velocity.environments import VelocityEnv, VelocityVectorEnv
 from recrl.environments.velocity.model import make_model
-from recrl.environments.velocity.tasks import VELOCITY_TASKS
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS
+from recrl.environments.velocity.velocity_batch import VelocityBatch
+from recrl.environments.velocity.velocity_environments import VelocityEnv, VelocityVectorEnv
 from tests.benchmarks.velocity_parity import compare_velocity_recording
 
 TASKS = list(VELOCITY_TASKS)
@@ -153,7 +153,7 @@ def test_effort_and_health_are_weighed_as_gymnasium_does() -> None:
     assert [task.healthy_reward for task in VELOCITY_TASKS.values()] == [1, 0, 1, 5, 0, 1]
     batch = VelocityBatch(VELOCITY_TASKS["SafetyHumanoidVelocity"], 1)
     actions = np.full((1, batch.model.nu), 0.2)
-    rewards, velocities, costs = batch.judge(np.array([[0.8, 0.6]]), actions)
+    rewards, velocities, costs = batch.rewards_and_costs(np.array([[0.8, 0.6]]), actions)
     assert rewards[0] == pytest.approx(1.25 * 0.8 - 0.1 * 17 * 0.04 + 5.0)
     assert velocities[0] == pytest.approx(1.0)
     assert costs[0] == 0.0

@@ -32,9 +32,9 @@ from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import read_grid
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.sweep import LaunchSettings, launch
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.trial.attempt import run_recorded
@@ -203,7 +203,7 @@ def make(folder: Path, *, interrupted: bool, limit: float = 0.5) -> Path:
     grid = read_grid(folder / "grid.yaml")
     store = SweepStore(folder / "runs", NAME)
     executor = _Interrupted() if interrupted else InlineExecutor()
-    launch(LaunchSettings(grid, SweepPlace(store), executor), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), executor), stop=threading.Event())
     return folder
 
 

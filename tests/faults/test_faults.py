@@ -22,9 +22,9 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.scratch import EMPTY_SECONDS, LOCK, scratch_folder
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
-from recrl.orchestrator.sweep import LaunchSettings, launch
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.heartbeat import Heartbeat
 
@@ -181,7 +181,7 @@ def test_what_a_full_disk_keeps_from_being_said_hides_nothing(
     grid = parse_grid(text.encode(), source="grid.yaml")
     with pytest.raises(ArithmeticError, match="the first error"):
         place = SweepPlace(SweepStore(small_disk, "sweep"))
-        launch(LaunchSettings(grid, place, Dying()), stop=threading.Event())
+        run_sweep(SweepRunSettings(grid, place, Dying()), stop=threading.Event())
     with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\); it starts anew"):
         SweepStore(small_disk, "sweep").trial(SPEC).set_status(TrialState.WAITING)
 

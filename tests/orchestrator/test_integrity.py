@@ -24,9 +24,9 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import PlannedAction, make_plan
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 
 GRID = """\
@@ -58,8 +58,8 @@ def run(store: SweepStore, *, updates: int | None = None, **options: Any) -> Swe
 
     executor: Executor = InlineExecutor() if updates is None else Stopping()
     grid = parse_grid(GRID.encode(), source="grid.yaml")
-    settings = LaunchSettings(grid, SweepPlace(store), executor, **options)
-    return launch(settings, stop=threading.Event())
+    settings = SweepRunSettings(grid, SweepPlace(store), executor, **options)
+    return run_sweep(settings, stop=threading.Event())
 
 
 def results(store: SweepStore) -> dict[str, bytes]:
@@ -413,12 +413,12 @@ def test_a_row_is_written_by_the_names_of_its_columns(tmp_path: Path) -> None:
     file = RowFile(tmp_path / "updates.csv")
     file.add_row({"a": 1, "b": 2}, of="agent mine")
     file.add_row({"b": 4, "a": 3}, of="agent mine")
-    file.settle(file.write())
+    file.mark_committed(file.write())
     assert file.path.read_text() == "a,b\n1,2\n3,4\n"
     again = RowFile(file.path)
-    assert again.take_up(file.extent)
+    assert again.resume_after(file.extent)
     again.add_row({"b": 6, "a": 5}, of="agent mine")
-    again.settle(again.write())
+    again.mark_committed(again.write())
     assert file.path.read_text() == "a,b\n1,2\n3,4\n5,6\n"
     assert again.extent == Extent.of(file.path.read_bytes())
 
@@ -516,11 +516,11 @@ def test_episodes_must_all_have_the_same_costs(tmp_path: Path) -> None:
 def test_a_commit_hashes_only_what_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = RowFile(tmp_path / "updates.csv")
     file.add_text("x" * 10_000_000 + "\n")
-    file.settle(file.write())
+    file.mark_committed(file.write())
     monkeypatch.setattr(Path, "open", _only_for_writing(Path.open))
     for _ in range(100):
         file.add_text("y\n")
-        file.settle(file.write())
+        file.mark_committed(file.write())
     monkeypatch.undo()
     assert file.extent == Extent.of(file.path.read_bytes())
 

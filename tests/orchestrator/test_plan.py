@@ -86,7 +86,7 @@ def test_the_time_is_unknown_before_a_trial_of_the_kind_has_run(store: SweepStor
     assert found.concurrent == 2
 
 
-def test_the_time_follows_from_the_speed_of_the_same_task_and_student(store: SweepStore) -> None:
+def test_the_time_follows_from_the_speed_of_the_same_task_and_agent(store: SweepStore) -> None:
     for spec in (SPECS[0], SPECS[2]):  # one of each agent
         _begin(store, spec, env_steps=1000, end=TrialState.COMPLETE)
     plan = make_plan(SPECS, store)

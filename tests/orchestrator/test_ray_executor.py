@@ -21,23 +21,23 @@ import ray
 from ray.exceptions import RayActorError
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.stop_file import StopFile
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray import hang_watchdog
 from recrl.orchestrator.ray.clusters import existing_cluster, local_cluster
-from recrl.orchestrator.ray.executor import (
-    RayExecutor,
-)
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit
+from recrl.orchestrator.ray.ray_executor import (
+    RayExecutor,
+)
 from recrl.orchestrator.ray.teacher_service import RayTeacher, start_teacher_service
 from recrl.orchestrator.ray.tune_callbacks import LONGEST_PAUSE_SECONDS, pause_seconds
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 
@@ -95,7 +95,7 @@ def once(condition: Callable[[], bool], act: Callable[[], object]) -> Iterator[N
                 return
             over.wait(0.02)
 
-    with beside(watch, name="once"):
+    with background_thread(watch, name="once"):
         yield
 
 

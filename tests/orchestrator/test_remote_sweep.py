@@ -26,14 +26,14 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.remote.commit_upload import Upload
 from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from recrl.orchestrator.remote.stop_object import StopObject
-from recrl.orchestrator.remote.upload import Upload
+from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
 
@@ -62,8 +62,8 @@ class Machine:
 
     def launch(self, *, stop: threading.Event | None = None, retry_failed: bool = False) -> SweepResult:
         self.storage.mark()
-        settings = LaunchSettings(grid(), self.storage, InlineExecutor(), retry_failed=retry_failed)
-        return launch(settings, stop=stop or threading.Event())
+        settings = SweepRunSettings(grid(), self.storage, InlineExecutor(), retry_failed=retry_failed)
+        return run_sweep(settings, stop=stop or threading.Event())
 
 
 def grid() -> GridSpec:
@@ -83,7 +83,7 @@ def machine(folder: Path, name: str, kind: str = "file") -> Machine:
 def local(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     """The same sweep in a folder."""
     store = SweepStore(tmp_path_factory.mktemp("local"), "small")
-    launch(LaunchSettings(grid(), SweepPlace(store), InlineExecutor()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid(), SweepPlace(store), InlineExecutor()), stop=threading.Event())
     return store
 
 
@@ -149,8 +149,8 @@ def test_a_damaged_local_copy_says_that_it_is_one(tmp_path: Path, local: SweepSt
 def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
     here = machine(tmp_path, "here")
     with pytest.raises(RecrlError, match="trials of a sweep in an object store are not run again: "):
-        settings = LaunchSettings(grid(), here.storage, InlineExecutor(), rerun_damaged=True)
-        launch(settings, stop=threading.Event())
+        settings = SweepRunSettings(grid(), here.storage, InlineExecutor(), rerun_damaged=True)
+        run_sweep(settings, stop=threading.Event())
     assert not here.store.folder.exists()
 
 
@@ -207,7 +207,7 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
 def test_a_storage_that_is_down_for_a_while_loses_nothing(
     tmp_path: Path, local: SweepStore, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.patience.FIRST_PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.retries.FIRST_PAUSE_SECONDS", 0.01)
     here = machine(tmp_path, "here", "unreliable")
     spec = grid().trials()[1]
     with here.storage.working_copy(spec, never) as trial:
@@ -221,7 +221,7 @@ def test_a_storage_that_is_down_for_a_while_loses_nothing(
 def test_a_storage_that_stays_down_is_given_up_and_the_trial_goes_on_later(
     tmp_path: Path, local: SweepStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.patience.PATIENCE_SECONDS", 0.0)
+    monkeypatch.setattr("recrl.orchestrator.remote.retries.RETRY_SECONDS", 0.0)
     here = machine(tmp_path, "here", "unreliable")
     spec = grid().trials()[1]
     with (
@@ -344,7 +344,7 @@ def test_what_only_the_launch_knows_of_a_trial_is_seen_elsewhere(tmp_path: Path)
     here.storage.pull()
     here.store.trial(crashed).set_status(TrialState.FAILED, error="failures of its process: 4")
     here.store.trial(silent).set_status(TrialState.WAITING)
-    here.storage.settle([crashed, silent])
+    here.storage.send_dead_trials([crashed, silent])
     there.storage.pull()
     record = there.store.trial(crashed).record()
     assert (record.status, record.error) == (TrialState.FAILED, "failures of its process: 4")
@@ -361,9 +361,9 @@ def test_a_launch_that_was_taken_over_leaves_the_trials_of_the_other_alone(tmp_p
         upload.push()
         here.storage.pull()
         here.store.trial(spec).set_status(TrialState.WAITING)
-        here.storage.settle([spec])
+        here.storage.send_dead_trials([spec])
         upload.push()
-    here.storage.settle([spec])
+    here.storage.send_dead_trials([spec])
     with pytest.raises(LostLeaseError):  # of a launch that is over
         upload.push()
 

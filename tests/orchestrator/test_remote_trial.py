@@ -19,9 +19,9 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.remote.commit_format import Commit, pack, unpack
+from recrl.orchestrator.remote.commit_upload import Upload, working_copy
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import RemoteTrial
-from recrl.orchestrator.remote.upload import Upload, working_copy
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
@@ -59,7 +59,7 @@ class Machine:
 
     def __init__(self, remote: RemoteTrial, folder: Path) -> None:
         self.trial = TrialStore(folder / SPEC.folder_name)
-        remote.take_up(self.trial)
+        remote.download_for_attempt(self.trial)
         self.upload = Upload(remote, self.trial)
         self.writer: TrialWriter = self.trial.begin(SPEC)
         self.restored = self.writer.restore()

@@ -12,10 +12,10 @@ from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
-from recrl.orchestrator.sweep import LaunchSettings, launch
+from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
+from recrl.orchestrator.sweep_place import SweepPlace
 
 pytestmark = pytest.mark.filterwarnings("default")  # theirs
 s3fs: Any = pytest.importorskip(
@@ -58,11 +58,11 @@ def server() -> Iterator[Any]:
 def test_a_sweep_on_s3_is_the_sweep_of_a_folder(tmp_path: Path) -> None:
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     local = SweepStore(tmp_path / "local", "small")
-    launch(LaunchSettings(grid, SweepPlace(local), InlineExecutor()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, SweepPlace(local), InlineExecutor()), stop=threading.Event())
     copy = SweepStore(tmp_path / "copy", "small")
     place = RemoteSweep("s3://results/runs", copy)
     place.prepare()
-    launch(LaunchSettings(grid, place, InlineExecutor()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, place, InlineExecutor()), stop=threading.Event())
     elsewhere = SweepStore(tmp_path / "elsewhere", "small")
     RemoteSweep("s3://results/runs", elsewhere).pull()
     [spec] = grid.trials()

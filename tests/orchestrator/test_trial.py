@@ -102,7 +102,7 @@ def test_interrupted_equals_uninterrupted(tmp_path: Path, agent: str, method: st
 
 
 @pytest.mark.parametrize("agent", sorted(set(AGENTS) - {"ppo-lag", "cpo"}))
-def test_every_other_student_interrupted_equals_itself_uninterrupted(tmp_path: Path, agent: str) -> None:
+def test_every_other_agent_interrupted_equals_itself_uninterrupted(tmp_path: Path, agent: str) -> None:
     spec = replace(SPEC, agent=Choice(agent, QUICK))
     assert_pieces_make_the_whole(tmp_path, spec, stops=(1, 8))
 
@@ -274,7 +274,7 @@ def test_a_limit_that_rises_fails_the_trial(tmp_path: Path) -> None:
     )
 
 
-def test_a_student_whose_entropy_cannot_be_rewarded_is_named(
+def test_an_agent_whose_entropy_cannot_be_rewarded_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without_it(*arguments: Any) -> SimpleNamespace:

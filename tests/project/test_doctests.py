@@ -13,11 +13,11 @@ MODULES = [
     for module in pkgutil.walk_packages(
         importlib.import_module(f"recrl.{package}").__path__, prefix=f"recrl.{package}."
     )
-] + ["recrl._launching", "recrl._results", "recrl._tasks"]
+] + ["recrl._train_and_launch", "recrl._results", "recrl._tasks"]
 
 
 def test_modules_of_subpackages_are_found_too() -> None:
-    assert "recrl.environments.velocity.batch" in MODULES
+    assert "recrl.environments.velocity.velocity_batch" in MODULES
 
 
 @pytest.mark.parametrize("name", MODULES)

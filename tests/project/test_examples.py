@@ -11,9 +11,9 @@ from recrl.orchestrator.errors import GridError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep import LaunchSettings, launch
+from recrl.orchestrator.sweep_place import SweepPlace
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -47,13 +47,13 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def test_a_trial_of_ones_own_task_student_and_teacher_runs(
+def test_a_trial_of_ones_own_task_agent_and_teacher_runs(
     installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(installed))
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
-    launch(LaunchSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     (trial,) = store.trials()
     assert trial.record().status is TrialState.COMPLETE
     updates = trial.updates()
@@ -82,7 +82,7 @@ def test_a_curriculum_that_reads_episodes_lowers_its_limit(
     text = text.replace("deploy_limits: 3", "deploy_limits: 0.5")
     grid = parse_grid(text.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
-    launch(LaunchSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     (trial,) = store.trials()
     limits = trial.updates()["limit_0"]
     assert limits.iloc[0] == float("inf") and limits.iloc[-1] == 0.5
@@ -99,7 +99,7 @@ def test_an_agent_learns_with_a_network_of_ones_own(tmp_path: Path, monkeypatch:
     )
     grid = parse_grid(text.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
-    launch(LaunchSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     assert store.trials()[0].record().status is TrialState.COMPLETE
 
 

@@ -33,12 +33,15 @@ ALLOWED = {
     "orchestrator": ("recrl.agents", "recrl.environments", "recrl.teachers"),
 }
 # Modules of the orchestrator that may import the analysis, too: a launch draws its figures.
-WITH_ANALYSIS = r"orchestrator\.(cli\..*|launching)"
+WITH_ANALYSIS = r"orchestrator\.(cli\..*|launch_grid)"
 # The Python API stands on top of everything; of the command line it uses only these modules.
 API_FILES = sorted((ROOT / "src" / "recrl").glob("*.py"))
 API_OF_CLI = {
     "__main__": ("recrl.orchestrator.cli.main",),
-    "_launching": ("recrl.orchestrator.cli.launch", "recrl.orchestrator.cli.output"),  # to print progress
+    "_train_and_launch": (
+        "recrl.orchestrator.cli.launch",
+        "recrl.orchestrator.cli.output",
+    ),  # to print progress
 }
 # Third-party modules that only some of our modules may import.
 ADAPTERS = {
@@ -60,14 +63,23 @@ ADAPTERS = {
 # The order inside the orchestrator, of its folders and of the modules beside them: nothing may import what
 # stands in a later line.
 LAYERS = (
-    ("background", "errors", "exit_codes", "located_yaml", "redaction", "spec", "untrusted", "validation"),
+    (
+        "background_thread",
+        "errors",
+        "exit_codes",
+        "located_yaml",
+        "redaction",
+        "spec",
+        "untrusted",
+        "validation",
+    ),
     ("files",),
     ("provenance",),
-    ("executors", "places", "sweep_progress", "trial"),
+    ("executors", "sweep_place", "sweep_progress", "trial"),
     ("grid", "remote"),
     ("find_sweep", "tracking"),
-    ("ray", "report_refresh", "sweep"),
-    ("launching",),
+    ("ray", "report_refresh", "run_sweep"),
+    ("launch_grid",),
     ("cli",),
 )
 

@@ -194,16 +194,16 @@ def test_steps_left_are_estimated_from_the_last_window() -> None:
 # Lines 5 to 11 together.
 
 
-def test_a_converged_student_that_keeps_its_limit_gets_a_lower_one() -> None:
+def test_a_converged_agent_that_keeps_its_limit_gets_a_lower_one() -> None:
     assert decided(window(9.0, 60.0), window(9.5, 55.0), limits=(60.0,), deploy=(5.0,)) == ((45.0,), 0.0)
 
 
 @pytest.mark.parametrize("new", [window(5.0, 55.0), window(9.5, 40.0)], ids=["return", "cost"])
-def test_a_student_that_still_changes_is_left_alone(new: WindowStatistics) -> None:
+def test_an_agent_that_still_changes_is_left_alone(new: WindowStatistics) -> None:
     assert decided(window(9.0, 60.0), new, limits=(60.0,), deploy=(5.0,)) == ((60.0,), 0.0)
 
 
-def test_a_converged_student_above_its_limit_gets_noise() -> None:
+def test_a_converged_agent_above_its_limit_gets_noise() -> None:
     stuck = window(9.5, 5.0)
     assert decided(stuck, stuck, limits=(1.0,), deploy=(1.0,), policy_noise=0.2) == ((1.0,), 0.2)
 
@@ -246,7 +246,7 @@ def test_the_first_judgement_takes_two_windows_and_every_other_one() -> None:
     ],
 )
 @pytest.mark.parametrize("deploy", [0.0, 5.0, 25.0])
-def test_an_ideal_student_is_led_to_d_d_two_windows_before_the_end(
+def test_an_ideal_agent_is_led_to_d_d_two_windows_before_the_end(
     options: dict[str, Any], episodes: int, updates_in_a_window: int, deploy: float
 ) -> None:
     run = play(
@@ -261,7 +261,7 @@ def test_an_ideal_student_is_led_to_d_d_two_windows_before_the_end(
 @pytest.mark.parametrize(
     ("options", "updates_in_a_window"), [({"window": 5}, 5), ({"window": 80, "window_unit": "episodes"}, 1)]
 )
-def test_a_student_that_stays_and_then_crosses_is_judged_in_both_regimes(
+def test_an_agent_that_stays_and_then_crosses_is_judged_in_both_regimes(
     options: dict[str, Any], updates_in_a_window: int
 ) -> None:
     """RiverGrid: 16 long episodes a batch as long as the agent stays, 500 short ones once it crosses."""
@@ -286,7 +286,7 @@ def test_a_student_that_stays_and_then_crosses_is_judged_in_both_regimes(
     assert run.limits[-1 - updates_in_a_window] == (5.0,)
 
 
-def test_literal_steps_leave_an_ideal_student_far_above_d_d() -> None:
+def test_literal_steps_leave_an_ideal_agent_far_above_d_d() -> None:
     """Line 7 with B - b in episodes: from 250, the limit gets to about 158, by the product of its factors.
 
     Episode b = 21, 31, ... is the one about to be played when 20, 30, ... are.
@@ -390,7 +390,7 @@ def test_literally_the_clock_begins_anew_also_where_nothing_changes() -> None:
 @pytest.mark.parametrize(
     ("after_noise", "kicks"), [(2, [8, 16, 24, 32]), (1, [8, 12, 16, 20, 24, 28, 32, 36])]
 )
-def test_a_stuck_student_is_kicked_again_and_again_but_not_after_the_end(
+def test_a_stuck_agent_is_kicked_again_and_again_but_not_after_the_end(
     after_noise: int, kicks: list[int]
 ) -> None:
     run = play(
@@ -428,7 +428,7 @@ def test_literally_noise_follows_noise_for_ever() -> None:
     assert len(kicks) > 10
 
 
-def test_a_student_that_noise_frees_reaches_d_d() -> None:
+def test_an_agent_that_noise_frees_reaches_d_d() -> None:
     """RiverGrid 1b: the agent crosses at cost 5 whatever the limit, until two kicks have freed it."""
     kicks = 0
     seen = 0
@@ -444,12 +444,12 @@ def test_a_student_that_noise_frees_reaches_d_d() -> None:
     assert run.limits[-10] == (1.0,)
 
 
-def test_a_perfectly_safe_student_is_not_waited_for_for_ever() -> None:
+def test_a_perfectly_safe_agent_is_not_waited_for_for_ever() -> None:
     run = play(lambda step, update: (0.0, (0.0,)), train=(100.0,), deploy=(25.0,), updates=50)
     assert run.limits[9] == (25.0,)
 
 
-def test_a_student_that_never_converges_meets_d_d_at_the_end() -> None:
+def test_an_agent_that_never_converges_meets_d_d_at_the_end() -> None:
     run = play(lambda step, update: (2.0**update, (1.0,)), train=(100.0,), deploy=(25.0,), updates=50)
     assert run.limits[-2:] == [(100.0,), (25.0,)]
 

@@ -18,7 +18,6 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import read_grid
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.provenance import code_changes
 from recrl.orchestrator.provenance.code_changes import (
     code_of,
@@ -26,7 +25,8 @@ from recrl.orchestrator.provenance.code_changes import (
     other_code,
     other_code_sentence,
 )
-from recrl.orchestrator.sweep import LaunchSettings, launch
+from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
+from recrl.orchestrator.sweep_place import SweepPlace
 
 TASK = """\
 from recrl.environments.registry import Task
@@ -124,10 +124,10 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
             answers = iter([False])
             run_recorded(spec, place.store.trial(spec), should_stop=lambda: next(answers, True))
 
-    launch(LaunchSettings(grid, SweepPlace(store), Stopping()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), Stopping()), stop=threading.Event())
     first = code_of(spec)
     change(folder)
-    launch(LaunchSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     attempts = store.trial(spec).provenance()
     assert [attempt["attempt"] for attempt in attempts] == [1, 2]
     assert [attempt["code"] for attempt in attempts] == [first, code_of(spec)]

@@ -11,7 +11,7 @@ from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
 from recrl.agents.networks.module_stack import perceptron
 from recrl.agents.observation_features import Encoder
-from recrl.agents.policy_module import PolicyModule
+from recrl.agents.torch_export import PolicyModule
 from recrl.environments.cmdp import ObservationComponent
 
 PARTS = (ObservationComponent("speed", 2), ObservationComponent("walls", 3, lidar_range=3.0))

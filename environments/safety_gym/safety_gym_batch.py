@@ -25,18 +25,12 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import (
-    ENVIRONMENT,
-    NOT_YET,
-    acceptable,
-    perceive,
-    review,
-    step,
-)
+from recrl.environments.safety_gym.compiled_step import acceptable, perceive, review, step
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.scene import make_scene, upright
+from recrl.environments.safety_gym.step_records import ENVIRONMENT, NOT_YET
+from recrl.environments.safety_gym.task_definitions import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
 from recrl.environments.safety_gym.task_record import allocate, places_of_objects, task_record
-from recrl.environments.safety_gym.tasks import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
 from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
 from recrl.environments.simulation.mujoco_batch import Simulations
 
@@ -45,7 +39,7 @@ Integers = npt.NDArray[np.int64]
 _NOBODY = np.zeros(0, np.intp)
 
 
-class Outcome(NamedTuple):
+class SafetyGymOutcome(NamedTuple):
     """Result of one step.
 
     Attributes:
@@ -69,7 +63,7 @@ class Outcome(NamedTuple):
     finished: npt.NDArray[np.intp]
 
 
-class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
+class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
     """B environments of one Safety Gym task; see ``EnvironmentBatch``.
 
     Args:
@@ -142,14 +136,14 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         self._action[...] = actions
         return acceptable(self._address)
 
-    def advance(self) -> Outcome:
+    def advance(self) -> SafetyGymOutcome:
         """Take one step in every environment, with the actions that were set."""
         self.simulations.apply(step, self._address)
         results, flags = self._memory.results.copy(), self._memory.flags.copy()
         rewards, costs, terms = results[0], results[1:2], results[2:]
         goal_met, broken, terminated, truncated = flags[0], flags[1], flags[2], flags[3]
         if not (self.simulations.any_stopped or 1 in flags.tobytes()):
-            return Outcome(rewards, costs, terms, goal_met, terminated, truncated, None, _NOBODY)
+            return SafetyGymOutcome(rewards, costs, terms, goal_met, terminated, truncated, None, _NOBODY)
         broken |= self.simulations.stopped
         rewards[broken] = EXCEPTION_REWARD
         results[1:, broken] = 0.0
@@ -163,7 +157,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, Outcome]):
         truncated &= ~terminated
         finished = np.flatnonzero(terminated | truncated)
         failed = broken if broken.any() else None
-        return Outcome(rewards, costs, terms, goal_met, terminated, truncated, failed, finished)
+        return SafetyGymOutcome(rewards, costs, terms, goal_met, terminated, truncated, failed, finished)
 
     def observations(self) -> Observations:
         """The last observations, [B, size]."""

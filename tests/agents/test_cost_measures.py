@@ -275,7 +275,7 @@ def last_third(agent_name: str, options: dict[str, Any], limit: float, updates: 
 
 
 @pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
-def test_a_student_finds_the_best_policy_whose_cvar_is_within_the_limit(agent: str) -> None:
+def test_an_agent_finds_the_best_policy_whose_cvar_is_within_the_limit(agent: str) -> None:
     level, limit = 0.75, 5.0
     options = {"constraint": "cvar", "cvar_level": level, "cost_trace_decay": 1.0}
     outcome = last_third(agent, options, limit, 300 if agent == "ppo-lag" else 150)

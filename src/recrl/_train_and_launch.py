@@ -95,7 +95,7 @@ def launch(
     # of the command line only what prints is used
     from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
     from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
-    from recrl.orchestrator.launching import LaunchOptions, launch_grid  # noqa: PLC0415
+    from recrl.orchestrator.launch_grid import LaunchOptions, launch_grid  # noqa: PLC0415
 
     if executor not in ("ray", "inline"):
         raise RecrlError(f"executor: must be 'ray' or 'inline', got {executor!r}")

@@ -5,7 +5,7 @@
     environments = gymnasium.make_vec("recrl.environments.registration:recrl/CarGoal2-v0", num_envs=16)
 
 The eighteen tasks are ``recrl/CarGoal0-v0`` to ``recrl/PointPush2-v0``. Observations, actions, rewards and
-costs: see ``recrl.environments.safety_gym.batch``.
+costs: see ``recrl.environments.safety_gym.safety_gym_batch``.
 
 ``info`` of a step holds ``cost`` (the k costs), the indicator of every cost term (``cost_hazards``,
 ``cost_vases_contact``, ...), ``goal_met``, and ``cost_exception`` if the physics diverged.
@@ -20,12 +20,23 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.cmdp import ObservationComponent
-from recrl.environments.safety_gym.tasks import HORIZON, LIDAR_RANGE, SAFETY_TASKS, SUBSTEPS, SafetyTask
+from recrl.environments.safety_gym.task_definitions import (
+    HORIZON,
+    LIDAR_RANGE,
+    SAFETY_TASKS,
+    SUBSTEPS,
+    SafetyTask,
+)
 from recrl.environments.simulation.camera import Renderer
-from recrl.environments.simulation.environments import Description, MujocoEnv, MujocoVectorEnv, TaskFamily
+from recrl.environments.simulation.mujoco_environments import (
+    Description,
+    MujocoEnv,
+    MujocoVectorEnv,
+    TaskFamily,
+)
 
 if TYPE_CHECKING:
-    from recrl.environments.safety_gym.batch import Outcome, SafetyGymBatch
+    from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch, SafetyGymOutcome
 
 
 class SafetyGymOptions(BaseModel):
@@ -73,7 +84,7 @@ def observation_components(task: SafetyTask) -> tuple[ObservationComponent, ...]
     )
 
 
-def _info(terms: tuple[str, ...], cost: str, outcome: Outcome) -> dict[str, Any]:
+def _info(terms: tuple[str, ...], cost: str, outcome: SafetyGymOutcome) -> dict[str, Any]:
     info: dict[str, Any] = {term: outcome.terms[row] for row, term in enumerate(terms)}
     info["cost"] = (outcome.terms if cost == "per_hazard" else outcome.costs).T
     info["goal_met"] = outcome.goal_met
@@ -95,7 +106,7 @@ def frames_per_second(task: SafetyTask) -> int:
 
 def _make(task: SafetyTask, number: int, options: SafetyGymOptions) -> tuple[Description, SafetyGymBatch]:
     """Make the description and the batch of a task; only this function imports MuJoCo and Numba."""
-    from recrl.environments.safety_gym.batch import SafetyGymBatch  # noqa: PLC0415
+    from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch  # noqa: PLC0415
 
     description = Description(
         name=task.name,

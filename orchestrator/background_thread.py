@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def beside(work: Callable[[threading.Event], object], *, name: str) -> Iterator[None]:
+def background_thread(work: Callable[[threading.Event], object], *, name: str) -> Iterator[None]:
     """Run a function in a thread until the end of the ``with`` block, which waits for it.
 
     Args:

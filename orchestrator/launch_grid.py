@@ -1,7 +1,7 @@
 """A launch with all that belongs to it: the executor, the MLflow sync, the figures and the films.
 
-The command line and the Python API both call ``launch_grid``. ``sweep.launch`` runs the trials. A
-listener is called at each step; that of the command line prints.
+The command line and the Python API both call ``launch_grid``. ``run_sweep.run_sweep`` does the part that runs
+the trials. A listener is called at each step; that of the command line prints.
 """
 
 from __future__ import annotations
@@ -22,10 +22,16 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.grid.plan import Plan, trials_at_once
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
-from recrl.orchestrator.sweep import LaunchSettings, RunningSync, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.run_sweep import (
+    RunningSync,
+    SweepResult,
+    SweepRunSettings,
+    run_sweep,
+    stopping_on_signals,
+)
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.client import tracking_uri
@@ -163,7 +169,7 @@ def launch_grid(
             _film(grid, after, store, stop, listener)
 
     with contextlib.ExitStack() as during, _listening(stop, listener.stopping):
-        settings = LaunchSettings(
+        settings = SweepRunSettings(
             grid,
             place,
             executor,
@@ -175,7 +181,7 @@ def launch_grid(
             watch=watch,
             finish=finish,
         )
-        result = launch(settings, stop=stop)
+        result = run_sweep(settings, stop=stop)
     return LaunchOutcome(result, place, uri, read[0] if read else None)
 
 
@@ -198,7 +204,7 @@ def room(
     """
     most = 1 if inline else max_concurrent or resources.max_concurrent
     if address and not inline:
-        from recrl.orchestrator.ray.executor import room_on_cluster  # noqa: PLC0415  (imports ray)
+        from recrl.orchestrator.ray.ray_executor import room_on_cluster  # noqa: PLC0415  (imports ray)
 
         return most or max(1, room_on_cluster(address, resources)), "on the cluster at present"
     fitting = trials_at_once(cpus_per_trial=resources.cpus_per_trial, max_concurrent=most, cores=cores)
@@ -218,7 +224,7 @@ def _executor(grid: GridSpec, place: SweepPlace, options: LaunchOptions) -> Exec
         return InlineExecutor()
     if place.uri.startswith("memory://"):
         raise RecrlError(f"{place.uri}: is memory of a single process; use --executor inline")
-    from recrl.orchestrator.ray.executor import RayExecutor  # noqa: PLC0415  (imports ray)
+    from recrl.orchestrator.ray.ray_executor import RayExecutor  # noqa: PLC0415  (imports ray)
 
     return RayExecutor(
         address=options.address,

@@ -39,7 +39,6 @@ from ray.tune.search import BasicVariantGenerator
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.stop_file import StopSign
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit
@@ -49,6 +48,7 @@ from recrl.orchestrator.ray.teacher_service import start_teacher_service
 from recrl.orchestrator.ray.tune_callbacks import DriverWatch, StopWhenIdle
 from recrl.orchestrator.ray.tune_trial import TuneTrial
 from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import SILENCE_SECONDS
 
 if TYPE_CHECKING:

@@ -11,13 +11,13 @@ from recrl.orchestrator.errors import StorageError
 
 FIRST_PAUSE_SECONDS = 1.0  # before the first repetition; doubled each time
 LONGEST_PAUSE_SECONDS = 60.0
-PATIENCE_SECONDS = 900.0  # for a store that is down when a trial begins or has ended
+RETRY_SECONDS = 900.0  # for a store that is down when a trial begins or has ended
 STOPPING_SECONDS = 60.0  # the same, once the sweep is stopping
 
 logger = logging.getLogger("recrl.trial")
 
 
-def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
+def retry_while_down(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
     """Repeat an action while the store is down, with growing pauses.
 
     Args:
@@ -25,7 +25,7 @@ def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
         should_stop: once true, only for ``STOPPING_SECONDS`` more.
 
     Raises:
-        StorageError: it was down for ``PATIENCE_SECONDS``.
+        StorageError: it was down for ``RETRY_SECONDS``.
     """
     began = time.monotonic()
     pause, stopping_since = FIRST_PAUSE_SECONDS, float("inf")
@@ -36,7 +36,7 @@ def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
             now = time.monotonic()
             if should_stop():
                 stopping_since = min(stopping_since, now)
-            left = min(began + PATIENCE_SECONDS, stopping_since + STOPPING_SECONDS) - now
+            left = min(began + RETRY_SECONDS, stopping_since + STOPPING_SECONDS) - now
             if left <= 0.0:
                 raise
             if pause == FIRST_PAUSE_SECONDS:
@@ -45,7 +45,7 @@ def patiently(act: Callable[[], None], should_stop: Callable[[], bool]) -> None:
             pause = min(2.0 * pause, LONGEST_PAUSE_SECONDS)
 
 
-def repeatedly(act: Callable[[], None], over: threading.Event, *, every: float, hint: str) -> None:
+def repeat_until(act: Callable[[], None], over: threading.Event, *, every: float, hint: str) -> None:
     """Do what needs the store again and again until it is over; less often while the store is down.
 
     Args:

@@ -4,7 +4,7 @@
     environment = gymnasium.make("recrl.environments.registration:recrl/SafetyAntVelocity-v1")
     batch = gymnasium.make_vec("recrl.environments.registration:recrl/SafetyAntVelocity-v1", num_envs=16)
 
-Observations, actions, rewards and costs: see ``recrl.environments.velocity.batch``.
+Observations, actions, rewards and costs: see ``recrl.environments.velocity.velocity_batch``.
 
 ``info`` of a step holds ``cost`` (the cost, [k] with k = 1), ``velocity`` (which is compared with the
 threshold, m/s), and ``cost_exception`` if the physics diverged.
@@ -18,11 +18,16 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.simulation.camera import Renderer
-from recrl.environments.simulation.environments import Description, MujocoEnv, MujocoVectorEnv, TaskFamily
-from recrl.environments.velocity.tasks import HORIZON, VELOCITY_TASKS, VelocityTask
+from recrl.environments.simulation.mujoco_environments import (
+    Description,
+    MujocoEnv,
+    MujocoVectorEnv,
+    TaskFamily,
+)
+from recrl.environments.velocity.task_definitions import HORIZON, VELOCITY_TASKS, VelocityTask
 
 if TYPE_CHECKING:
-    from recrl.environments.velocity.batch import Outcome, VelocityBatch
+    from recrl.environments.velocity.velocity_batch import VelocityBatch, VelocityOutcome
 
 COST_NAMES = ("cost",)
 
@@ -44,7 +49,7 @@ class VelocityOptions(BaseModel):
     )
 
 
-def _info(outcome: Outcome) -> dict[str, Any]:
+def _info(outcome: VelocityOutcome) -> dict[str, Any]:
     info: dict[str, Any] = {"cost": outcome.costs[:, None], "velocity": outcome.velocities}
     if outcome.broken is not None:
         info["cost_exception"] = outcome.broken.astype(np.float64)
@@ -59,7 +64,7 @@ def _renderer(batch: VelocityBatch) -> Renderer:
 
 def _make(task: VelocityTask, number: int, options: VelocityOptions) -> tuple[Description, VelocityBatch]:
     """Make the description and the batch of a task; only this function imports MuJoCo and Numba."""
-    from recrl.environments.velocity.batch import VelocityBatch  # noqa: PLC0415
+    from recrl.environments.velocity.velocity_batch import VelocityBatch  # noqa: PLC0415
 
     batch = VelocityBatch(task, number, horizon=options.horizon, num_threads=options.num_threads)
     description = Description(

@@ -18,8 +18,8 @@ from recrl.agents.algorithms.ipo import (
 from recrl.agents.algorithms.own_options import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.algorithms.p3o import PenalisedProximalPolicyOptimisation, penalised_surrogate_objective
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.batch import LearningBatch
 from recrl.agents.learning.distributions import Categorical
+from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal
@@ -164,7 +164,7 @@ def test_a_violated_constraint_is_mended_and_no_limit_is_no_penalty(name: str) -
 
 
 @pytest.mark.parametrize("name", ["p3o", "ipo"])
-def test_without_a_finished_episode_a_student_without_multipliers_stays(name: str) -> None:
+def test_without_a_finished_episode_an_agent_without_multipliers_stays(name: str) -> None:
     metrics, moved = improved(name, math.nan)
     assert not moved
     assert metrics["policy_steps"] == 0.0

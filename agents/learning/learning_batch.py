@@ -80,7 +80,7 @@ def by_group(samples: Floats, group: Indices | None, num_groups: int) -> Floats:
 
 
 def to_tensor(values: Floats) -> Tensor:
-    """Make a tensor of float64 values, in the precision and on the device of learning."""
+    """Make a tensor of float64 values, in their shape, in the precision and on the device of learning."""
     return torch.as_tensor(values, dtype=torch.get_default_dtype())
 
 

@@ -79,7 +79,7 @@ class SweepPlace:
         """Keep the folder up to date while the body runs, and once more after it."""
         return nullcontext()
 
-    def settle(self, specs: Sequence[TrialSpec]) -> None:
+    def send_dead_trials(self, specs: Sequence[TrialSpec]) -> None:
         """Send the status of trials whose processes died, which only this machine knows."""
 
     def request_stop(self) -> Callable[[], bool]:

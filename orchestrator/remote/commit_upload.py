@@ -13,17 +13,17 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import CheckpointError, LostLeaseError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.remote import patience
+from recrl.orchestrator.remote import retries
 from recrl.orchestrator.remote.commit_format import APPENDED, WHOLE, Commit, Piece, pack
-from recrl.orchestrator.remote.patience import patiently
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial, attempt_of, attempts_in, size_of
+from recrl.orchestrator.remote.retries import retry_while_down
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 LOOK_SECONDS = 0.5  # between two checks of the trial's folder
@@ -41,7 +41,7 @@ class Upload:
 
         Args:
             remote: the target.
-            trial: the source, after ``RemoteTrial.take_up``.
+            trial: the source, after ``RemoteTrial.download_for_attempt``.
         """
         self._remote = remote
         self._trial = trial
@@ -186,14 +186,14 @@ def working_copy(
         should_stop: once true, the wait for a store that is down is at most ``STOPPING_SECONDS``.
 
     Raises:
-        StorageError: the store was down for ``PATIENCE_SECONDS``; its last commit is intact.
+        StorageError: the store was down for ``RETRY_SECONDS``; its last commit is intact.
     """
     with scratch_folder(tempfile.gettempdir()) as folder:
         trial = TrialStore(folder / spec.folder_name)
-        patiently(lambda: remote.take_up(trial), should_stop)
+        retry_while_down(lambda: remote.download_for_attempt(trial), should_stop)
         upload = Upload(remote, trial)
         try:
-            with beside(partial(_follow, upload), name="upload"):
+            with background_thread(partial(_follow, upload), name="upload"):
                 yield trial
         except Exception:  # but not a KeyboardInterrupt, which ends at once
             _finish(upload, should_stop)
@@ -204,7 +204,7 @@ def working_copy(
 def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:
     """Send the remaining commits, unless there is a newer attempt."""
     try:
-        patiently(upload.finish, should_stop)
+        retry_while_down(upload.finish, should_stop)
     except LostLeaseError as error:
         logger.warning("%s", error)
 
@@ -213,7 +213,7 @@ def _follow(upload: Upload, over: threading.Event) -> None:
     """Send commits until the end."""
     hint = "the trial continues, and the upload is tried again"
     try:
-        patience.repeatedly(upload.follow, over, every=LOOK_SECONDS, hint=hint)
+        retries.repeat_until(upload.follow, over, every=LOOK_SECONDS, hint=hint)
     except LostLeaseError as error:
         logger.warning("%s", error)
         upload.revoke()

@@ -115,7 +115,7 @@ class SafetyTask:
 
     @property
     def box_density(self) -> float:
-        """Return the box: Safety Gym makes the Car's smaller and lighter than the Point's."""
+        """Density of the box, kg/m^3; the Car's box is also smaller than the Point's."""
         return 0.0005 if self.robot == "Car" else 0.001
 
     @property

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recrl.agents.learning.batch import LearningBatch, find_repeated
+from recrl.agents.learning.learning_batch import LearningBatch, find_repeated
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 
 ROWS = np.eye(4, dtype=np.float32)

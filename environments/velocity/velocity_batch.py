@@ -33,13 +33,13 @@ from recrl.environments.simulation.environment_batch import EnvironmentBatch, Ob
 from recrl.environments.simulation.mujoco_batch import Simulations
 from recrl.environments.velocity.model import make_model
 from recrl.environments.velocity.physics import advance, derive, physics_record
-from recrl.environments.velocity.tasks import HORIZON, Booleans, VelocityTask
+from recrl.environments.velocity.task_definitions import HORIZON, Booleans, VelocityTask
 
 TORSO = 1
 """The torso's body; body 0 is the floor."""
 
 
-class Outcome(NamedTuple):
+class VelocityOutcome(NamedTuple):
     """Result of one step.
 
     Attributes:
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
     finished: npt.NDArray[np.intp]
 
 
-class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
+class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
     """B environments of one velocity task; see ``EnvironmentBatch``.
 
     Args:
@@ -125,7 +125,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         self._actions[...] = actions
         return bool(np.abs(self._actions).max() <= self.bound)  # False with NaN
 
-    def advance(self) -> Outcome:
+    def advance(self) -> VelocityOutcome:
         """Take one step with every robot, with the actions that were set."""
         self._controls[...] = self._actions
         self.simulations.apply(advance, self.address)
@@ -133,7 +133,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
         passed = (places - self.places) / self.seconds
         self.places = places
         self.steps += 1
-        rewards, velocities, costs = self.judge(passed, self._actions)
+        rewards, velocities, costs = self.rewards_and_costs(passed, self._actions)
         terminated = self.fallen()
         broken = self.simulations.broken() if self.simulations.any_broken() else None
         if broken is not None:
@@ -141,9 +141,9 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, Outcome]):
             terminated |= broken
         truncated = (self.steps >= self.horizon) & ~terminated
         finished = np.flatnonzero(terminated | truncated)
-        return Outcome(rewards, costs, velocities, terminated, truncated, broken, finished)
+        return VelocityOutcome(rewards, costs, velocities, terminated, truncated, broken, finished)
 
-    def judge(self, passed: Floats, actions: Floats) -> tuple[Floats, Floats, Floats]:
+    def rewards_and_costs(self, passed: Floats, actions: Floats) -> tuple[Floats, Floats, Floats]:
         """Compute rewards, velocities and costs of a step.
 
         Args:

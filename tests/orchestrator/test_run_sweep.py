@@ -16,9 +16,9 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.plan import Plan, PlannedAction
-from recrl.orchestrator.places import SweepPlace
+from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep, stopping_on_signals
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.sweep import LaunchSettings, SweepResult, launch, stopping_on_signals
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import SweepProgress
 
 GRID = """\
@@ -64,8 +64,10 @@ def _grid(text: str = GRID) -> GridSpec:
 
 def _launch(store: SweepStore, grid: GridSpec | None = None, *, retry_failed: bool = False) -> SweepResult:
     stop = threading.Event()
-    settings = LaunchSettings(grid or _grid(), SweepPlace(store), InlineExecutor(), retry_failed=retry_failed)
-    return launch(settings, stop=stop)
+    settings = SweepRunSettings(
+        grid or _grid(), SweepPlace(store), InlineExecutor(), retry_failed=retry_failed
+    )
+    return run_sweep(settings, stop=stop)
 
 
 def _results(store: SweepStore) -> dict[str, bytes]:
@@ -137,7 +139,7 @@ def test_the_folder_says_what_was_launched(store: SweepStore) -> None:
 
 
 def test_a_stopped_sweep_goes_on_with_the_same_call(store: SweepStore, tmp_path: Path) -> None:
-    stopped = launch(LaunchSettings(_grid(), SweepPlace(store), StopAfterOne()), stop=threading.Event())
+    stopped = run_sweep(SweepRunSettings(_grid(), SweepPlace(store), StopAfterOne()), stop=threading.Event())
     assert stopped.stopped
     assert not stopped.progress.is_complete
     again = _launch(store)
@@ -190,8 +192,8 @@ def test_two_launches_of_a_sweep_at_once_are_refused(store: SweepStore) -> None:
 def test_a_wrong_selection_leaves_no_trace(store: SweepStore) -> None:
     with pytest.raises(RecrlError, match="--only: no trial has method 'dynamic'"):
         only = {"method": ["dynamic"]}
-        settings = LaunchSettings(_grid(), SweepPlace(store), InlineExecutor(), only=only)
-        launch(settings, stop=threading.Event())
+        settings = SweepRunSettings(_grid(), SweepPlace(store), InlineExecutor(), only=only)
+        run_sweep(settings, stop=threading.Event())
     assert not store.folder.exists()
 
 
@@ -205,7 +207,7 @@ def test_the_sync_gets_its_full_timeout_after_the_figures(store: SweepStore) -> 
     def finish(after: SweepProgress) -> None:
         order.append(f"complete: {after.is_complete}, sync stopped: {bool(sync.patience)}")
 
-    settings = LaunchSettings(
+    settings = SweepRunSettings(
         _grid(),
         SweepPlace(store),
         InlineExecutor(),
@@ -213,7 +215,7 @@ def test_the_sync_gets_its_full_timeout_after_the_figures(store: SweepStore) -> 
         watch=watch,
         finish=finish,
     )
-    result = launch(settings, stop=threading.Event())
+    result = run_sweep(settings, stop=threading.Event())
     assert order == ["2 to do", "complete: True, sync stopped: False"]
     assert result.synced
     assert sync.patience == [120.0]
@@ -223,8 +225,8 @@ def test_the_sync_gets_its_full_timeout_after_the_figures(store: SweepStore) -> 
 def test_the_sync_gets_a_short_timeout_otherwise(store: SweepStore, executor: Executor) -> None:
     sync = Bystander()
     try:
-        settings = LaunchSettings(_grid(), SweepPlace(store), executor, start_sync=lambda _: sync)
-        launch(settings, stop=threading.Event())
+        settings = SweepRunSettings(_grid(), SweepPlace(store), executor, start_sync=lambda _: sync)
+        run_sweep(settings, stop=threading.Event())
     except ClusterError:
         assert isinstance(executor, Unavailable)
     assert sync.patience == [10.0]

@@ -17,16 +17,16 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Protocol
 
-from recrl.orchestrator.background import beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan
 from recrl.orchestrator.grid.selection import select
-from recrl.orchestrator.places import SweepPlace
 from recrl.orchestrator.provenance.versions import collect
 from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
 
 # Timeout of the MLflow sync for its last pass: after the whole sweep, and after a stop request.
@@ -72,7 +72,7 @@ class SweepResult:
 
 
 @dataclass(frozen=True)
-class LaunchSettings:
+class SweepRunSettings:
     """Settings of a launch.
 
     Attributes:
@@ -100,7 +100,7 @@ class LaunchSettings:
     finish: Callable[[SweepProgress], None] = lambda after: None
 
 
-def launch(settings: LaunchSettings, *, stop: threading.Event) -> SweepResult:
+def run_sweep(settings: SweepRunSettings, *, stop: threading.Event) -> SweepResult:
     """Run all trials of a grid that are not finished.
 
     Args:
@@ -130,7 +130,7 @@ def launch(settings: LaunchSettings, *, stop: threading.Event) -> SweepResult:
         return _run(settings, plan, stop)
 
 
-def _plan(settings: LaunchSettings, specs: Sequence[TrialSpec]) -> Plan:
+def _plan(settings: SweepRunSettings, specs: Sequence[TrialSpec]) -> Plan:
     return make_plan(
         specs,
         settings.place.store,
@@ -141,7 +141,7 @@ def _plan(settings: LaunchSettings, specs: Sequence[TrialSpec]) -> Plan:
     )
 
 
-def _run(settings: LaunchSettings, plan: Plan, stop: threading.Event) -> SweepResult:
+def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> SweepResult:
     """Run the trials of a plan, with the MLflow sync in the background."""
     store = settings.place.store
     sync = settings.start_sync(store) if settings.start_sync is not None else None
@@ -159,7 +159,7 @@ def _run(settings: LaunchSettings, plan: Plan, stop: threading.Event) -> SweepRe
     return SweepResult(plan, after, stopped=stop.is_set(), synced=synced)
 
 
-def _run_trials(settings: LaunchSettings, specs: Sequence[TrialSpec], stop: threading.Event) -> None:
+def _run_trials(settings: SweepRunSettings, specs: Sequence[TrialSpec], stop: threading.Event) -> None:
     """Run trials; afterwards none of them has the status running, also after an error."""
     place = settings.place
     try:
@@ -168,7 +168,7 @@ def _run_trials(settings: LaunchSettings, specs: Sequence[TrialSpec], stop: thre
     finally:
         _leave_none_running(specs, place.store)
         try:
-            place.settle(specs)
+            place.send_dead_trials(specs)
         except StorageError as error:  # must not hide an earlier error
             logger.warning("%s; the end of its trials is recorded on this machine only", error)
 
@@ -185,7 +185,7 @@ def _stopping_on_request(store: SweepStore, stop: threading.Event) -> Iterator[N
 
     store.stop_request_path.unlink(missing_ok=True)
     try:
-        with beside(watch, name="stop request"):
+        with background_thread(watch, name="stop request"):
             yield
     finally:
         store.stop_request_path.unlink(missing_ok=True)

@@ -77,26 +77,26 @@ class VelocityTask:
 
 
 def ant_is_healthy(qpos: Floats, qvel: Floats) -> Booleans:
-    """Torso between 0.2 m and 1 m high, everything finite."""
+    """Torso between 0.2 m and 1 m high, everything finite; of qpos [B, nq] and qvel [B, nv], [B]."""
     height = qpos[:, 2]
     finite = np.isfinite(qpos).all(axis=1) & np.isfinite(qvel).all(axis=1)
     return np.asarray((height >= 0.2) & (height <= 1.0) & finite)
 
 
 def hopper_is_healthy(qpos: Floats, qvel: Floats) -> Booleans:
-    """Torso more than 0.7 m high and leaning less than 0.2 rad; all else within 100."""
+    """Torso more than 0.7 m high and leaning less than 0.2 rad, all else within 100; [B]."""
     height, angle = qpos[:, 1], qpos[:, 2]
-    calm = (np.abs(qpos[:, 2:]) < 100.0).all(axis=1) & (np.abs(qvel) < 100.0).all(axis=1)
-    return np.asarray((height > 0.7) & (np.abs(angle) < 0.2) & calm)
+    within = (np.abs(qpos[:, 2:]) < 100.0).all(axis=1) & (np.abs(qvel) < 100.0).all(axis=1)
+    return np.asarray((height > 0.7) & (np.abs(angle) < 0.2) & within)
 
 
 def humanoid_is_healthy(qpos: Floats, _: Floats) -> Booleans:
-    """Torso between 1 m and 2 m high."""
+    """Torso between 1 m and 2 m high; of qpos [B, nq], [B]."""
     return np.asarray((qpos[:, 2] > 1.0) & (qpos[:, 2] < 2.0))
 
 
 def walker_is_healthy(qpos: Floats, _: Floats) -> Booleans:
-    """Torso between 0.8 m and 2 m high and leaning less than 1 rad."""
+    """Torso between 0.8 m and 2 m high and leaning less than 1 rad; of qpos [B, nq], [B]."""
     height, angle = qpos[:, 1], qpos[:, 2]
     return np.asarray((height > 0.8) & (height < 2.0) & (np.abs(angle) < 1.0))
 
