@@ -24,19 +24,23 @@ from recrl.teachers.registry import teacher_config
 
 def run_bound(request: BoundRequest, console: Console) -> ExitCode:
     """Compare the cost of training with its bounds; find the largest d_t within a budget."""
+    from recrl.analysis.data.cost_names import indices_of_cost  # noqa: PLC0415
     from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415  (imports pandas and SciPy)
 
     sweep, _ = source(request)
     say_warnings(sweep, console)
-    if request.cost > sweep.num_costs:
-        raise RecrlError(f"--cost: {sweep.name} has {sweep.num_costs} costs, got {request.cost}")
-    rows = cumulative_cost.cumulative_costs(sweep, cost=request.cost - 1)
+    try:
+        indices = indices_of_cost(sweep, request.cost)
+    except ValueError as error:
+        raise RecrlError(f"--cost: {error}") from error
+    rows = cumulative_cost.cumulative_costs(sweep, cost=indices)
     if not len(rows):
         raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
     show(cumulative_cost.bound_table(rows), console)
+    which = f"Cost {request.cost}, summed" if sweep.num_costs > 1 else "Summed"
     say(
         console,
-        "Summed over policies, one expected episode each; means over runs; undiscounted unless stated.",
+        f"{which} over policies, one expected episode each; means over runs; undiscounted unless stated.",
     )
     if request.budget is not None:
         allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
@@ -81,7 +85,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     show(pd.concat(summaries), console)
     for i in range(max(len(run.spec.deploy_limits) for run in runs)):
         figure = replayed_limits(runs, method.label, cost=i)
-        _, picture = styles.save(figure, folder, called if i == 0 else f"{called}_cost-{i + 1}")
+        _, picture = styles.save(figure, folder, f"{called}_cost-{i}" if i else called)
         say(console, f"Figure        {short(picture)}")
     say(console, f"Every update  {short(folder)}")
     return ExitCode.OK

@@ -278,12 +278,14 @@ class BoundRequest(SourceRequest):
     trust: bool = by_flag(**_TRUST)
     budget: float | None = by_flag(
         type=types.cost,
-        metavar="COST",
+        metavar="X",
         help="allowed cost above the deployment limit of all training episodes together: find the largest "
         "training limit d_t",
     )
-    cost: int = by_flag(
-        type=types.at_least_one, default=1, metavar="I", help="index of the cost (default: 1)"
+    cost: str = by_flag(
+        default="0",
+        metavar="COST",
+        help="index of the cost, counted from 0, or its name (default: 0)",
     )
 
 

@@ -117,6 +117,13 @@ def test_the_command_says_it(river_grid: SweepStore, capsys: pytest.CaptureFixtu
     assert "The largest d_t within 1000 of cost above d_d over all episodes:" in out
 
 
+def test_the_command_counts_costs_from_0(river_grid: SweepStore, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bound", "--root", str(river_grid.folder.parent), "--cost"]
+    assert main([*command, "0"]) == ExitCode.OK
+    assert main([*command, "1"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == "recrl-sweep: --cost: river has only the cost 0, got '1'\n"
+
+
 def with_discount(sweep: Sweep, discount: float) -> Sweep:
     """The sweep of agents with this discount."""
     cpo = Choice("cpo", {"discount": discount})
