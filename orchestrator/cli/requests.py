@@ -278,13 +278,13 @@ class BoundRequest(SourceRequest):
     trust: bool = by_flag(**_TRUST)
     budget: float | None = by_flag(
         type=types.cost,
-        metavar="X",
+        metavar="COST",
         help="allowed cost above the deployment limit of all training episodes together: find the largest "
         "training limit d_t",
     )
     cost: str = by_flag(
         default="0",
-        metavar="COST",
+        metavar="INDEX",
         help="index of the cost, counted from 0, or its name (default: 0)",
     )
 
