@@ -232,10 +232,10 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
     for _, row in rows.iterrows():
         limit = float(row["largest_train_limit"])
         lines.append(
-            {name: str(row[name]) for name in GROUP}
-            | {"overshoot a policy": number(row["overshoot"])}
+            dict(zip(("task", "agent", "curriculum"), (str(row[name]) for name in GROUP), strict=True))
+            | {"overshoot per policy": number(row["overshoot"])}
             | {"violation of the worst run": number(row["measured_violation"])}
-            | {"its d_t": number(row["used_train_limit"])}
+            | {"d_t of the runs": number(row["used_train_limit"])}
             | {"largest d_t": "any" if math.isinf(limit) else "none" if math.isnan(limit) else number(limit)}
         )
     return pd.DataFrame(lines)

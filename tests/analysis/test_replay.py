@@ -97,7 +97,11 @@ def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest
     assert main([*command, "dynamik"]) == ExitCode.WRONG_INPUT
     assert "did you mean 'dynamic'?" in capsys.readouterr().err
     assert main([*command, "dynamic", "--option", "window=0"]) == ExitCode.WRONG_INPUT
-    assert "recrl-sweep: teacher dynamic: window: " in capsys.readouterr().err
+    assert capsys.readouterr().err == ("recrl-sweep: --option: dynamic: window: must be at least 1, got 0\n")
+    assert main([*command, "dynamic", "--option", "windw=3"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: --option: dynamic: windw: unknown key; did you mean 'window'?\n"
+    )
 
 
 def test_the_figure_shows_what_was_and_what_would_have_been(trial: TrialStore) -> None:
