@@ -91,8 +91,8 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     show(pd.concat(summaries), console)
     say(
         console,
-        "mean limit, replayed: means of the finite limits; reaches d_d: the share of the training phase after "
-        "which the limit is the deployment limit.",
+        "mean limit, replayed: means of the finite limits; reaches d_d: the share of the training phase "
+        "after which the limit is the deployment limit.",
     )
     for i in range(max(len(run.spec.deploy_limits) for run in runs)):
         figure = replayed_limits(runs, method.label, cost=i)

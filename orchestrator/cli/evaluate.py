@@ -82,9 +82,7 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
     kept = {spec.folder_name for spec in select(specs, only)} | (set() if only else damaged)
     if not kept:
         begin = f" begin with {text!r}" if text else ""
-        raise RecrlError(
-            f"{store.name}: no trials on disk{begin}; recrl-sweep status {store.name} lists them"
-        )
+        raise RecrlError(f"{store.name}: no trials on disk{begin}; see recrl-sweep status {store.name}")
     return [trial for trial in found if trial.folder.name in kept]
 
 

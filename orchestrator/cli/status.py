@@ -168,7 +168,7 @@ def _trial(store: SweepStore, text: str) -> TrialStore:
     titles = [f"{trial.trial_id} {trial.title}" for trial in found[:10]]
     more = f" and {len(found) - 10} more" if len(found) > 10 else ""
     named = f"give one, by its id or title: {', '.join(titles)}{more}"
-    which = named if found else f"recrl-sweep status {store.name} lists them"
+    which = named if found else f"see recrl-sweep status {store.name}"
     what = f"trials on disk begin with {text!r}" if text else "trials are running"
     raise RecrlError(f"{store.name}: {len(found) or 'no'} {what}; {which}")
 

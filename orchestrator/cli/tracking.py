@@ -41,7 +41,7 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     if not report.is_up_to_date:
         raise TrackingError(
             f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}; the files "
-            f"have everything, so try again: recrl-sweep sync {store.name}"
+            "have everything: sync again later"
         )
     say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:

@@ -396,8 +396,11 @@ def test_logs_are_found_by_id_title_or_folder(folder: Path, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["nobody"], "small: no trials on disk begin with 'nobody'; recrl-sweep status small lists them"),
-        ([], "small: no trials are running; recrl-sweep status small lists them"),
+        (
+            ["nobody"],
+            "small: no trials on disk begin with 'nobody'; see recrl-sweep status small",
+        ),
+        ([], "small: no trials are running; see recrl-sweep status small"),
         (
             ["two-state"],
             "small: 2 trials on disk begin with 'two-state'; give one, by its id or title: ",
