@@ -163,8 +163,14 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
 
 def nearest(name: str, known: Sequence[str]) -> str:
     """Return ``; did you mean 'window'?``, or nothing if no known name is near."""
+    near = nearest_name(name, known)
+    return f"; did you mean {near!r}?" if near is not None else ""
+
+
+def nearest_name(name: str, known: Sequence[str]) -> str | None:
+    """Return the known name that is nearest; None if no name is near."""
     near = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    return near[0] if near else None
 
 
 def check_keywords(function: Callable[..., Any], name: str, keywords: Mapping[str, Any]) -> None:

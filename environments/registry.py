@@ -112,9 +112,9 @@ TASKS: dict[str, Task] = {
     ),
     "gymnasium": Task(
         summary="Any environment that is registered with Gymnasium, by its id.",
-        options="recrl.environments.gymnasium_adapter:GymnasiumOptions",
-        make="recrl.environments.gymnasium_adapter:make_gymnasium",
-        drawn="recrl.environments.gymnasium_adapter:draw_gymnasium",
+        options="recrl.environments.gymnasium_tasks:GymnasiumOptions",
+        make="recrl.environments.gymnasium_tasks:make_gymnasium",
+        drawn="recrl.environments.gymnasium_tasks:draw_gymnasium",
         sample_options={"id": "CartPole-v1", "costless": True},
     ),
     **{
@@ -159,7 +159,7 @@ def find_task(name: str) -> Task:
         return found
     if not callable(found):
         raise ValueError(f"task {name!r} must be a Task or return an environment, got {type(found).__name__}")
-    from recrl.environments.gymnasium_adapter import (  # noqa: PLC0415  # only if a task needs it
+    from recrl.environments.gymnasium_tasks import (  # noqa: PLC0415  # only if a task needs it
         draw_from_callable,
         make_from_callable,
     )

@@ -29,8 +29,9 @@ def find_sweep(root: Path, sweep: str | None, storage: str | None = None) -> Swe
     if sweep is None:
         if len(names) == 1:
             return SweepStore(root, names[0])
-        listed = f"give one: {', '.join(names)}" if names else "launch one first"
-        raise RecrlError(f"{place}: holds {len(names)} sweeps; {listed}")
+        if names:
+            raise RecrlError(f"{place}: holds {len(names)} sweeps; give one: {', '.join(names)}")
+        raise RecrlError(f"{place}: holds no sweep; launch one first{_elsewhere(storage)}")
     if sweep.endswith((".yaml", ".yml")):
         sweep = read_name(Path(sweep))
     if sweep.endswith(EXPORT_SUFFIX) and sweep not in names:
@@ -41,9 +42,14 @@ def find_sweep(root: Path, sweep: str | None, storage: str | None = None) -> Swe
         folder = Path(sweep).absolute()
         if not storage and (is_sweep(folder) or (folder / "trials").is_dir()):
             return SweepStore(folder.parent, folder.name)
-        listed = f" (there: {', '.join(names)})" if names else ", nothing was launched there yet"
-        raise RecrlError(f"{place}: holds no sweep {sweep!r}{nearest(sweep, names)}{listed}")
+        hint = nearest(Path(sweep).name, names)
+        listed = f" (there: {', '.join(names)})" if names else f"; launch it first{_elsewhere(storage)}"
+        raise RecrlError(f"{place}: holds no sweep {sweep!r}{hint}{listed}")
     return SweepStore(root, sweep)
+
+
+def _elsewhere(storage: str | None) -> str:
+    return "" if storage else ", or give the folder of your sweeps with --root"
 
 
 def is_sweep(folder: Path) -> bool:

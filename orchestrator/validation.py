@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from recrl.environments.plugins import nearest
+from recrl.environments.plugins import nearest, nearest_name
 from recrl.orchestrator.located_yaml import Place
 
 _SENTENCES: Mapping[str, str] = {
@@ -52,12 +52,19 @@ _SENTENCES: Mapping[str, str] = {
 def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator[tuple[Place, str]]:
     """Return all mistakes as (place relative to the validated value, sentence).
 
+    A required key that is misspelt is one mistake: the unknown key, not the missing one beside it.
+
     Args:
         error: pydantic's error.
         model: the class that was validated, to name the nearest known key; None if unknown.
     """
-    for item in error.errors(include_url=False):
+    items = error.errors(include_url=False)
+    unknown = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
+    meant = {(*it[:-1], nearest_name(str(it[-1]), known_keys(model, it[:-1]))) for it in unknown}
+    for item in items:
         place, kind = item["loc"], item["type"]
+        if kind == "missing" and place in meant:
+            continue
         if kind == "extra_forbidden":
             yield place, _unknown_key(str(place[-1]), known_keys(model, place[:-1]))
             continue
@@ -76,6 +83,12 @@ def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
         if isinstance(part, str) and part in model.model_fields:
             model = model_in(model.model_fields[part].annotation)
     return list(model.model_fields) if model else []
+
+
+def misspells(key: str, wanted: str, model: type[BaseModel]) -> bool:
+    """Return whether a key is unknown to ``model``, and ``wanted`` is the nearest of its keys."""
+    known = list(model.model_fields)
+    return key not in known and nearest_name(key, known) == wanted
 
 
 def as_written(value: Any) -> str:

@@ -7,13 +7,17 @@ the numbers of the CSV files' columns: cost 0, cost 1.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
+from itertools import zip_longest
 from typing import Any
 
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
+from recrl.environments.plugins import nearest
 from recrl.orchestrator.redaction import printable
 
 LONGEST_NAME = 60
+INDEX = re.compile("[0-9]{1,6}")
 
 
 def cost_names(sweep: Sweep) -> Mapping[str, tuple[str, ...]]:
@@ -43,6 +47,39 @@ def cost_suffix(sweep: Sweep, i: int, task: str | None = None) -> str:
     labels = {spec.task.label for spec in shown if len(spec.deploy_limits) > i}
     found = {names[label][i] if label in names else str(i) for label in labels}
     return f" {found.pop()}" if len(found) == 1 else f" {i}"
+
+
+def indices_of_cost(sweep: Sweep, wanted: str) -> Mapping[str, int]:
+    """Return the index of a cost in each task that has it, by the task's label.
+
+    Args:
+        sweep: its trials have the names.
+        wanted: the cost's index, counted from 0, or its name; two tasks may have the name at different
+            indices.
+
+    Returns:
+        Empty if the sweep has no trials.
+
+    Raises:
+        ValueError: no task of the sweep has the cost.
+    """
+    names = {it.spec.task.label: ("",) * len(it.spec.deploy_limits) for it in sweep.facts}
+    names |= cost_names(sweep)
+    if INDEX.fullmatch(wanted):
+        found = {task: int(wanted) for task, each in names.items() if int(wanted) < len(each)}
+    else:
+        found = {task: each.index(wanted) for task, each in names.items() if wanted and wanted in each}
+    if names and not found:
+        costs = [dict.fromkeys(filter(_is_name, each)) for each in zip_longest(*names.values(), fillvalue="")]
+        texts = [f"{i} ({' or '.join(called)})" if called else str(i) for i, called in enumerate(costs)]
+        has = "only the cost" if len(costs) == 1 else "the costs"
+        hint = nearest(wanted, [name for called in costs for name in called])
+        raise ValueError(f"{sweep.name} has {has} {', '.join(texts)}, got {wanted!r}{hint}")
+    return found
+
+
+def _is_name(text: str) -> bool:
+    return bool(text) and not INDEX.fullmatch(text)
 
 
 def _is_named(names: tuple[str, ...]) -> bool:

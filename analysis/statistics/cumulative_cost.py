@@ -130,12 +130,12 @@ def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, disco
     return np.asarray(np.fmin(seen, largest))
 
 
-def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
+def cumulative_costs(sweep: Sweep, *, cost: int | Mapping[str, int] = 0) -> pd.DataFrame:
     """Return measured sums and bounds: one row per trial with a finished training phase.
 
     Args:
         sweep: the frames.
-        cost: i, index of the cost.
+        cost: i, index of the cost; or the index in each task that has the cost, by the task's label.
 
     Returns:
         KEY, policies (n), episodes_per_policy, train_limit (the d_t in force at the start of the
@@ -145,16 +145,19 @@ def cumulative_costs(sweep: Sweep, *, cost: int = 0) -> pd.DataFrame:
     trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
     runs = training_runs(sweep)
     lines = []
-    for _, trial in trained[trained[f"deploy_limit_{cost}"].notna()].iterrows():
+    for _, trial in trained.iterrows():
         key = tuple(trial[name] for name in KEY)
-        start = trial[f"start_limit_{cost}"]
-        given = trial[f"train_limit_{cost}"] if math.isnan(start) else start
-        deploy = float(trial[f"deploy_limit_{cost}"])
+        i = cost if isinstance(cost, int) else cost.get(str(trial["task"]))
+        if i is None or math.isnan(trial[f"deploy_limit_{i}"]):
+            continue
+        start = trial[f"start_limit_{i}"]
+        given = trial[f"train_limit_{i}"] if math.isnan(start) else start
+        deploy = float(trial[f"deploy_limit_{i}"])
         lines.append(
             dict(zip(KEY, key, strict=True))
             | {"train_limit": float(given), "deploy_limit": deploy}
             | {"episodes_per_policy": float(runs[key]["episodes"].mean())}
-            | _sums(policies_of(sweep, trial, runs[key], cost=cost), deploy)
+            | _sums(policies_of(sweep, trial, runs[key], cost=i), deploy)
         )
     rows = pd.DataFrame(lines)
     for name in KEY[:3] if len(rows) else ():
@@ -231,10 +234,10 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
     for _, row in rows.iterrows():
         limit = float(row["largest_train_limit"])
         lines.append(
-            {name: str(row[name]) for name in GROUP}
-            | {"overshoot a policy": number(row["overshoot"])}
+            dict(zip(("task", "agent", "curriculum"), (str(row[name]) for name in GROUP), strict=True))
+            | {"overshoot per policy": number(row["overshoot"])}
             | {"violation of the worst run": number(row["measured_violation"])}
-            | {"its d_t": number(row["used_train_limit"])}
+            | {"d_t of the runs": number(row["used_train_limit"])}
             | {"largest d_t": "any" if math.isinf(limit) else "none" if math.isnan(limit) else number(limit)}
         )
     return pd.DataFrame(lines)

@@ -96,7 +96,7 @@ def replay_summary(trial: TrialStore, rows: pd.DataFrame) -> pd.DataFrame:
         other = training[f"replayed_limit_{i}"].to_numpy(np.float64)
         differ = own != other
         lines.append(
-            {"trial": trial.spec.title, "cost": str(i + 1), "updates": str(len(training))}
+            {"trial": trial.spec.title, "cost": str(i), "updates": str(len(training))}
             | {"other limit": str(int(differ.sum()))}
             | {"mean limit": _mean(own), "replayed": _mean(other)}
             | {"reaches d_d": _reached(training, own, deploy)}

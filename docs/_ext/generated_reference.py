@@ -84,6 +84,7 @@ def command_line() -> str:
     lines += [f"| [`{name}`](#recrl-sweep-{name}) | {cell(text)} |" for name, text in summaries.items()]
     for name, command in commands.choices.items():
         lines += [f"\n## recrl-sweep {name}\n", f"{cell(command.description)}\n", usage(command)]
+        lines += [f"```console\n{(command.epilog or '').removeprefix('Example: ')}\n```\n"]
         lines += ["| argument | meaning |", "|---|---|", *map(argument, arguments_of(command))]
     return "\n".join(lines) + "\n"
 

@@ -37,6 +37,7 @@ class Request:
         given: the arguments as they were typed.
     """
 
+    example: ClassVar[str] = ""  # a command line for --help
     trusted: ClassVar[bool] = False  # whether the command itself is the permission to follow import paths
     given: tuple[str, ...]
 

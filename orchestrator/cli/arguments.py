@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import re
 from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
@@ -40,6 +41,9 @@ Later:
   recrl-sweep logs demo 3f2a --follow     a trial's log, by the beginning of its id or title
   recrl-sweep evaluate demo 3f2a --video  evaluate its policy again, and film an episode
   recrl-sweep check demo                  check all files against their digests
+  recrl-sweep bound demo                  compare the cost of training with its theoretical bounds
+  recrl-sweep replay demo --teacher dynamic --option window=8
+                                          the limits that another curriculum would have set
   recrl-sweep launch demo.yaml --retry-failed
   recrl-sweep launch demo.yaml --only method=dynamic task=rivergrid-1b
   recrl-sweep launch demo.yaml --address auto --storage s3://bucket/folder
@@ -77,6 +81,8 @@ COMMANDS: Mapping[type[Request], str] = {
     requests.UIRequest: "tracking:run_ui",
     requests.SyncRequest: "tracking:run_sync",
 }
+_CHOICE = re.compile(r"invalid choice: '(.*)' \(choose from (.*)\)")  # argparse's own sentences
+_UNKNOWN = re.compile(r"unrecognized arguments: (--[\w-]+).*")
 LISTS = ("--only", "--option")  # each takes several KEY=VALUE
 LONGEST_LINE = 1000  # characters of an error
 
@@ -91,8 +97,17 @@ def readable(sentence: str) -> str:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong with the arguments, which may hold a password, and exit."""
-        super().error(readable(message))
+        """Say what is wrong with the arguments, which may hold a password, and what was meant, and exit."""
+        super().error(readable(f"{message}{self._hint(message)}"))
+
+    def _hint(self, message: str) -> str:
+        from recrl.environments.plugins import nearest  # noqa: PLC0415  (--help is to be quick)
+
+        if choice := _CHOICE.search(message):
+            return nearest(choice[1], re.findall(r"[\w.-]+", choice[2]))
+        if unknown := _UNKNOWN.fullmatch(message):
+            return nearest(unknown[1], list(self._option_string_actions))
+        return f"; see {self.prog} --help" if "required" in message else ""
 
 
 def parse(given: Sequence[str]) -> Request:
@@ -101,7 +116,9 @@ def parse(given: Sequence[str]) -> Request:
     Raises:
         SystemExit: they are wrong, or contain ``--help``.
     """
-    parsed = parser().parse_args(spread(given))
+    parsed, unknown = parser().parse_known_args(spread(given))
+    if unknown:
+        parsed.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     parsed.given = tuple(given)
     request: Request = parsed.request.of(parsed)
     return request
@@ -120,8 +137,10 @@ def parser() -> argparse.ArgumentParser:
     for request in COMMANDS:
         name, summary = request.__name__.removesuffix("Request").lower(), request.__doc__ or ""
         short = summary[:1].lower() + summary[1:].removesuffix(".")
-        command = commands.add_parser(name, help=short, description=summary)
-        command.set_defaults(request=request)
+        command = commands.add_parser(
+            name, help=short, description=summary, epilog=f"Example: {request.example}"
+        )
+        command.set_defaults(request=request, parser=command)
         request.add_to(command)
     return top
 

@@ -19,28 +19,38 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.selection import parse_only, select
 from recrl.orchestrator.spec import Choice, TrialState
-from recrl.teachers.registry import teacher_config
+from recrl.orchestrator.validation import sentences
+from recrl.teachers.registry import find_teacher, teacher_config
 
 
 def run_bound(request: BoundRequest, console: Console) -> ExitCode:
     """Compare the cost of training with its bounds; find the largest d_t within a budget."""
+    from recrl.analysis.data.cost_names import indices_of_cost  # noqa: PLC0415
     from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415  (imports pandas and SciPy)
 
     sweep, _ = source(request)
     say_warnings(sweep, console)
-    if request.cost > sweep.num_costs:
-        raise RecrlError(f"--cost: {sweep.name} has {sweep.num_costs} costs, got {request.cost}")
-    rows = cumulative_cost.cumulative_costs(sweep, cost=request.cost - 1)
+    try:
+        indices = indices_of_cost(sweep, request.cost)
+    except ValueError as error:
+        raise RecrlError(f"--cost: {error}") from error
+    rows = cumulative_cost.cumulative_costs(sweep, cost=indices)
     if not len(rows):
         raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
     show(cumulative_cost.bound_table(rows), console)
+    which = f"Cost {request.cost}, summed" if sweep.num_costs > 1 else "Summed"
     say(
         console,
-        "Summed over policies, one expected episode each; means over runs; undiscounted unless stated.",
+        f"{which} over policies, one expected episode each; means over runs; undiscounted unless stated; "
+        "–: not known for this agent or task.",
     )
     if request.budget is not None:
         allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
-        say(console, f"\nThe largest d_t within {request.budget:g} of cost above d_d over all episodes:")
+        say(
+            console,
+            f"\nThe largest training limit d_t within {request.budget:g} of cost above the deployment limit "
+            "d_d over all episodes:",
+        )
         show(cumulative_cost.admissible_table(allowed), console)
     return ExitCode.OK
 
@@ -79,9 +89,14 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
         raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials has a policy update yet")
     say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
     show(pd.concat(summaries), console)
+    say(
+        console,
+        "mean limit, replayed: means of the finite limits; reaches d_d: the share of the training phase "
+        "after which the limit is the deployment limit.",
+    )
     for i in range(max(len(run.spec.deploy_limits) for run in runs)):
         figure = replayed_limits(runs, method.label, cost=i)
-        _, picture = styles.save(figure, folder, called if i == 0 else f"{called}_cost-{i + 1}")
+        _, picture = styles.save(figure, folder, f"{called}_cost-{i}" if i else called)
         say(console, f"Figure        {short(picture)}")
     say(console, f"Every update  {short(folder)}")
     return ExitCode.OK
@@ -100,8 +115,11 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
     try:
         teacher_config(method.name, options)
     except ValidationError as error:
-        mistakes = "; ".join(f"{'.'.join(map(str, it['loc']))}: {it['msg']}" for it in error.errors())
-        raise RecrlError(f"teacher {method.name}: {mistakes}, got {options}") from error
+        mistakes = (
+            f"{'.'.join(map(str, place))}: {sentence}"
+            for place, sentence in sentences(error, find_teacher(method.name).config)
+        )
+        raise RecrlError(f"--option: {method.name}: {'; '.join(mistakes)}") from error
     except UntrustedNameError as error:
         raise RecrlError(f"{error}; if you trust it, add --trust") from error
     except UnknownNameError as error:

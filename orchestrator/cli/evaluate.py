@@ -47,7 +47,10 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
         rows += summary(episodes, saved)
         written.append(path)
     show(pd.DataFrame(rows), console)
-    say(console, "Means and standard errors; within: episodes in which no cost exceeded its d_d.")
+    say(
+        console,
+        "Means and standard errors. d_d: deployment limits; within: episodes in which no cost exceeded them.",
+    )
     for path in written:
         say(console, f"Episodes   {short(path)}")
     for reason in left_out:
@@ -79,7 +82,7 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
     kept = {spec.folder_name for spec in select(specs, only)} | (set() if only else damaged)
     if not kept:
         begin = f" begin with {text!r}" if text else ""
-        raise RecrlError(f"{store.name}: no trials on disk{begin}; status names them")
+        raise RecrlError(f"{store.name}: no trials on disk{begin}; see recrl-sweep status {store.name}")
     return [trial for trial in found if trial.folder.name in kept]
 
 

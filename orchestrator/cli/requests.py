@@ -36,8 +36,8 @@ _ONLY: Mapping[str, Any] = {
     "action": "append",
     "default": [],
     "metavar": "KEY=VALUE",
-    "help": "only these trials: task, agent or method by label, or seed; several values with commas, "
-    "method=none,dynamic",
+    "help": "only these trials: task, agent or method by label, or seed; several pairs with spaces, several "
+    "values with commas: --only method=none,dynamic seed=0",
 }
 _TRACKING: Mapping[str, Any] = {
     "metavar": "URI",
@@ -51,7 +51,10 @@ class PlaceRequest(Request):
     """Location of sweeps."""
 
     root: Path = by_flag(
-        type=types.folder, default=DEFAULT_ROOT, help="the folder of all sweeps (default: runs)"
+        type=types.folder,
+        default=DEFAULT_ROOT,
+        metavar="FOLDER",
+        help="the folder of all sweeps (default: runs)",
     )
     storage: str | None = by_flag(
         metavar="URI",
@@ -81,7 +84,8 @@ class GridRequest(PlaceRequest):
     max_concurrent: int | None = by_flag(
         type=types.at_least_one,
         metavar="N",
-        help="largest number of parallel trials; by default as fit (or the grid's)",
+        help="largest number of parallel trials; by default as many as fit, at most the grid's "
+        "max_concurrent",
     )
     address: str | None = by_flag()
 
@@ -90,6 +94,7 @@ class GridRequest(PlaceRequest):
 class LaunchRequest(GridRequest):
     """Run what is not complete, draw the figures, print the results."""
 
+    example: ClassVar[str] = "recrl-sweep launch demo.yaml --only method=none,dynamic seed=0"
     trusted: ClassVar[bool] = True
     address: str | None = by_flag(
         metavar="HOST:PORT",
@@ -117,10 +122,12 @@ class LaunchRequest(GridRequest):
 class PlanRequest(GridRequest):
     """Say what a launch would do, and about how long it takes."""
 
+    example: ClassVar[str] = "recrl-sweep plan demo.yaml --measure"
     address: str | None = by_flag(
         group="room",
         metavar="HOST:PORT",
-        help="estimate for this Ray cluster, which must run; by default for this machine",
+        help="estimate for this Ray cluster, which must run, or 'auto' to find it; by default for this "
+        "machine",
     )
     cores: int | None = by_flag(
         group="room", type=types.at_least_one, metavar="N", help="estimate for this number of cores"
@@ -140,6 +147,7 @@ class PlanRequest(GridRequest):
 class ValidateRequest(Request):
     """Check a grid file; all mistakes at once, with their lines."""
 
+    example: ClassVar[str] = "recrl-sweep validate demo.yaml"
     grid: Path = by_place(**_GRID)
     trust: bool = by_flag(**_TRUST)
 
@@ -155,21 +163,27 @@ class SweepRequest(PlaceRequest):
 class StatusRequest(SweepRequest):
     """Show the progress of a sweep, from its files."""
 
+    example: ClassVar[str] = "recrl-sweep status demo"
     brief: bool = by_flag(action="store_true", help="one line, without the table of trials")
 
 
 class CheckRequest(SweepRequest):
-    """Check every file of a sweep against the length and digest that were committed."""
+    """Check every file of a sweep against its recorded length and digest."""
+
+    example: ClassVar[str] = "recrl-sweep check demo"
 
 
 class StopRequest(SweepRequest):
-    """Ask the launch that runs a sweep to save its trials and end, and wait."""
+    """Ask a sweep's launch to save its trials and end; wait until it has."""
+
+    example: ClassVar[str] = "recrl-sweep stop demo"
 
 
 @dataclass(frozen=True)
 class LogsRequest(SweepRequest):
     """Print a trial's log."""
 
+    example: ClassVar[str] = "recrl-sweep logs demo 3f2a --follow"
     trial: tuple[str, ...] = by_place(
         nargs="*",
         metavar="TRIAL",
@@ -186,6 +200,7 @@ class LogsRequest(SweepRequest):
 class EvaluateRequest(SweepRequest):
     """Evaluate the policies of trials without learning; optionally film them."""
 
+    example: ClassVar[str] = "recrl-sweep evaluate demo 3f2a --episodes 500 --video"
     trial: tuple[str, ...] = by_place(
         nargs="*",
         metavar="TRIAL",
@@ -210,8 +225,8 @@ class EvaluateRequest(SweepRequest):
     )
     video: str | None = by_flag(
         choices=VIDEOS,
-        help="also film one episode of each policy, as a GIF or, with the package av, as MP4; it is also "
-        "logged to MLflow",
+        help="also film one episode of each policy, as a GIF (--video alone) or, with the package av, as "
+        "MP4; it is also logged to MLflow",
     )
     tracking_uri: str | None = by_flag(**_TRACKING)
 
@@ -233,6 +248,7 @@ class SourceRequest(SweepRequest):
 class FiguresRequest(SourceRequest):
     """Draw the figures, tables and report of the present results."""
 
+    example: ClassVar[str] = "recrl-sweep figures demo --band iqm"
     trust: bool = by_flag(**_TRUST)
     to: Path | None = by_flag(
         type=types.folder, metavar="FOLDER", help="the output folder; by default the sweep's figures folder"
@@ -240,8 +256,8 @@ class FiguresRequest(SourceRequest):
     band: str = by_flag(
         choices=("mean", "iqm"),
         default="mean",
-        help="of learning curves: mean and standard error (default), or interquartile mean and 95%% "
-        "bootstrap band",
+        help="what learning curves show: mean and standard error (default), or interquartile mean and "
+        "95%% bootstrap band",
     )
     sketch: bool = by_flag(
         action="store_true",
@@ -253,6 +269,7 @@ class FiguresRequest(SourceRequest):
 class ExportRequest(SourceRequest):
     """Write one small file that figures and tables can be drawn from."""
 
+    example: ClassVar[str] = "recrl-sweep export demo --to demo.zip"
     to: Path | None = by_flag(
         type=types.zip_file, metavar="FILE.zip", help="by default the sweep's name, in this folder"
     )
@@ -262,6 +279,7 @@ class ExportRequest(SourceRequest):
 class MergeRequest(Request):
     """Join files that export wrote, of a sweep that ran in several places."""
 
+    example: ClassVar[str] = "recrl-sweep merge here.zip there.zip --to both.zip"
     parts: tuple[Path, ...] = by_place(
         type=types.path_of,
         nargs="+",
@@ -275,6 +293,7 @@ class MergeRequest(Request):
 class BoundRequest(SourceRequest):
     """Compare the cost of training with its bounds; find the largest training limit for a budget."""
 
+    example: ClassVar[str] = "recrl-sweep bound demo --budget 5000"
     trust: bool = by_flag(**_TRUST)
     budget: float | None = by_flag(
         type=types.cost,
@@ -282,8 +301,10 @@ class BoundRequest(SourceRequest):
         help="allowed cost above the deployment limit of all training episodes together: find the largest "
         "training limit d_t",
     )
-    cost: int = by_flag(
-        type=types.at_least_one, default=1, metavar="I", help="index of the cost (default: 1)"
+    cost: str = by_flag(
+        default="0",
+        metavar="INDEX",
+        help="index of the cost, counted from 0, or its name (default: 0)",
     )
 
 
@@ -291,6 +312,7 @@ class BoundRequest(SourceRequest):
 class ReplayRequest(SweepRequest):
     """The limits that another curriculum would have set on recorded episodes."""
 
+    example: ClassVar[str] = "recrl-sweep replay demo --teacher dynamic --option window=8 --only method=none"
     trust: bool = by_flag(**_TRUST)
     teacher: str = by_flag(
         required=True, metavar="NAME", help="a method of the sweep, or any curriculum by its name"
@@ -299,7 +321,7 @@ class ReplayRequest(SweepRequest):
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="its options that differ from the sweep's, window=8",
+        help="its options that differ from the sweep's; several with spaces: --option window=8 preset=paper",
     )
     only: tuple[str, ...] = by_flag(**_ONLY)
 
@@ -308,6 +330,7 @@ class ReplayRequest(SweepRequest):
 class UIRequest(SweepRequest):
     """Open MLflow's pages about a sweep, on this machine only."""
 
+    example: ClassVar[str] = "recrl-sweep ui demo"
     tracking_uri: str | None = by_flag(**_TRACKING)
     port: int = by_flag(type=types.port, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)")
 
@@ -316,6 +339,7 @@ class UIRequest(SweepRequest):
 class SyncRequest(SweepRequest):
     """Bring MLflow up to date with the files, for example after it was unreachable."""
 
+    example: ClassVar[str] = "recrl-sweep sync demo --tracking-uri http://localhost:5000"
     tracking_uri: str | None = by_flag(**_TRACKING)
     rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
 
@@ -324,11 +348,12 @@ class SyncRequest(SweepRequest):
 class InitRequest(Request):
     """Write a grid file with comments to start from."""
 
+    example: ClassVar[str] = "recrl-sweep init --template own-task"
     file: Path | None = by_place(
         nargs="?",
         type=types.path_of,
         metavar="FILE",
-        help="default: the template's name; never overwritten",
+        help="default: the template's name, demo.yaml; never overwritten",
     )
     template: str = by_flag(
         choices=TEMPLATES,
@@ -342,20 +367,30 @@ class InitRequest(Request):
 class ListRequest(Request):
     """List the tasks, agents or curricula."""
 
-    kind: str = by_place(choices=KINDS, help="what to list")
+    example: ClassVar[str] = "recrl-sweep list agents"
+    kind: str = by_place(
+        choices=KINDS,
+        metavar="KIND",
+        help="tasks, agents or curricula (methods, their key in a grid, is the same)",
+    )
 
 
 @dataclass(frozen=True)
 class OptionsRequest(Request):
     """List the options of a task, an agent, a curriculum or a section of the grid."""
 
+    example: ClassVar[str] = "recrl-sweep options ppo-lag"
     name: str = by_place(
         metavar="NAME",
         help="as 'list' shows it, or package.module:attribute; or a section: run, resources, limits, "
         "tasks, agents, methods",
     )
-    trust: bool = by_flag(**_TRUST)
+    trust: bool = by_flag(
+        action="store_true", help="import NAME if it is an import path: do so only with code that you trust"
+    )
 
 
 class SchemaRequest(Request):
     """Print a JSON schema of grid files, for editors."""
+
+    example: ClassVar[str] = "recrl-sweep schema > recrl.schema.json"

@@ -167,7 +167,8 @@ def _trial(store: SweepStore, text: str) -> TrialStore:
         return found[0]
     titles = [f"{trial.trial_id} {trial.title}" for trial in found[:10]]
     more = f" and {len(found) - 10} more" if len(found) > 10 else ""
-    which = f"give one, by its id or title: {', '.join(titles)}{more}" if found else "status names them"
+    named = f"give one, by its id or title: {', '.join(titles)}{more}"
+    which = named if found else f"see recrl-sweep status {store.name}"
     what = f"trials on disk begin with {text!r}" if text else "trials are running"
     raise RecrlError(f"{store.name}: {len(found) or 'no'} {what}; {which}")
 

@@ -40,7 +40,8 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     report = sync(store, uri, rebuild=request.rebuild, write_export=write_in_own_process)
     if not report.is_up_to_date:
         raise TrackingError(
-            f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}"
+            f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}; the files "
+            "have everything: sync again later"
         )
     say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:

@@ -12,12 +12,11 @@ from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.problem_list import TASK_MARK
 from recrl.orchestrator.located_yaml import Place
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import check_limits_fall, checked_answer
-
-TASK_MARK = "\0"  # stands for a task in a sentence, after "on" or "of"
 
 
 class BuildError(Exception):

@@ -20,7 +20,15 @@ from recrl.agents.registry import AGENTS, find_agent
 from recrl.environments.plugins import UnknownNameError, nearest
 from recrl.environments.registry import TASKS, find_task, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
-from recrl.orchestrator.grid.file_models import Entry, Limits, Resources, Run, TaskEntry
+from recrl.orchestrator.grid.file_models import (
+    DeployLimits,
+    Entry,
+    Limits,
+    Resources,
+    Run,
+    TaskEntry,
+    TrainLimits,
+)
 from recrl.orchestrator.validation import model_in
 from recrl.teachers.registry import TEACHERS, find_teacher
 
@@ -194,6 +202,12 @@ _WORDS: Mapping[Any, str] = {
     tuple: "list",
 }
 
+# Types that a function reads: their annotation has only its result.
+_WRITTEN = (
+    (TrainLimits, "'auto' or number or list of number"),
+    (DeployLimits, "number or list of number"),
+)
+
 
 def type_text(annotation: Any) -> str:
     """Describe the allowed values of an option.
@@ -203,7 +217,8 @@ def type_text(annotation: Any) -> str:
     """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
-        return type_text(arguments[0])
+        written = (text for kind, text in _WRITTEN if annotation == kind)
+        return next(written, None) or type_text(arguments[0])
     if origin is Literal:
         return " or ".join(repr(value) for value in arguments)
     if origin in (types.UnionType, typing.Union):

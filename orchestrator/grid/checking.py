@@ -20,7 +20,7 @@ budget, T ``rollout_steps``. Limits are undiscounted costs per episode.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,15 +28,21 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from recrl.agents.registry import agent_config
 from recrl.environments.cmdp import CMDPSpec, CostLimits
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError, nearest, trusted_attribute
+from recrl.environments.plugins import (
+    UnknownNameError,
+    UntrustedNameError,
+    nearest,
+    trusted_attribute,
+)
 from recrl.environments.registry import task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
-from recrl.orchestrator.grid.building import TASK_MARK, BuildError, build_own, cmdp_of
+from recrl.orchestrator.grid.building import BuildError, build_own, cmdp_of
 from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
 from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, SweepName, TaskEntry
+from recrl.orchestrator.grid.problem_list import TASK_MARK, ProblemList
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice
-from recrl.orchestrator.validation import NotJsonError, as_written, require_json, sentences
+from recrl.orchestrator.validation import NotJsonError, as_written, misspells, require_json, sentences
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000
@@ -79,11 +85,9 @@ def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
     grid = check.grid()
     if grid is not None and build:
         for place, sentence, task in build_own(grid, check.cmdps):
-            check.add_of_task(place, sentence, task)
+            check.problems.add_of_task(place, sentence, task)
     if check.problems:
-        unique = dict.fromkeys(check.problems)
-        ordered = sorted(unique, key=lambda problem: (problem.line, str(problem.place)))
-        raise GridError([f"{source}:{problem}" for problem in ordered])
+        raise GridError(check.problems.located(source))
     if grid is None:
         raise UncalledError(source, check.uncalled)
     return grid
@@ -100,8 +104,13 @@ def read_name(path: Path) -> str:
     if not isinstance(value, dict):
         problems = document.problems or (Problem(1, (), "a grid must be a mapping of settings"),)
         raise GridError([f"{path}:{problem}" for problem in problems])
+    if "name" not in value:
+        misspelt = next((key for key in value if misspells(key, "name", GridFile)), None)
+        place: Place = ("name",) if misspelt is None else (misspelt,)
+        sentence = "is required" if misspelt is None else "unknown key; did you mean 'name'?"
+        raise GridError([f"{path}:{Problem(document.line(place), place, sentence)}"])
     try:
-        return TypeAdapter(SweepName).validate_python(value.get("name"))
+        return TypeAdapter(SweepName).validate_python(value["name"])
     except ValidationError as error:
         problem = Problem(document.line(("name",)), ("name",), next(sentences(error, None))[1])
         raise GridError([f"{path}:{problem}"]) from error
@@ -126,18 +135,18 @@ class _Check:
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._document = parse(data)
-        self.problems = list(self._document.problems)
+        self.problems = ProblemList(self._document)
         self.uncalled: list[str] = []
-        self._of_tasks: dict[tuple[Place, str], list[str]] = {}  # tasks with the same mistake
         self.cmdps: dict[str, CMDPSpec] = {}  # of the tasks that can be built, by label
         raw = self._document.value
         self._raw: Mapping[str, Any] = raw if isinstance(raw, dict) else {}
 
     def grid(self) -> GridSpec | None:
         """Return the grid, or None if there are problems."""
-        if not isinstance(self._document.value, dict):
+        value = self._document.value
+        if not isinstance(value, dict):
             if not self.problems:
-                self.add((), f"a grid must be a mapping of settings, got {as_written(self._document.value)}")
+                self.problems.add((), f"a grid must be a mapping of settings, got {as_written(value)}")
             return None
         file = self._validated(GridFile, self._raw)
         tasks = self._tasks()
@@ -163,7 +172,7 @@ class _Check:
         """Check the product of all parts."""
         size = len(grid.tasks) * len(grid.agents) * len(grid.methods) * len(grid.seeds)
         if size > MAX_TRIALS:
-            self.add((), f"a grid must have at most {MAX_TRIALS} trials, got {size}")
+            self.problems.add((), f"a grid must have at most {MAX_TRIALS} trials, got {size}")
             return
         known: dict[str, list[Any]] = {
             "task": [cell.task.label for cell in grid.tasks],
@@ -174,13 +183,14 @@ class _Check:
         for index, rule in enumerate(grid.exclude):
             wanted = rule.model_dump(exclude_none=True)
             if not wanted:
-                self.add(("exclude", index), f"must name at least one of {', '.join(known)}")
+                self.problems.add(("exclude", index), f"must name at least one of {', '.join(known)}")
             for key, values in wanted.items():
                 for value in (value for value in values if value not in known[key]):
                     hint = nearest(str(value), [str(name) for name in known[key]])
-                    self.add(("exclude", index, key), f"this grid has no {key} {as_written(value)}{hint}")
+                    sentence = f"this grid has no {key} {as_written(value)}{hint}"
+                    self.problems.add(("exclude", index, key), sentence)
         if not self.problems and not grid.trials():
-            self.add(("exclude",), "leaves no trial")
+            self.problems.add(("exclude",), "leaves no trial")
 
     def _tasks(self) -> list[TaskCell]:
         """Return the tasks with correct limits and rollouts."""
@@ -190,7 +200,7 @@ class _Check:
             try:
                 cmdp = cmdp_of(task)
             except BuildError as error:
-                self.add(("tasks", index), str(error))
+                self.problems.add(("tasks", index), str(error))
                 continue
             self.cmdps[task.label] = cmdp
             limits = self._both_limits(index, task.label, cmdp)
@@ -225,15 +235,15 @@ class _Check:
             require_json(options)
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
-                self.add((*place, "options", *inner), sentence)
+                self.problems.add((*place, "options", *inner), sentence)
         except UnknownNameError as error:
-            self.add(name_place, str(error))
+            self.problems.add(name_place, str(error))
         except UntrustedNameError as error:
             self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
         except NotJsonError as error:
-            self.add((*place, "options"), f"must be finite JSON values ({error})")
+            self.problems.add((*place, "options"), f"must be finite JSON values ({error})")
         except USERS_ERRORS as error:
-            self.add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
+            self.problems.add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
         else:
             self._check_network((*place, "options", "network"), options)
             return options
@@ -247,22 +257,22 @@ class _Check:
         try:
             trusted_attribute(path)
         except UnknownNameError as error:
-            self.add(place, str(error))
+            self.problems.add(place, str(error))
         except UntrustedNameError as error:
             self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")
         except USERS_ERRORS as error:
-            self.add(place, f"{path!r} cannot be imported: {described(error)}")
+            self.problems.add(place, f"{path!r} cannot be imported: {described(error)}")
 
     def _check_differs(self, place: Place, choice: Choice, earlier: Mapping[int, Choice]) -> None:
         """Check that no earlier entry has the same label, or is the same under another label."""
         for index, other in earlier.items():
             if other.label == choice.label:
-                self.add(
+                self.problems.add(
                     place, f"is called {choice.label!r}, as is {place[0]}.{index}; give it another label"
                 )
                 return
             if (other.name, other.options) == (choice.name, choice.options) and place[0] != "tasks":
-                self.add(place, f"is the same as {place[0]}.{index}, under another label")
+                self.problems.add(place, f"is the same as {place[0]}.{index}, under another label")
                 return
 
     def _both_limits(self, index: int, label: str, cmdp: CMDPSpec) -> tuple[CostLimits, CostLimits] | None:
@@ -272,7 +282,7 @@ class _Check:
         if train_limits is None or deploy_limits is None:
             return None
         if any(train < deploy for train, deploy in zip(train_limits, deploy_limits, strict=True)):
-            self.add(
+            self.problems.add(
                 place,
                 f"must be at least the deploy_limits of {label} (d_t >= d_d), "
                 f"got {_numbers(train_limits)} under {_numbers(deploy_limits)}",
@@ -292,13 +302,14 @@ class _Check:
                 return None, place
             values = getattr(shared, key) or DEFAULT_LIMITS[key]
         if values is None:
-            self.add(("tasks", index), f"{key} is required, here or for all tasks")
+            if not any(misspells(it, key, GridFile) for it in self._raw):  # then the schema check has said so
+                self.problems.add(("tasks", index), f"{key} is required, here or for all tasks")
             return None, place
         is_listed = isinstance(raw, dict) and isinstance(raw.get(key), list)
         if len(values) != cmdp.num_costs and (is_listed or len(values) > 1):
             costs = f"{cmdp.num_costs} cost{'s' * (cmdp.num_costs > 1)} ({', '.join(cmdp.cost_names)})"
             got = f"{len(values)} limits" if len(values) > 1 else "1 limit; one for all is a plain number"
-            self.add(place, f"{label} has {costs}, got {got}")
+            self.problems.add(place, f"{label} has {costs}, got {got}")
             return None, place
         return CostLimits(values if len(values) == cmdp.num_costs else values * cmdp.num_costs), place
 
@@ -309,7 +320,7 @@ class _Check:
         default = min(ROLLOUT_STEPS, cmdp.horizon or ROLLOUT_STEPS)
         steps, num_envs = run.rollout_steps or default, run.num_envs
         if run.total_steps < num_envs * steps:
-            self.add_of_task(
+            self.problems.add_of_task(
                 ("run", "total_steps"),
                 f"must be at least one update of {TASK_MARK}, "
                 f"{num_envs} environments x {steps} steps = {num_envs * steps}, got {run.total_steps}",
@@ -325,44 +336,8 @@ class _Check:
             return model.model_validate(value)
         except ValidationError as error:
             for place, sentence in sentences(error, model):
-                self.add(place, sentence)
+                self.problems.add(place, sentence)
         return None
-
-    def add(self, place: Place, sentence: str) -> None:
-        """Add a problem, with the line of its place."""
-        self.problems.append(self._problem(place, sentence))
-
-    def add_of_task(self, place: Place, sentence: str, task: str) -> None:
-        """Add a mistake on a task; the same mistake on further tasks stays one problem, which names them.
-
-        Args:
-            place: of the mistake.
-            sentence: with ``TASK_MARK`` in place of the task, after a preposition.
-            task: its label.
-        """
-        tasks = self._of_tasks.setdefault((place, sentence), [])
-        if tasks:
-            self.problems.remove(self._problem(place, _of_tasks(sentence, tasks)))
-        tasks.append(task)
-        self.add(place, _of_tasks(sentence, tasks))
-
-    def _problem(self, place: Place, sentence: str) -> Problem:
-        return Problem(self._document.line(place), place, sentence)
-
-
-def _of_tasks(sentence: str, tasks: Sequence[str]) -> str:
-    """Return the sentence of a mistake with its task, or with several in brackets at the end.
-
-    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a"])
-    'mine cannot be built on a: no'
-    >>> _of_tasks(f"mine cannot be built on {TASK_MARK}: no", ["a", "b"])
-    'mine cannot be built: no (on a, b)'
-    """
-    before, after = sentence.split(TASK_MARK, 1)
-    if len(tasks) == 1:
-        return f"{before}{tasks[0]}{after}"
-    head = before.removesuffix(" on ").removesuffix(" of ")
-    return f"{head}{after} (on {', '.join(tasks)})"
 
 
 def _valid(model: type[Model], value: Any) -> Model | None:

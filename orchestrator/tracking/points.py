@@ -173,12 +173,16 @@ def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row)
 
 
 def params(spec: TrialSpec) -> dict[str, str]:
-    """Return a trial's params for the UI's table: few and flat, for sorting, filtering and grouping."""
+    """Return a trial's params for the UI's table: few and flat, for sorting, filtering and grouping.
+
+    Numbers are exact, as in the grid. An infinite training limit d_t is ``auto``: the curriculum measures it.
+    """
     choices = {"task": spec.task, "agent": spec.agent, "method": spec.method}
     flat = {name: choice.label for name, choice in choices.items()} | {
         "seed": str(spec.seed),
-        "train_limits": _numbers(spec.train_limits),
-        "deploy_limits": _numbers(spec.deploy_limits),
+        "train_limits": ", ".join(map(_limit, spec.train_limits)),
+        "deploy_limits": ", ".join(map(_limit, spec.deploy_limits)),
+        "total_steps": str(spec.total_steps),
         "train_steps": str(spec.train_steps),
         "deploy_steps": str(spec.deploy_steps),
         "num_envs": str(spec.num_envs),
@@ -279,8 +283,9 @@ def _safe(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_. -]", "_", name)[:200]
 
 
-def _numbers(values: Iterable[float]) -> str:
-    return ", ".join(f"{value:g}" for value in values)
+def _limit(limit: float) -> str:
+    """Return a limit as in a grid, with all its digits: ``0.1234567``, ``25``, ``auto``."""
+    return repr(limit).removesuffix(".0") if math.isfinite(limit) else "auto"
 
 
 def _mean_text(values: Sequence[float]) -> str:

@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 
 from recrl.analysis.data import sweep_data
-from recrl.analysis.data.cost_names import cost_names, cost_suffix
+from recrl.analysis.data.cost_names import cost_names, cost_suffix, indices_of_cost
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_formats, verdict_texts
-from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics import cumulative_cost, metrics
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.cli.result_table import result_table
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -70,3 +70,57 @@ def test_a_verdict_names_the_cost_that_is_over_its_limit(
     row = {"seeds": seeds, "solved": 0, "feasible": seeds - infeasible, "infeasible": infeasible}
     worst = {"worst_excess": 0.22, "worst_share": 0.11, "worst_cost": cost}
     assert verdict_texts.verdict_text(pd.Series(row | worst)) == text
+
+
+def test_a_cost_is_found_by_its_index_from_0_or_by_its_name(two: Sweep) -> None:
+    sweep = named(two, ["fuel", "noise"])
+    assert indices_of_cost(sweep, "0") == indices_of_cost(sweep, "fuel") == {"a": 0}
+    assert indices_of_cost(sweep, "1") == indices_of_cost(sweep, "noise") == {"a": 1}
+    assert indices_of_cost(two, "1") == {"a": 1}
+
+
+def test_two_tasks_may_have_a_cost_at_different_indices(made_up_sweep: Callable[..., SweepStore]) -> None:
+    sweep = sweep_data.load(
+        made_up_sweep(seeds=1, num_costs=2, tasks=["a", "b"], agents=["cpo"], methods=["none"])
+    )
+    first, second = (named(sweep, names) for names in (["fuel", "noise"], ["noise", "heat"]))
+    mixed = dataclasses.replace(
+        sweep,
+        facts=tuple(
+            one if one.spec.task.label == "a" else other
+            for one, other in zip(first.facts, second.facts, strict=True)
+        ),
+    )
+    assert indices_of_cost(mixed, "noise") == {"a": 1, "b": 0}
+    assert indices_of_cost(mixed, "heat") == {"b": 1}
+    assert indices_of_cost(mixed, "1") == {"a": 1, "b": 1}
+    both = cumulative_cost.cumulative_costs(mixed, cost={"a": 1, "b": 0})
+    assert set(cumulative_cost.cumulative_costs(mixed, cost={"b": 1})["task"]) == {"b"}
+    assert set(both["task"]) == {"a", "b"}
+    with pytest.raises(ValueError, match=r"has the costs 0 \(fuel or noise\), 1 \(noise or heat\), got '2'$"):
+        indices_of_cost(mixed, "2")
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted", "problem"),
+    [
+        (["fuel", "noise"], "2", "made-up has the costs 0 (fuel), 1 (noise), got '2'"),
+        (["fuel", "noise"], "-1", "made-up has the costs 0 (fuel), 1 (noise), got '-1'"),
+        (
+            ["fuel", "noise"],
+            "nois",
+            "made-up has the costs 0 (fuel), 1 (noise), got 'nois'; did you mean 'noise'?",
+        ),
+        (None, "fuel", "made-up has the costs 0, 1, got 'fuel'"),
+    ],
+)
+def test_a_cost_that_no_task_has_is_refused(two: Sweep, names: object, wanted: str, problem: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        indices_of_cost(named(two, names), wanted)
+    assert str(caught.value) == problem.replace("made-up", two.name)
+
+
+def test_the_only_cost_has_the_index_0(finished: Sweep) -> None:
+    assert set(indices_of_cost(finished, "0").values()) == {0}
+    with pytest.raises(ValueError, match=r" has only the cost 0, got '1'$"):
+        indices_of_cost(finished, "1")

@@ -114,7 +114,14 @@ def test_the_command_says_it(river_grid: SweepStore, capsys: pytest.CaptureFixtu
     assert main(["bound", "--root", root, "--budget", "1000"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert "rivergrid-1a" in out
-    assert "The largest d_t within 1000 of cost above d_d over all episodes:" in out
+    assert "\nThe largest training limit d_t within 1000 of cost above the deployment limit d_d " in out
+
+
+def test_the_command_counts_costs_from_0(river_grid: SweepStore, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bound", "--root", str(river_grid.folder.parent), "--cost"]
+    assert main([*command, "0"]) == ExitCode.OK
+    assert main([*command, "1"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == "recrl-sweep: --cost: river has only the cost 0, got '1'\n"
 
 
 def with_discount(sweep: Sweep, discount: float) -> Sweep:

@@ -72,7 +72,7 @@ def test_another_teacher_sets_its_limits_on_the_same_episodes(trial: TrialStore)
     rows = replay(trial, Choice("none"))
     assert (rows["replayed_limit_0"] == 1.0).all()
     (line,) = replay_summary(trial, rows).to_dict("records")
-    assert (line["replayed"], line["replayed reaches d_d"]) == ("1.00", "3%")
+    assert (line["cost"], line["replayed"], line["replayed reaches d_d"]) == ("0", "1.00", "3%")
     assert line["other limit"] == str((rows["limit_0"].iloc[:37] != 1.0).sum())
 
 
@@ -97,7 +97,11 @@ def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest
     assert main([*command, "dynamik"]) == ExitCode.WRONG_INPUT
     assert "did you mean 'dynamic'?" in capsys.readouterr().err
     assert main([*command, "dynamic", "--option", "window=0"]) == ExitCode.WRONG_INPUT
-    assert "recrl-sweep: teacher dynamic: window: " in capsys.readouterr().err
+    assert capsys.readouterr().err == ("recrl-sweep: --option: dynamic: window: must be at least 1, got 0\n")
+    assert main([*command, "dynamic", "--option", "windw=3"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: --option: dynamic: windw: unknown key; did you mean 'window'?\n"
+    )
 
 
 def test_the_figure_shows_what_was_and_what_would_have_been(trial: TrialStore) -> None:

@@ -11,7 +11,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv, make_from_callable
+from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
+from recrl.environments.gymnasium_tasks import make_from_callable
 from recrl.environments.registry import KeywordOptions, make_vector, task_options
 
 

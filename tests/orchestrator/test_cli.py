@@ -2,6 +2,7 @@
 
 import re
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,7 +14,8 @@ import pytest
 
 from recrl.analysis.figures import learning_curves
 from recrl.environments.plugins import load_attribute
-from recrl.orchestrator.cli.arguments import COMMANDS
+from recrl.orchestrator.cli.argument_fields import Request
+from recrl.orchestrator.cli.arguments import COMMANDS, parse
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -94,6 +96,37 @@ def test_help_names_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("place", COMMANDS.values())
 def test_every_command_has_its_function(place: str) -> None:
     assert callable(load_attribute(f"recrl.orchestrator.cli.{place}"))
+
+
+@pytest.mark.parametrize("request_type", COMMANDS)
+def test_the_example_of_every_command_is_accepted(request_type: type[Request]) -> None:
+    words = shlex.split(request_type.example.partition(" > ")[0])
+    assert words[0] == "recrl-sweep"
+    assert type(parse(words[1:])) is request_type
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "the following arguments are required: COMMAND; see recrl-sweep --help"),
+        (["launch"], "the following arguments are required: GRID.yaml; see recrl-sweep launch --help"),
+        (["list"], "the following arguments are required: KIND; see recrl-sweep list --help"),
+        (["list", "task"], "'agents', 'curricula', 'methods'); did you mean 'tasks'?"),
+        (["statsu"], "'ui', 'sync'); did you mean 'status'?"),
+        (["status", "small", "--breif"], "unrecognized arguments: --breif; did you mean '--brief'?"),
+        (["status", "small", "more"], "unrecognized arguments: more"),
+    ],
+)
+def test_an_argument_that_is_misspelt_or_missing_has_a_hint(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == ExitCode.WRONG_INPUT
+    usage, *_, error = capsys.readouterr().err.splitlines()
+    assert error.endswith(sentence)
+    known = arguments[:1] if arguments[:1] in (["launch"], ["list"], ["status"]) else []
+    assert usage.startswith(" ".join(["usage: recrl-sweep", *known, "[-h]"]))
 
 
 def test_a_right_grid_is_confirmed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -229,8 +262,11 @@ def test_a_busy_sweep_has_its_own_code(folder: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["status"], "runs: holds 0 sweeps; launch one first"),
-        (["status", "smal"], "runs: holds no sweep 'smal', nothing was launched there yet"),
+        (["status"], "runs: holds no sweep; launch one first, or give the folder of your sweeps with --root"),
+        (
+            ["status", "smal"],
+            "runs: holds no sweep 'smal'; launch it first, or give the folder of your sweeps with --root",
+        ),
         (
             ["plan", "grid.yaml", "--only", "linear"],
             "--only: must look like method=dynamic or seed=0,1, got 'linear'",
@@ -255,9 +291,11 @@ def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureF
         store.write_info({"name": store.name})
     assert main(["status"]) == ExitCode.WRONG_INPUT
     assert main(["status", "smal"]) == ExitCode.WRONG_INPUT
+    assert main(["status", "runs/smal"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.splitlines() == [
         "recrl-sweep: runs: holds 2 sweeps; give one: large, small",
         "recrl-sweep: runs: holds no sweep 'smal'; did you mean 'small'? (there: large, small)",
+        "recrl-sweep: runs: holds no sweep 'runs/smal'; did you mean 'small'? (there: large, small)",
     ]
 
 
@@ -358,8 +396,11 @@ def test_logs_are_found_by_id_title_or_folder(folder: Path, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["nobody"], "small: no trials on disk begin with 'nobody'; status names them"),
-        ([], "small: no trials are running; status names them"),
+        (
+            ["nobody"],
+            "small: no trials on disk begin with 'nobody'; see recrl-sweep status small",
+        ),
+        ([], "small: no trials are running; see recrl-sweep status small"),
         (
             ["two-state"],
             "small: 2 trials on disk begin with 'two-state'; give one, by its id or title: ",

@@ -103,7 +103,9 @@ def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str
     assert out.startswith("run, a section of a grid: Length and width of every trial.\n")
     assert re.search(r"^total_steps +whole number +required +Environment steps", out, re.MULTILINE)
     assert "silence_seconds" in output(capsys, "options", "resources")
-    assert "train_limits" in output(capsys, "options", "limits")
+    out = output(capsys, "options", "limits")
+    assert re.search(r"^train_limits +'auto' or number or list of number or null ", out, re.MULTILINE)
+    assert re.search(r"^deploy_limits +number or list of number or null ", out, re.MULTILINE)
 
 
 @pytest.mark.parametrize(

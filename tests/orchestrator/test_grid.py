@@ -12,7 +12,7 @@ from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import GridError
 from recrl.orchestrator.grid.checked_grid import GridSpec
-from recrl.orchestrator.grid.checking import parse_grid, read_grid
+from recrl.orchestrator.grid.checking import parse_grid, read_grid, read_name
 
 SMALL = """\
 name: small
@@ -74,6 +74,65 @@ def test_ten_mistakes_give_ten_located_sentences() -> None:
         "grid.yaml:18: train_limits: must be 'auto', a number or a list of numbers, got 'automatic'",
         "grid.yaml:20: run.total_steps: must be a whole number, got 'lots'",
         "grid.yaml:21: run.num_env: unknown key; did you mean 'num_envs'?",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("name: small", "nmae: small", "1: nmae: unknown key; did you mean 'name'?"),
+        ("seeds: 2", "sedes: [0]", "5: sedes: unknown key; did you mean 'seeds'?"),
+        ("tasks: [{", "task: [{", "2: task: unknown key; did you mean 'tasks'?"),
+        ("agents: [", "agent: [", "3: agent: unknown key; did you mean 'agents'?"),
+        ("methods: [", "metods: [", "4: metods: unknown key; did you mean 'methods'?"),
+        ("run: {", "runs: {", "6: runs: unknown key; did you mean 'run'?"),
+        ("{total_steps", "{total_step", "6: run.total_step: unknown key; did you mean 'total_steps'?"),
+        ("{name: two", "{nam: two", "2: tasks.0.nam: unknown key; did you mean 'name'?"),
+        (
+            ", deploy_limits: 2",
+            ", deploy_limit: 2",
+            "2: tasks.0.deploy_limit: unknown key; did you mean 'deploy_limits'?",
+        ),
+        ("[ppo-lag]", "[{nmae: ppo-lag}]", "3: agents.0.nmae: unknown key; did you mean 'name'?"),
+        ("[none, ", "[{nme: none}, ", "4: methods.0.nme: unknown key; did you mean 'name'?"),
+        (
+            "two-state, deploy_limits: 2}]",
+            "two-state}]\ndeploy_limit: 2",
+            "3: deploy_limit: unknown key; did you mean 'deploy_limits'?",
+        ),
+        (
+            "two-state, deploy_limits: 2}]",
+            "two-state}, {name: two-state, label: b}]\ndeploylimits: 2",
+            "3: deploylimits: unknown key; did you mean 'deploy_limits'?",
+        ),
+    ],
+)
+def test_a_misspelt_key_is_one_mistake(old: str, new: str, problem: str) -> None:
+    assert SMALL.count(old) == 1
+    assert _problems(SMALL.replace(old, new)) == [f"grid.yaml:{problem}"]
+
+
+@pytest.mark.parametrize(
+    ("new", "problem"),
+    [
+        ("nmae: small", "1: nmae: unknown key; did you mean 'name'?"),
+        ("colour: small", "1: name: is required"),
+        ("name: a b", "1: name: must be a name for a folder: letters, digits and . _ - only, at most 64"),
+    ],
+)
+def test_a_sweep_without_a_name_is_a_sentence(new: str, problem: str, tmp_path: Path) -> None:
+    path = tmp_path / "grid.yaml"
+    path.write_text(SMALL.replace("name: small", new))
+    with pytest.raises(GridError) as caught:
+        read_name(path)
+    assert str(caught.value).partition(", got")[0] == f"{path}:{problem}"
+
+
+def test_an_unknown_key_that_is_near_no_missing_key_hides_none() -> None:
+    assert _problems(SMALL.replace("seeds: 2", "colour: 2")) == [
+        "grid.yaml:1: seeds: is required",
+        "grid.yaml:5: colour: unknown key (known: train_limits, deploy_limits, name, tasks, agents, methods, "
+        "seeds, run, resources, exclude)",
     ]
 
 

@@ -207,7 +207,9 @@ def test_evaluate_says_what_it_found_and_where(
     assert heads.split() == ["trial", "update", "policy", "episodes", "return", "costs", "d_d", "within"]
     assert stochastic.startswith("two-state ppo-lag none seed 5  5 of 5  stochastic     8         ")
     assert "  deterministic  8  " in deterministic
-    assert legend == "Means and standard errors; within: episodes in which no cost exceeded its d_d."
+    assert legend == (
+        "Means and standard errors. d_d: deployment limits; within: episodes in which no cost exceeded them."
+    )
     csv = f"small/trials/{complete.folder.name}/evaluations/update-00000005__seed-1.csv"
     assert file == f"Episodes   {csv}"
     assert len(Path(csv).read_text().splitlines()) == 1 + 2 * 8
@@ -227,7 +229,7 @@ def test_evaluate_leaves_out_what_has_no_checkpoint(
     assert capsys.readouterr().err == f"recrl-sweep: {sentence}"
     assert main(["evaluate", "--root", root, "small", "nobody"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err == (
-        "recrl-sweep: small: no trials on disk begin with 'nobody'; status names them\n"
+        "recrl-sweep: small: no trials on disk begin with 'nobody'; see recrl-sweep status small\n"
     )
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 import pytest
 
+from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
@@ -168,6 +169,24 @@ def test_params_are_few_and_flat(made_up_sweep: Callable[..., SweepStore]) -> No
     assert flat["task"] == "river-a"
     assert flat["task.horizon"] == "10"
     assert (flat["seed"], flat["train_limits"], flat["deploy_limits"]) == ("0", "100", "5")
+
+
+def test_params_are_what_the_grid_says(made_up_sweep: Callable[..., SweepStore]) -> None:
+    spec = replace(
+        first_trial(made_up_sweep(**SMALL)).spec,
+        train_limits=CostLimits((math.inf, 1_234_567.0, 6.5)),
+        deploy_limits=CostLimits((25.0, 0.1234567, 0.0)),
+        train_steps=9_500_001,
+        deploy_steps=500_000,
+    )
+    flat = params(spec)
+    assert flat["train_limits"] == "auto, 1234567, 6.5"  # of d_t = auto only the curriculum knows a number
+    assert flat["deploy_limits"] == "25, 0.1234567, 0"
+    assert (flat["total_steps"], flat["train_steps"], flat["deploy_steps"]) == (
+        "10000001",
+        "9500001",
+        "500000",
+    )
 
 
 # Where and in what state

@@ -1,0 +1,102 @@
+"""Tasks made of Gymnasium environments: the task ``gymnasium``, of a registered id, and a user's callables.
+
+``gymnasium_adapter`` steps them; here they are made, for training and for films.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
+
+from recrl.environments.gymnasium_adapter import Environment, SyncCMDPVectorEnv
+from recrl.environments.plugins import check_keywords, import_module, require_trust
+
+
+class GymnasiumOptions(BaseModel):
+    """Settings of the task ``gymnasium``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str = Field(description="The id registered with Gymnasium, or module:id to import the module first.")
+    keywords: dict[str, JsonValue] = Field(
+        default_factory=dict, description="Keyword arguments for gymnasium.make."
+    )
+    cost_names: tuple[str, ...] | None = Field(
+        default=None,
+        min_length=1,
+        description="Names of the costs in info['cost']; by default the environment's cost_names, else cost.",
+    )
+    costless: bool = Field(
+        default=False, description="Whether to report a cost of 0 for an environment that reports none."
+    )
+
+    @field_validator("id")
+    @classmethod
+    def _registered(cls, identifier: str) -> str:
+        module, separator, registered = identifier.rpartition(":")
+        if separator and not module.startswith("recrl.environments."):
+            require_trust(identifier)
+        try:
+            if separator:
+                import_module(module)
+            gymnasium.spec(registered)
+        except (gymnasium.error.Error, ImportError, ValueError) as error:
+            raise ValueError(str(error)) from error
+        except SystemExit as error:
+            raise ValueError(f"importing {module} ends the process (exit code {error.code})") from error
+        return identifier
+
+
+def make_gymnasium(name: str, num_envs: int, options: GymnasiumOptions) -> SyncCMDPVectorEnv:
+    """B environments of a registered id."""
+    keywords: dict[str, Any] = dict(options.keywords)
+    factory = functools.partial(gymnasium.make, options.id, disable_env_checker=True, **keywords)
+    return SyncCMDPVectorEnv(
+        name, [factory] * num_envs, cost_names=options.cost_names, costless=options.costless
+    )
+
+
+def make_from_callable(
+    factory: Callable[..., Environment], name: str, num_envs: int, options: BaseModel
+) -> SyncCMDPVectorEnv:
+    """B environments of a user's callable, which takes the options as keywords.
+
+    Raises:
+        ValueError: the callable does not take an option.
+    """
+    check_keywords(factory, name, options.model_dump())
+    return SyncCMDPVectorEnv(name, [functools.partial(factory, **options.model_dump())] * num_envs)
+
+
+def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
+    """Return a rendering environment of a registered id."""
+    keywords: dict[str, Any] = {**options.keywords, "render_mode": "rgb_array"}
+    environment: Environment = gymnasium.make(options.id, disable_env_checker=True, **keywords)
+    return _Costless(environment, len(options.cost_names or ("cost",))) if options.costless else environment
+
+
+def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:
+    """Return an environment of a user's callable; it renders if the callable takes ``render_mode``."""
+    keywords = options.model_dump()
+    parameters = inspect.signature(factory).parameters.values()
+    if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
+        keywords["render_mode"] = "rgb_array"
+    return factory(**keywords)
+
+
+class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Wrapper that reports a cost of 0 for each of ``num_costs`` costs."""
+
+    def __init__(self, environment: Environment, num_costs: int) -> None:
+        super().__init__(environment)
+        self._num_costs = num_costs
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated, truncated, {**info, "cost": np.zeros(self._num_costs)}
