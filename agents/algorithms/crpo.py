@@ -20,8 +20,8 @@ complementarity problem. A constraint is near if the trust region reaches its li
 the reward's gradient is a combination of the costs' gradients, and a step beyond a limit would be taken back.
 Then a cost step corrects the violation and no more, like Polyak's (1967) steps for violated constraints, and
 a reward step ends at the limit. Before, steps go as far beyond the limit on one side as on the other. The
-coefficient lambda is the option ``kl_price``, with the unit and the purpose of that of ``trpo-lag``; 0 is the
-source's.
+coefficient lambda is the option ``kl_penalty``, with the unit and the purpose of that of ``trpo-lag``; 0 is
+the source's.
 
 If no episode finished, nothing is known about the constraints and the policy does not change.
 
@@ -75,7 +75,7 @@ def cost_step(problem: StepProblem, corrected: int, config: CRPOConfig) -> DualS
     weights = np.zeros_like(problem.violations)
     if squared > NO_INFLUENCE:
         weights[corrected] = np.sqrt(2.0 * problem.radius / squared)
-        if config.kl_price > 0.0:
+        if config.kl_penalty > 0.0:
             beyond = overshoot(problem, config) * max(-float(problem.mixed[corrected]), 0.0)
             weights[corrected] = min(
                 weights[corrected], (float(problem.violations[corrected]) + beyond) / squared
@@ -88,7 +88,7 @@ def reward_step(problem: StepProblem, config: CRPOConfig) -> DualSolution:
     nothing, size = np.zeros_like(problem.violations), 0.0
     if problem.squared_gradient > NO_INFLUENCE:
         size = float(np.sqrt(2.0 * problem.radius / problem.squared_gradient))
-        if config.kl_price > 0.0:
+        if config.kl_penalty > 0.0:
             rises, slack = -problem.mixed, np.maximum(-problem.violations, 0.0)
             raised = rises > 0.0
             up_to_limit = float(np.min(slack[raised] / rises[raised], initial=np.inf))
@@ -97,14 +97,14 @@ def reward_step(problem: StepProblem, config: CRPOConfig) -> DualSolution:
 
 
 def overshoot(problem: StepProblem, config: CRPOConfig) -> float:
-    """Return beta, the length in units of v by which a step goes beyond a limit, for ``kl_price`` above 0."""
+    """Return beta, the length in units of v by which a step goes beyond a limit; needs a ``kl_penalty``."""
     squared = max(problem.squared_gradient, NO_INFLUENCE)
     reach = np.sqrt(2.0 * problem.radius * np.diag(problem.gram))
     at_hand = np.flatnonzero(-problem.violations <= reach)
     rises = -problem.mixed[at_hand]
     weights = projection_weights(problem.gram[np.ix_(at_hand, at_hand)], rises)
     taken = 0.0 if weights is None else float(rises @ weights)
-    return float(np.sqrt(max(1.0 - taken / squared, 0.0))) / (2.0 * config.kl_price)
+    return float(np.sqrt(max(1.0 - taken / squared, 0.0))) / (2.0 * config.kl_penalty)
 
 
 class ConstraintRectifiedPolicyOptimisation:

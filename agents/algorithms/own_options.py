@@ -165,10 +165,10 @@ class TRPOLagConfig(LagrangianConfig, TrustRegionConfig):
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_TRUST_REGION,
         **STARTER_AGENTS_MULTIPLIERS,
-        "kl_price": 0.0,
+        "kl_penalty": 0.0,
     }
 
-    kl_price: NonNegative = Field(
+    kl_penalty: NonNegative = Field(
         default=1.0,
         description="lambda, the coefficient of the KL in the surrogate, which is the Lagrangian "
         "over 1 + the multipliers, in standard deviations of the reward advantages. "
@@ -182,10 +182,10 @@ class CRPOConfig(TrustRegionConfig):
     paper: ClassVar[Mapping[str, Any]] = {
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_TRUST_REGION,
-        "kl_price": 0.0,
+        "kl_penalty": 0.0,
     }
 
-    kl_price: NonNegative = Field(
+    kl_penalty: NonNegative = Field(
         default=1.0,
         description="lambda, the coefficient of the KL beyond a limit, in standard deviations of "
         "the reward advantages per nat. Steps get shorter as the gain falls; 0 for "

@@ -34,7 +34,7 @@ def trust_region_step(
     config: TrustRegionConfig,
     generator: np.random.Generator,
     *,
-    kl_price: float = 0.0,
+    kl_penalty: float = 0.0,
 ) -> dict[str, float]:
     """Take one trust-region step on the surrogate of some advantages; skip it if they are all equal.
 
@@ -48,7 +48,7 @@ def trust_region_step(
         objective: the advantages of the surrogate, [N].
         config: the trust region, conjugate gradients and line search.
         generator: for the choice of the metric's samples.
-        kl_price: lambda, the coefficient of the KL, in the advantages' unit per nat, at least 0.
+        kl_penalty: lambda, the coefficient of the KL, in the advantages' unit per nat, at least 0.
 
     Returns:
         Metrics of the step.
@@ -61,7 +61,7 @@ def trust_region_step(
     require_finite("the squared length of the trust region's direction", squared)
     if squared <= 0.0:
         return {"policy_steps": 0.0, "line_search_steps": float(config.backtrack_tries), "step_norm": 0.0}
-    direction.mul_(step_size(squared, config.target_kl, kl_price))
+    direction.mul_(step_size(squared, config.target_kl, kl_penalty))
     before = model.start()
 
     def is_acceptable() -> bool:
@@ -71,19 +71,19 @@ def trust_region_step(
     return line_search(policy.parameters, direction, is_acceptable, config)
 
 
-def step_size(squared: float, target_kl: float, kl_price: float) -> float:
+def step_size(squared: float, target_kl: float, kl_penalty: float) -> float:
     """Return the factor on H^-1 g: min(sqrt(2 delta / q), 1 / lambda).
 
     Args:
         squared: q, above 0.
         target_kl: delta, nats.
-        kl_price: lambda, at least 0.
+        kl_penalty: lambda, at least 0.
 
     >>> step_size(8.0, 0.01, 0.0), step_size(8.0, 0.01, 10.0), step_size(8.0, 0.01, 40.0)
     (0.05, 0.05, 0.025)
     """
     longest: float = (2.0 * target_kl / squared) ** 0.5
-    return longest if kl_price * longest <= 1.0 else 1.0 / kl_price
+    return longest if kl_penalty * longest <= 1.0 else 1.0 / kl_penalty
 
 
 class TrustRegionPolicyOptimisation:

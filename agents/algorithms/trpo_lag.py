@@ -5,7 +5,7 @@ surrogate of (A_r - sum_i p_i A_i) / (1 + sum_i p_i). If no episode finished, th
 
 At a saddle point of the Lagrangian that surrogate has no gradient. A step to the edge of the trust region has
 the same length there as elsewhere, so the policy would oscillate about the limit. So, ours, the KL is
-subtracted with the coefficient ``kl_price``, and steps get shorter as the gain falls.
+subtracted with the coefficient ``kl_penalty``, and steps get shorter as the gain falls.
 
 Notation: N samples, k costs.
 """
@@ -43,7 +43,7 @@ class TRPOLagrangian:
             penalty.advantages,
             self._config,
             generator,
-            kl_price=self._config.kl_price,
+            kl_penalty=self._config.kl_penalty,
         )
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 

@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from recrl.orchestrator.background_thread import background_thread as beside
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.plan import Estimate, Plan, PlannedAction
 from recrl.orchestrator.spec import TrialState
@@ -191,7 +191,7 @@ def live_progress(ask: Callable[[], SweepProgress], console: Console) -> Iterato
         console: where to show it.
     """
     show = _show_in_place if console.is_terminal else _show_lines
-    with beside(partial(show, ask, console), name="progress"):
+    with background_thread(partial(show, ask, console), name="progress"):
         yield
 
 

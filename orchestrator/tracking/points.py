@@ -5,7 +5,7 @@ Metrics are over environment steps; the part before the slash is the UI's chart 
     train/return, train/cost_0            means over the episodes of an update, training phase
     perf/episodes                         their number
     deploy/return, deploy/cost_0, ...     the same, deployment phase
-    curriculum/limit_0, curriculum/noise  output of the curriculum; also curriculum/temperature, if any
+    curriculum/limit_0, curriculum/noise  output of the curriculum; entropy_coefficient, if any
     agent/<name>                          metrics of the agent: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
     final/return, final/cost_0, final/limit_0    the final policy as in the report (``final_outcomes``): exact
@@ -144,7 +144,7 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
     for column in row.keys() - set(UPDATE_COLUMNS):
         if re.fullmatch(r"cost_\d+", column):
             values[f"{section}/{column}"] = float(row[column])
-        elif re.fullmatch(r"limit_\d+|temperature", column):
+        elif re.fullmatch(r"limit_\d+|entropy_coefficient", column):
             values[f"curriculum/{column}"] = float(row[column])
         else:
             values[f"agent/{_safe(column)}"] = float(row[column])

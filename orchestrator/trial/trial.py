@@ -142,7 +142,7 @@ class Trial:
             "update_seconds": round(time.process_time() - clock, 6),
             **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
             **{f"limit_{i}": limit for i, limit in enumerate(step.limits)},
-            **_temperature(step),
+            **_entropy_coefficient(step),
         }
         self._writer.append_update({**row, **self._own_metrics(metrics, row)})
         if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
@@ -342,9 +342,9 @@ def policy_table(policy: FinalPolicy, environments: CMDPVectorEnv) -> list[dict[
     return [{f"action_{j}": float(share) for j, share in enumerate(row)} for row in probabilities]
 
 
-def _temperature(step: CurriculumStep) -> dict[str, float]:
+def _entropy_coefficient(step: CurriculumStep) -> dict[str, float]:
     """Return the column of the entropy coefficient; empty if the curriculum never rewards entropy."""
-    return {} if step.entropy_coefficient is None else {"temperature": step.entropy_coefficient}
+    return {} if step.entropy_coefficient is None else {"entropy_coefficient": step.entropy_coefficient}
 
 
 def _mean(values: Sequence[float] | Floats) -> float:

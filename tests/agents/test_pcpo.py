@@ -169,11 +169,11 @@ def test_without_a_finished_episode_the_multipliers_stay_and_the_policy_goes_on(
     assert metrics["multiplier_0"] == 0.0
 
 
-def crpo_sizes(gradient: list[float], violation: float, kl_price: float) -> tuple[float, float]:
+def crpo_sizes(gradient: list[float], violation: float, kl_penalty: float) -> tuple[float, float]:
     """How long CRPO's steps up the reward and down the cost are, with H = I, b = (1, 0), and radius 1."""
     g, costs = np.array(gradient), EAST[None]
     problem = StepProblem(float(g @ g), -costs @ g, costs @ costs.T, np.array([violation]), 0.5)
-    config = CRPOConfig(kl_price=kl_price)
+    config = CRPOConfig(kl_penalty=kl_penalty)
     return reward_step(problem, config).gradient_weight, cost_step(problem, 0, config).constraint_weights[0]
 
 

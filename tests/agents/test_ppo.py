@@ -91,23 +91,23 @@ def test_trpo_takes_the_step_that_cpo_takes_without_limits(space: Space[object])
 def test_with_a_price_of_the_kl_a_step_is_as_long_as_the_gain_is_large_up_to_the_trust_region(
     space: Space[object],
 ) -> None:
-    def stepped(size: float, kl_price: float) -> float:
+    def stepped(size: float, kl_penalty: float) -> float:
         policy, batch, advantages = sampled(space)
         experience = Experience.of(policy, batch, advantages, UNKNOWN)
         objective = size * (advantages[:, 0] - advantages[:, 0].mean())
         generator = np.random.default_rng(0)
         config = TRPOConfig(target_kl=DELTA)
-        return trust_region_step(policy, experience, objective, config, generator, kl_price=kl_price)[
+        return trust_region_step(policy, experience, objective, config, generator, kl_penalty=kl_penalty)[
             "step_norm"
         ]
 
-    edge = stepped(1.0, kl_price=0.0)
-    assert stepped(1e-3, kl_price=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
-    assert stepped(1e3, kl_price=1.0) == pytest.approx(edge, rel=1e-3)
-    small = stepped(1e-3, kl_price=1.0)
+    edge = stepped(1.0, kl_penalty=0.0)
+    assert stepped(1e-3, kl_penalty=0.0) == pytest.approx(edge, rel=1e-3)  # whatever is to be gained
+    assert stepped(1e3, kl_penalty=1.0) == pytest.approx(edge, rel=1e-3)
+    small = stepped(1e-3, kl_penalty=1.0)
     assert small < 0.1 * edge
-    assert stepped(2e-3, kl_price=1.0) == pytest.approx(2.0 * small, rel=1e-3)
-    assert stepped(1e-3, kl_price=2.0) == pytest.approx(0.5 * small, rel=1e-3)
+    assert stepped(2e-3, kl_penalty=1.0) == pytest.approx(2.0 * small, rel=1e-3)
+    assert stepped(1e-3, kl_penalty=2.0) == pytest.approx(0.5 * small, rel=1e-3)
 
 
 def test_where_no_action_is_better_trpo_stays() -> None:

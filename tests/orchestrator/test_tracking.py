@@ -115,10 +115,10 @@ def test_points_are_sorted_into_chart_sections(made_up_sweep: Callable[..., Swee
         "agent/cost_value_loss": 2.0,
     }
     assert {(point.step, point.milliseconds) for point in points(row, spec)} == {(2800, 1700000000250)}
-    changed = {"phase": "deployment", "cost_0": "4.5", "limit_0": "5.0", "temperature": "0.25"}
+    changed = {"phase": "deployment", "cost_0": "4.5", "limit_0": "5.0", "entropy_coefficient": "0.25"}
     deployed = points({**row, **changed}, spec)
     values = {point.key: point.value for point in deployed}
-    assert values["curriculum/temperature"] == 0.25
+    assert values["curriculum/entropy_coefficient"] == 0.25
     assert (values["deploy/return"], values["deploy/cost_0"], values["curriculum/limit_0"]) == (
         -1.5,
         4.5,

@@ -208,9 +208,9 @@ def test_what_entropy_was_worth_is_recorded_and_ends_with_the_heat(tmp_path: Pat
     updates = run(tmp_path, spec).updates()
     # 19 updates of training; what the teacher says after an update counts in the next. The first has none.
     expected = [0.0, *(2.0 * max(0.0, 1.0 - update / 9.5) for update in range(1, 20))]
-    assert updates["temperature"].tolist() == pytest.approx(expected)
+    assert updates["entropy_coefficient"].tolist() == pytest.approx(expected)
     assert updates["limit_0"].tolist() == pytest.approx([7.5, *(3.0 + 2.25 * each for each in expected[1:])])
-    assert "temperature" not in run(tmp_path).updates()
+    assert "entropy_coefficient" not in run(tmp_path).updates()
 
 
 class Opaque:
