@@ -21,6 +21,7 @@ from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 
+OUTCOMES = "outcomes.csv"
 BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 
@@ -107,13 +108,27 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
             shown.append(ShownTable(heading, bound_table(costs), BOUNDS_NOTE))
     written += [
         table_formats.write_csv(judged, folder / "verdicts.csv"),
-        table_formats.write_csv(rows, folder / "outcomes.csv"),
+        table_formats.write_csv(rows, folder / OUTCOMES),
         table_formats.write_parquet(rows, folder / "outcomes.parquet"),
         table_formats.write_csv(whole, folder / "summary.csv"),
         table_formats.write_csv(compared, folder / "comparisons.csv"),
         table_formats.write_text("\n".join(latex), folder / "outcomes.tex"),
     ]
     return written, Tables(judged, shown)
+
+
+def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:
+    """Write only ``outcomes.csv``, as ``write_tables`` does.
+
+    Args:
+        sweep: its frames.
+        folder: where the file goes.
+
+    Returns:
+        The file; nothing is written before a trial is complete.
+    """
+    rows = metrics.outcomes(sweep)
+    return [table_formats.write_csv(rows, folder / OUTCOMES)] if len(rows) else []
 
 
 def _outcome_tables(averaged: pd.DataFrame, suffixes: Sequence[str]) -> list[ShownTable]:

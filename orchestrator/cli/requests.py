@@ -316,6 +316,7 @@ class UIRequest(SweepRequest):
 class SyncRequest(SweepRequest):
     """Bring MLflow up to date with the files, for example after it was unreachable."""
 
+    trust: bool = by_flag(**_TRUST)
     tracking_uri: str | None = by_flag(**_TRACKING)
     rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
 
