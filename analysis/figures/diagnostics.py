@@ -168,7 +168,7 @@ def _legend(figure: Figure, title: str, seeds: int, target: float | None) -> Non
     ]
     if target is not None:
         handles.append(Line2D([], [], **TARGET_LINE, label=f"target of the KL divergence, {target:g}"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, title=title)
+    panels.legend_above(figure, handles, most=panels.REFERENCES_A_LINE, title=title)
 
 
 def _is_noise(events: pd.DataFrame, method: str) -> pd.Series[bool]:
