@@ -165,6 +165,8 @@ def launch_grid(
             read.append(sweep_data.load(store))
             if options.figures:
                 _draw(read[0], store, listener)
+            elif uri:
+                _write_outcomes(read[0], store)
         if not stop.is_set():
             _film(grid, after, store, stop, listener)
 
@@ -256,6 +258,13 @@ def _draw(sweep: Sweep, store: SweepStore, listener: LaunchListener) -> None:
         listener.failed_to_draw(error)
     else:
         listener.drawn(store.figures_folder)
+
+
+def _write_outcomes(sweep: Sweep, store: SweepStore) -> None:
+    """Write the outcomes of the final policies, which MLflow shows also without figures."""
+    from recrl.analysis.report.table_files import write_outcomes  # noqa: PLC0415
+
+    write_outcomes(sweep, store.figures_folder)
 
 
 def _film(

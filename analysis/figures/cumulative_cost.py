@@ -56,7 +56,7 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
     methods = [method for method in look if (trials["method"] == method).any()]
     runs = training_runs(sweep)
     with styles.context():
-        figure = Figure(figsize=(TEXT_WIDTH, 1.55 * len(tasks) + 0.75), layout="constrained")
+        figure = Figure(figsize=(TEXT_WIDTH, 1.55 * len(tasks) + 1.0), layout="constrained")
         grid = figure.subplots(len(tasks), len(methods), squeeze=False, sharex="row", sharey="row")
         for row, task in zip(grid, tasks, strict=True):
             for axes, method in zip(row, methods, strict=True):
@@ -114,5 +114,5 @@ def _legend(figure: Figure, agent: str, drawn: set[str]) -> None:
         for colour, dashes, name in REFERENCES.values()
         if name in drawn
     ]
-    title = f"{agent}: cost of the training phase, summed over its policies; every run thin, the mean thick"
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, title=title)
+    title = f"{agent}: cost of training, summed over its policies\nevery run thin, the mean thick"
+    panels.legend_above(figure, handles, most=panels.REFERENCES_A_LINE, title=title)

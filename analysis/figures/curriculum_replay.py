@@ -86,7 +86,7 @@ def replayed_limits(runs: Sequence[Replayed], teacher: str, *, cost: int = 0) ->
             Line2D([], [], color=COST_COLOUR, linewidth=1.1, label="the agent's own cost"),
         ]
         title = f"limits that {teacher} would have set on the recorded episodes, a line a run"
-        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), title=title)
+        panels.legend_above(figure, handles, most=len(handles), title=title)
     return figure
 
 

@@ -17,6 +17,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
@@ -157,7 +158,7 @@ def _event_marks(axes: Axes, steps: Iterable[float], style: MethodStyle, marker:
 
 def _legend(figure: Figure, title: str, seeds: int, target: float | None) -> None:
     line = "mean ± standard error" if seeds > 1 else "the one run"
-    handles = [
+    handles: list[Line2D | Patch] = [
         Line2D([], [], color="0.2", linewidth=1.1, label=line),
         Line2D([], [], color=IN_FORCE_COLOUR, linewidth=0.9, label="limit in force, every run"),
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, label="limit $d_d$"),
@@ -168,7 +169,7 @@ def _legend(figure: Figure, title: str, seeds: int, target: float | None) -> Non
     ]
     if target is not None:
         handles.append(Line2D([], [], **TARGET_LINE, label=f"target of the KL divergence, {target:g}"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, title=title)
+    panels.legend_above(figure, handles, most=panels.REFERENCES_A_LINE, title=title)
 
 
 def _is_noise(events: pd.DataFrame, method: str) -> pd.Series[bool]:

@@ -14,6 +14,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.labels import occurring
@@ -49,8 +50,9 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     agents = occurring(rows["agent"])
     cells = _cells(sweep, rows)
+    clipped = False
     with styles.context():
-        figure = Figure(figsize=(TEXT_WIDTH, 2.0 * len(cells) + 0.75), layout="constrained")
+        figure = Figure(figsize=(TEXT_WIDTH, 2.0 * len(cells) + 1.05), layout="constrained")
         grid = figure.subplots(len(cells), len(agents), squeeze=False, sharex="row", sharey="row")
         for line, (task, i) in zip(grid, cells, strict=True):
             chosen = rows[rows["task"] == task].rename(
@@ -58,6 +60,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
             )
             trials = sweep.trials[sweep.trials["task"] == task]
             far = _right_edge(chosen)
+            clipped = clipped or bool((chosen[COST] > far).any())
             costs, returns = _frontier(sweep, trials, far=far)
             for axes, agent in zip(line, agents, strict=True):
                 axes.plot(costs, returns, color=OPTIMUM_COLOUR, linewidth=0.9, zorder=1.0)
@@ -69,7 +72,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
                 axes.set_xlabel(f"episode cost{cost_suffix(sweep, i, task)}")
             line[0].set_ylabel("return")
         present = [method for method in look if (rows["method"] == method).any()]
-        _legend(figure, look, present)
+        _legend(figure, look, present, clipped=clipped)
     return figure
 
 
@@ -154,7 +157,15 @@ def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far
     axes.set_xlim(-0.05 * far, far)
 
 
-def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str]) -> None:
+def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str], *, clipped: bool) -> None:
+    """Draw the legends.
+
+    Args:
+        figure: the whole one.
+        look: of all methods.
+        methods: that are drawn.
+        clipped: whether a mark is on the right edge because its cost is larger.
+    """
     handles = [
         Line2D(
             [],
@@ -168,17 +179,15 @@ def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str]) ->
         )
         for method in methods
     ]
-    references = [
+    references: list[Line2D | Patch] = [
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, label="limit $d_d$"),
         panels.infeasible_patch(),
         Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.9, label="best return $J^*(d)$, where known"),
     ]
-    figure.legend(handles=references, loc="outside lower center", ncols=len(references))
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=min(len(handles), panels.METHODS_A_LINE),
-        columnspacing=1.2,
-        handletextpad=0.5,
-        title="final policies, one mark per run: filled if feasible, hollow if not (at the edge: beyond)",
+    panels.legend_below(figure, references)
+    title = "final policies, one mark per run: filled if feasible, hollow if not"
+    if clipped:
+        title += "\nmarks on the right edge: the cost is beyond the axis"
+    panels.legend_above(
+        figure, handles, most=panels.METHODS_A_LINE, title=title, columnspacing=1.2, handletextpad=0.5
     )

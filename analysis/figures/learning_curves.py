@@ -96,7 +96,7 @@ def curricula(sweep: Sweep) -> Figure:
         if updates.loc[updates["task"] == task, f"limit_{i}"].notna().any()
     ]
     with styles.context():
-        figure = Figure(figsize=(TEXT_WIDTH, 1.6 * len(cells) + 1.05), layout="constrained")
+        figure = Figure(figsize=(TEXT_WIDTH, 1.6 * len(cells) + 1.2), layout="constrained")
         grid = figure.subplots(len(cells), len(agents), squeeze=False, sharey="row")
         for row, (task, i) in zip(grid, cells, strict=True):
             for axes, agent in zip(row, agents, strict=True):
@@ -122,7 +122,7 @@ def curricula(sweep: Sweep) -> Figure:
             look,
             present,
             optimum=False,
-            title="cost limits in force: every run thin, their mean thick; the agent's own cost faint",
+            title="cost limits in force: every run thin, their mean thick\nthe agent's own cost: faint",
         )
     return figure
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -18,10 +18,10 @@ from recrl.analysis.statistics.curves import Curve
 
 LOG_AXIS_FROM = 10.0  # times the limit
 MARKERS_A_LINE = 6
-METHODS_A_LINE = 7
-METHODS_A_PHONE, REFERENCES_A_PHONE = 4, 2  # a phone shows the left half of a figure
+METHODS_A_LINE, REFERENCES_A_LINE = 4, 2  # of a legend: a phone shows the left half of a figure
 DASHED = (0.0, (4.0, 2.0))
 INFEASIBLE: dict[str, Any] = {"color": "#c0392b", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.5}
+Entry = TypeVar("Entry")
 FAR_ABOVE = 1e6  # times the limit: the shaded region has no upper end
 
 
@@ -186,19 +186,59 @@ def legend(
     ]
     if optimum:
         references.append(Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.7, label="optimum $J^*(d_d)$"))
+    legend_above(figure, lines, most=METHODS_A_LINE, title=title, handlelength=3.2, columnspacing=1.6)
+    legend_below(figure, references)
+
+
+def legend_above(
+    figure: Figure, handles: Sequence[Line2D | Patch], *, most: int, title: str, **settings: Any
+) -> None:
+    """Draw a legend at the upper left of a figure, to be read row by row.
+
+    Args:
+        figure: with constrained layout.
+        handles: the entries, in order.
+        most: entries in a row; rows are filled evenly.
+        title: above the entries.
+        settings: of ``Figure.legend``.
+    """
+    columns = even_columns(len(handles), most)
     figure.legend(
-        handles=lines,
+        handles=in_rows(handles, columns),
         loc="outside upper left",
-        ncols=min(len(lines), METHODS_A_PHONE),
-        handlelength=3.2,
-        columnspacing=1.6,
+        ncols=columns,
         title=title,
         alignment="left",
+        **settings,
     )
+
+
+def legend_below(figure: Figure, references: Sequence[Line2D | Patch]) -> None:
+    """Draw the legend of reference lines at the lower left of a figure, likewise."""
+    columns = even_columns(len(references), REFERENCES_A_LINE)
     figure.legend(
-        handles=references,
+        handles=in_rows(references, columns),
         loc="outside lower left",
-        ncols=REFERENCES_A_PHONE,
+        ncols=columns,
         handlelength=2.6,
         columnspacing=1.6,
     )
+
+
+def even_columns(entries: int, most: int) -> int:
+    """Return the number of columns that fills the least number of rows evenly.
+
+    >>> [even_columns(entries, 4) for entries in (1, 4, 5, 7, 9)]
+    [1, 4, 3, 4, 3]
+    """
+    rows = -(-entries // most)
+    return -(-entries // max(rows, 1))
+
+
+def in_rows(entries: Sequence[Entry], columns: int) -> list[Entry]:
+    """Order entries so that matplotlib, which fills a legend column by column, shows them row by row.
+
+    >>> in_rows("abcde", 3)
+    ['a', 'd', 'b', 'e', 'c']
+    """
+    return [entry for column in range(columns) for entry in entries[column::columns]]

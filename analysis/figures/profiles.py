@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from recrl.analysis.data.labels import occurring
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.figures import styles
+from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import OPTIMUM_COLOUR, TEXT_WIDTH
 from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.intervals import performance_profile
@@ -43,7 +43,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     tasks, agents = occurring(rows["task"]), occurring(rows["agent"])
     with styles.context():
-        figure = Figure(figsize=(TEXT_WIDTH, 1.5 * len(tasks) + 0.6), layout="constrained")
+        figure = Figure(figsize=(TEXT_WIDTH, 1.5 * len(tasks) + 0.9), layout="constrained")
         grid = figure.subplots(len(tasks), len(agents), squeeze=False, sharex="row", sharey=True)
         for line, task in zip(grid, tasks, strict=True):
             chosen = rows[rows["task"] == task]
@@ -62,12 +62,12 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
         for axes in grid[-1]:
             axes.set_xlabel("return")
         present = [method for method in look if (rows["method"] == method).any()]
-        figure.legend(
-            handles=[Line2D([], [], **look[method].line, label=method) for method in present],
-            loc="outside upper center",
-            ncols=len(present),
+        panels.legend_above(
+            figure,
+            [Line2D([], [], **look[method].line, label=method) for method in present],
+            most=panels.METHODS_A_LINE,
+            title=f"{measure.description}:\nfraction of runs feasible and above a return (grey: optimum)",
             handlelength=3.2,
-            title=f"{measure.description}: fraction of runs feasible and above a return (grey: optimum)",
         )
     return figure
 

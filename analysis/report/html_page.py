@@ -51,6 +51,7 @@ tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
 .verdicts th { white-space: normal; }
 @media screen and (max-width: 44rem) {
   .verdicts td.verdict { min-width: 7rem; }
+  .verdicts th { white-space: nowrap; }
   .verdicts th:nth-child(-n+2), .verdicts td:nth-child(-n+2) { display: none; }
   .verdicts th:nth-child(3), .verdicts td:nth-child(3) { position: sticky; left: 0; background: #fff; }
   .verdicts tr.infeasible td:nth-child(3) { background: #fbe9e7; }
@@ -78,7 +79,7 @@ tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
 }
 """
 NAMES = ("task", "agent", "curriculum")
-HYPHENATED = re.compile(r"(?<!\S)(?=\S{1,30}(?!\S))\w+(?:-\w+)+")  # names such as ppo-lag stay on one line
+HYPHENATED = re.compile(r"(?<!\S)(?=\S{1,30}(?!\S))(?:--)?\w+(?:-\w+)+")  # ppo-lag stays on one line
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import table_formats
+from recrl.analysis.report.verdict_texts import tolerance_sentence
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
@@ -21,6 +22,7 @@ from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 
+OUTCOMES = "outcomes.csv"
 BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 
@@ -28,6 +30,7 @@ TIES = (
     f"P(higher return): a tie counts half. Returns tie within {SOLVED_GAP} of each other where the optimum "
     "is known, as for solved; elsewhere only where they differ by rounding."
 )
+SAMPLED = "That standard error is over the episodes of a trial; the one after ± is over seeds."
 FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
 BOUNDS_NOTE = (
     "Sums over the policies of the training phase, one expected episode each; means over n seeds. Limits in "
@@ -94,7 +97,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
     judged = count_verdicts(rows, compared, curriculum_flags(sweep), cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
-    outcomes = _outcome_tables(averaged, suffixes)
+    outcomes = _outcome_tables(rows, averaged, suffixes)
     latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
     shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
     if len(weighed):
@@ -107,7 +110,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
             shown.append(ShownTable(heading, bound_table(costs), BOUNDS_NOTE))
     written += [
         table_formats.write_csv(judged, folder / "verdicts.csv"),
-        table_formats.write_csv(rows, folder / "outcomes.csv"),
+        table_formats.write_csv(rows, folder / OUTCOMES),
         table_formats.write_parquet(rows, folder / "outcomes.parquet"),
         table_formats.write_csv(whole, folder / "summary.csv"),
         table_formats.write_csv(compared, folder / "comparisons.csv"),
@@ -116,14 +119,32 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     return written, Tables(judged, shown)
 
 
-def _outcome_tables(averaged: pd.DataFrame, suffixes: Sequence[str]) -> list[ShownTable]:
-    """Return the outcomes, those of the final policy first."""
+def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:
+    """Write only ``outcomes.csv``, as ``write_tables`` does.
+
+    Args:
+        sweep: its frames.
+        folder: where the file goes.
+
+    Returns:
+        The file; nothing is written before a trial is complete.
+    """
+    rows = metrics.outcomes(sweep)
+    return [table_formats.write_csv(rows, folder / OUTCOMES)] if len(rows) else []
+
+
+def _outcome_tables(
+    outcomes: pd.DataFrame, averaged: pd.DataFrame, suffixes: Sequence[str]
+) -> list[ShownTable]:
+    """Return the outcomes, those of the final policy first, each with the tolerance of its costs."""
     tables = []
     for measure in SHOWN_MEASURES:
         rows = averaged[averaged["measure"] == measure.value]
         if len(rows):
             table = table_formats.outcome_table(averaged, measure, suffixes)
-            tables.append(ShownTable(_heading(measure), table, kinds=table_formats.row_kinds(rows)))
+            exact = bool(outcomes.loc[outcomes["measure"] == measure.value, "exact"].all())
+            note = tolerance_sentence(exact=exact) + ("" if exact else f" {SAMPLED}")
+            tables.append(ShownTable(_heading(measure), table, note, table_formats.row_kinds(rows)))
     return tables
 
 

@@ -46,7 +46,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         f"{measured_how(verdicts)}.",
         *errors,
         f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known.",
-        tolerance_sentence(verdicts),
+        tolerance_sentence(exact=bool(verdicts["exact"].all())),
         "The return of an infeasible policy may be above the optimum: it is no success.",
         f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
@@ -67,14 +67,14 @@ def measured_how(verdicts: pd.DataFrame) -> str:
     return f"{sampled}, but computed exactly on {_listed(tasks)}" if tasks else sampled
 
 
-def tolerance_sentence(verdicts: pd.DataFrame) -> str:
+def tolerance_sentence(*, exact: bool) -> str:
     """Say how far above its limit the mean cost of a feasible policy may be.
 
     Args:
-        verdicts: of ``verdict_counts.count_verdicts``.
+        exact: whether all costs were computed, not sampled.
     """
     sampled = " or, where it is sampled, one standard error, whichever is larger"
-    error = "" if verdicts["exact"].all() else sampled
+    error = "" if exact else sampled
     return f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%}{error}."
 
 

@@ -340,6 +340,7 @@ class SyncRequest(SweepRequest):
     """Bring MLflow up to date with the files, for example after it was unreachable."""
 
     example: ClassVar[str] = "recrl-sweep sync demo --tracking-uri http://localhost:5000"
+    trust: bool = by_flag(**_TRUST)
     tracking_uri: str | None = by_flag(**_TRACKING)
     rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
 

@@ -40,11 +40,12 @@ def caption(rows: pd.DataFrame) -> str:
         rows: of ``verdict_counts.count_verdicts``.
     """
     several = int(rows["seeds"].max()) > 1
+    exact = bool(rows["exact"].all())
     means = "means over n seeds, returns ± standard error" if several else "one seed (n = 1): no intervals"
     return (
         f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"
         f"Verdicts: solved (feasible, and within {SOLVED_GAP} of the optimum), feasible, or infeasible by "
-        f"how much. {tolerance_sentence(rows)}"
+        f"how much. {tolerance_sentence(exact=exact)}"
     )
 
 

@@ -11,8 +11,10 @@ from recrl.orchestrator.cli.requests import SyncRequest, UIRequest
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
+from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.ui import open_ui
 
@@ -37,6 +39,8 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     """Bring MLflow up to date with the files."""
     store = open_store(request)
     uri = tracking_uri(store, request.tracking_uri)
+    if FinalOutcomes(store).lack_a_complete_trial():
+        _measure(store)
     report = sync(store, uri, rebuild=request.rebuild, write_export=write_in_own_process)
     if not report.is_up_to_date:
         raise TrackingError(
@@ -47,3 +51,11 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     if report.remark:
         say(console, f"without the export file ({report.remark}): MLflow still has the previous one")
     return ExitCode.OK
+
+
+def _measure(store: SweepStore) -> None:
+    """Write the outcomes of the final policies, for the metrics ``final/...``."""
+    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
+    from recrl.analysis.report.table_files import write_outcomes  # noqa: PLC0415
+
+    write_outcomes(sweep_data.load(store), store.figures_folder)

@@ -1,8 +1,9 @@
 """Outcome of each trial's final policy, by the same measure as in the report.
 
-The process that draws the report writes ``outcomes.csv`` beside it. This module reads that file. So MLflow
-and the report show the same numbers, and this package does not import the analysis. A trial has an outcome
-once it is complete and the report has been drawn: at the latest at the end of a launch with figures.
+The analysis writes ``outcomes.csv`` into the sweep's figures folder, and this module reads that file. So
+MLflow and the report show the same numbers, and this package does not import the analysis. The file is
+written with the report, and at the end of a launch without figures. ``recrl-sweep sync`` writes it if a
+complete trial is not in it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.tracking.positions import file_mark
 
 FILE_NAME = "outcomes.csv"  # in the sweep's figures folder
@@ -66,19 +67,20 @@ class FinalOutcome:
 
 
 class FinalOutcomes:
-    """The outcomes of a sweep's complete trials, as of the last report; read again when the file changes.
+    """The outcomes of a sweep's complete trials, as last written; read again when the file changes.
 
     Args:
         store: the sweep.
     """
 
     def __init__(self, store: SweepStore) -> None:
+        self._store = store
         self._path = store.figures_folder / FILE_NAME
         self._mark = ""
         self._found: dict[tuple[str, str, str, int], FinalOutcome] = {}
 
     def of(self, spec: TrialSpec) -> FinalOutcome | None:
-        """Return the outcome of a trial; None before the report has it."""
+        """Return the outcome of a trial; None before the file has it."""
         self._refresh()
         method = spec.method.label
         for label in (method, f"{method} [{spec.group}]"):  # the report adds the group to equal labels
@@ -91,6 +93,11 @@ class FinalOutcomes:
         """Return all outcomes, in the report's order."""
         self._refresh()
         return list(self._found.values())
+
+    def lack_a_complete_trial(self) -> bool:
+        """Whether a complete trial is not in the file."""
+        complete = (it for it in self._store.trials() if it.record().status is TrialState.COMPLETE)
+        return any(self.of(trial.spec) is None for trial in complete)
 
     def _refresh(self) -> None:
         try:

@@ -1,17 +1,22 @@
 """Content of MLflow's runs, as pure functions of the trials' files; independent of MLflow.
 
-Metrics are over environment steps; the part before the slash is the UI's chart section:
+The part before the slash is the UI's chart section. Metrics over environment steps:
 
     train/return, train/cost_0            means over the episodes of an update, training phase
-    perf/episodes                         their number
+    train/limit_0                         limit in force meanwhile, beside its cost
+    perf/episodes                         number of these episodes
     deploy/return, deploy/cost_0, ...     the same, deployment phase
     curriculum/limit_0, curriculum/noise  output of the curriculum; entropy_coefficient, if any
     agent/<name>                          metrics of the agent: kl, entropy, multiplier_0, ...
     perf/steps_per_second                 environment steps per CPU second
+
+Metrics with one value are at step 0. The UI draws bars if the last step of a metric is 0 in all runs, else a
+line, which would be a single dot:
+
     final/return, final/cost_0, final/limit_0    the final policy as in the report (``final_outcomes``): exact
-                                          where the task is finite; once, after the report was drawn
-    summary/deploy_return, ..._cost_0     mean over the episodes of the deployment phase; once, at the end
-    evaluation/<policy>_return, ..._cost_0    mean over the final evaluation's episodes; once, at the end
+                                          where the task is finite
+    summary/deploy_return, ..._cost_0     mean over the episodes of the deployment phase
+    evaluation/<policy>_return, ..._cost_0    mean over the final evaluation's episodes
 
 MLflow stores an infinite value as 1.8e308 and draws it. So values that are not finite (an infinite limit, the
 mean of no episodes) are left out, and the chart has no point there.
@@ -41,35 +46,6 @@ MAX_PARAMS = 100  # in one request
 MAX_NOTE = 7_500  # characters; MLflow takes 8,000 in a tag
 MAX_VERDICTS = 5_000  # of them, for the table of verdicts
 
-VIEW = "recrl"  # key of the prepared chart view
-
-# The UI's own state, in its own words (MLflow 3.17; undocumented, so a link without it must work as well).
-VIEW_STATE = {
-    "groupBy": {
-        "aggregateFunction": "average",
-        "groupByKeys": [{"mode": "tag", "groupByData": "recrl.group"}],
-    },
-    "runsHiddenMode": "SHOW_ALL",
-    "selectedColumns": [
-        *(f"params.`{name}`" for name in ("task", "agent", "method")),
-        *(f"metrics.`{name}`" for name in ("final/return", "final/cost_0", "final/limit_0")),
-        "tags.`recrl.verdict`",
-    ],
-    "compareRunCharts": [],
-    "compareRunSections": [
-        {
-            "uuid": f"recrl-{name}",
-            "name": name,
-            "display": True,
-            "isReordered": False,
-            "deleted": False,
-            "isGenerated": True,
-        }
-        for name in ("final", "train", "curriculum", "deploy", "summary", "evaluation", "agent", "perf")
-    ],
-    "isAccordionReordered": True,
-}
-
 Row = Mapping[str, str]
 
 
@@ -82,7 +58,7 @@ class Point:
         value: finite.
         milliseconds: wall time of the update, since 1970, from its row, so that a repeated point is
             identical.
-        step: environment steps.
+        step: environment steps; 0 for a metric with one value.
     """
 
     key: str
@@ -144,15 +120,17 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
     for column in row.keys() - set(UPDATE_COLUMNS):
         if re.fullmatch(r"cost_\d+", column):
             values[f"{section}/{column}"] = float(row[column])
-        elif re.fullmatch(r"limit_\d+|entropy_coefficient", column):
+        elif re.fullmatch(r"limit_\d+", column):
+            values[f"{section}/{column}"] = values[f"curriculum/{column}"] = float(row[column])
+        elif column == "entropy_coefficient":
             values[f"curriculum/{column}"] = float(row[column])
         else:
             values[f"agent/{_safe(column)}"] = float(row[column])
-    return points_of(values, row)
+    return _points_at(int(row["end_step"]), values, row)
 
 
 def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row) -> list[Point]:
-    """Return the points of a complete trial's summary and evaluations, at its last step.
+    """Return the points of a complete trial's summary and evaluations, as single values.
 
     Args:
         updates: ``TrialStore.updates()``.
@@ -169,7 +147,7 @@ def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row)
             values[f"summary/deploy_{name}"] = total / int(deployed["episodes"].sum())
         for policy, episodes in evaluation.groupby("policy"):
             values[f"evaluation/{policy}_{name}"] = float(episodes[column].mean())
-    return points_of(values, last_row)
+    return single_values(values, last_row)
 
 
 def params(spec: TrialSpec) -> dict[str, str]:
@@ -206,12 +184,6 @@ class Summary:
 
     group: tuple[str, str, str]
     values: Mapping[str, float]
-
-
-def charts_page(experiment_id: str) -> str:
-    """Return the address of the sweep's charts, averaged over seeds, after the ``#`` of the UI's address."""
-    page = f"/experiments/{experiment_id}/runs?viewStateShareKey={VIEW}"
-    return f"{page}&compareRunsMode=CHART&workflowType=machine_learning"
 
 
 def report_page(experiment_id: str, run_id: str) -> str:
@@ -270,9 +242,19 @@ def note(
     return "\n".join(lines)
 
 
-def points_of(values: Mapping[str, float], row: Row) -> list[Point]:
-    """Return the finite values as points at the time and step of a row of ``updates.csv``."""
-    milliseconds, step = round(float(row["time"]) * 1000), int(row["end_step"])
+def single_values(values: Mapping[str, float], last_row: Row) -> list[Point]:
+    """Return the finite values as points at step 0, so that the UI draws bars.
+
+    Args:
+        values: by the names of their metrics, each once in a trial.
+        last_row: the last row of ``updates.csv``, for the time.
+    """
+    return _points_at(0, values, last_row)
+
+
+def _points_at(step: int, values: Mapping[str, float], row: Row) -> list[Point]:
+    """Return the finite values as points at the time of a row of ``updates.csv``."""
+    milliseconds = round(float(row["time"]) * 1000)
     return [
         Point(key, value, milliseconds, step) for key, value in sorted(values.items()) if math.isfinite(value)
     ]

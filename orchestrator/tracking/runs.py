@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -11,20 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import EXPERIMENTS, connect, is_server
-from recrl.orchestrator.tracking.points import VIEW, VIEW_STATE
 from recrl.orchestrator.tracking.positions import Position, file_mark
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
-
-EXPERIMENT_TAGS = {
-    "mlflow.experimentKind": "custom_model_development",
-    f"mlflow.sharedViewState.{VIEW}": json.dumps(VIEW_STATE),
-}
 
 
 class SweepRuns:
@@ -118,15 +113,16 @@ class SweepRuns:
 
     def _find_experiment(self) -> str:
         name = f"{EXPERIMENTS}{self._store.name}"
+        tags = {"mlflow.experimentKind": "custom_model_development"} | view_tag(_num_costs(self._store))
         experiment = self.client.get_experiment_by_name(name)
         if experiment is None:
             # A server knows its artifact location; for a bare database the default would be the current
             # folder.
             place = None if is_server(self._uri) else self._store.mlflow_artifacts.as_uri()
-            return str(self.client.create_experiment(name, artifact_location=place, tags=EXPERIMENT_TAGS))
+            return str(self.client.create_experiment(name, artifact_location=place, tags=tags))
         if experiment.lifecycle_stage != "active":
             self.client.restore_experiment(experiment.experiment_id)
-        for key, value in EXPERIMENT_TAGS.items():
+        for key, value in tags.items():
             if experiment.tags.get(key) != value:
                 self.client.set_experiment_tag(experiment.experiment_id, key, value)
         return str(experiment.experiment_id)
@@ -168,6 +164,14 @@ def _sweep_id(store: SweepStore) -> str:
     """Return ten hex digits: sweeps of one name, made at different times, are different sweeps."""
     created = str(store.info().get("created", ""))
     return hashlib.sha256(f"{store.name}\n{created}".encode()).hexdigest()[:10]
+
+
+def _num_costs(store: SweepStore) -> int:
+    """Return the largest number of costs of a task; 1 if the list of trials is damaged."""
+    try:
+        return max((len(spec.deploy_limits) for spec in store.specs()), default=0)
+    except DamagedError:  # the pass over the sweep reports it
+        return 1
 
 
 def _milliseconds(seconds: float) -> int:

@@ -11,9 +11,10 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
+from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes, verdict_lines
-from recrl.orchestrator.tracking.points import Summary, charts_page, note, report_page
+from recrl.orchestrator.tracking.points import Summary, note, report_page
 from recrl.orchestrator.tracking.positions import Position, read_position, sync_folder
 from recrl.orchestrator.tracking.runs import SweepRuns
 

@@ -27,8 +27,8 @@ from recrl.orchestrator.tracking.points import (
     final_points,
     params,
     points,
-    points_of,
     rows_after,
+    single_values,
     thinned,
 )
 from recrl.orchestrator.tracking.positions import Position, file_mark, read_position, sync_folder
@@ -187,7 +187,7 @@ def _points_to_send(
         row = _last_row(data, position)
         last = final_points(trial.updates(), trial.evaluation(), row)
         if outcome is not None:
-            last += points_of(outcome.metrics, row)
+            last += single_values(outcome.metrics, row)
         summary = {point.key: point.value for point in last if point.key.startswith("summary/")}
         found, position = [*found, *last], replace(position, summary=summary)
     return found, position

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.client import is_server
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
-from recrl.orchestrator.tracking.points import charts_page
 from recrl.orchestrator.tracking.positions import sync_folder
 
 # Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.

@@ -146,6 +146,28 @@ def test_final_policies_lie_under_the_frontier_left_of_the_shaded_region(finishe
     assert [patch.get_x() for patch in shaded] == [5.0]
 
 
+def test_a_cost_beyond_the_axis_is_on_the_right_edge_and_the_legend_says_so(finished: Sweep) -> None:
+    near = return_against_cost(finished)
+    far = return_against_cost(
+        dataclasses.replace(finished, evaluations=finished.evaluations.assign(cost_0=51.0))
+    )
+    assert near is not None and far is not None
+    titles = ["\n".join(it.get_title().get_text() for it in figure.legends) for figure in (near, far)]
+    assert ["marks on the right edge: the cost is beyond the axis" in title for title in titles] == [
+        False,
+        True,
+    ]
+    assert np.asarray(far.axes[0].collections[0].get_offsets())[0].tolist()[0] == 50.0  # ten times the limit
+
+
+def test_a_legend_is_read_row_by_row_in_even_rows(made_up_sweep: Callable[..., SweepStore]) -> None:
+    methods = ["none", "linear", "cosine", "exponential", "dynamic"]
+    store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=methods)
+    above = learning_curves.curricula(sweep_data.load(store)).legends[0]
+    columns = [["none", "exponential"], ["linear", "dynamic"], ["cosine"]]
+    assert [text.get_text() for text in above.get_texts()] == [name for column in columns for name in column]
+
+
 def test_without_a_known_optimum_there_are_policies_and_limits_but_no_frontier(finished: Sweep) -> None:
     trials = finished.trials.assign(optimal_return=np.nan)
     figure = return_against_cost(dataclasses.replace(finished, trials=trials))

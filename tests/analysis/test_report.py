@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from recrl.analysis.data import sweep_data
+from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import drawing, table_files
 from recrl.analysis.report.drawing import NothingToDrawError
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -90,7 +91,22 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     assert not any(path.suffix == ".pdf" for path in sketched)
     tables = {path.name for path in sketched if path.suffix in (".csv", ".tex", ".parquet")}
     assert tables == {path.name for path in table_files.write_tables(sweep, tmp_path / "tables")[0]}
-    assert f"- {drawing.UNFINISHED}" in sketched[1].read_text().splitlines()
+    text = sketched[1].read_text()
+    assert f"- {drawing.UNFINISHED}" in text.splitlines()
+    assert text.count("another seed may give another verdict") == 1  # the answers say so, the warnings do not
+
+
+def test_tables_of_outcomes_say_their_tolerance(finished: Sweep, tmp_path: Path) -> None:
+    notes = {it.heading: it.note for it in table_files.write_tables(finished, tmp_path)[1].shown}
+    tolerance = "no mean cost exceeds its limit by more than 1% or, where it is sampled, one standard error"
+    assert tolerance in notes["Deployment phase (learning goes on)"]
+    assert "over the episodes of a trial" in notes["Deployment phase (learning goes on)"]
+
+
+def test_outcomes_alone_are_those_of_the_tables(finished: Sweep, tmp_path: Path) -> None:
+    (alone,) = table_files.write_outcomes(finished, tmp_path / "alone")
+    table_files.write_tables(finished, tmp_path)
+    assert alone.read_bytes() == (tmp_path / "outcomes.csv").read_bytes()
 
 
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:

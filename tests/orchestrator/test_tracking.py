@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import shutil
@@ -18,13 +19,16 @@ import pandas as pd
 import pytest
 
 from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
+from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.points import (
@@ -119,11 +123,8 @@ def test_points_are_sorted_into_chart_sections(made_up_sweep: Callable[..., Swee
     deployed = points({**row, **changed}, spec)
     values = {point.key: point.value for point in deployed}
     assert values["curriculum/entropy_coefficient"] == 0.25
-    assert (values["deploy/return"], values["deploy/cost_0"], values["curriculum/limit_0"]) == (
-        -1.5,
-        4.5,
-        5.0,
-    )
+    assert (values["deploy/return"], values["deploy/cost_0"]) == (-1.5, 4.5)
+    assert (values["deploy/limit_0"], values["curriculum/limit_0"]) == (5.0, 5.0)
 
 
 def test_the_summary_weighs_updates_by_their_episodes() -> None:
@@ -137,7 +138,9 @@ def test_the_summary_weighs_updates_by_their_episodes() -> None:
     )
     evaluation = pd.DataFrame({"policy": ["deterministic"], "episode_return": [9.5], "cost_0": [5.0]})
     last_row = {"time": "1.0", "end_step": "400"}
-    assert {point.key: point.value for point in final_points(updates, evaluation, last_row)} == {
+    final = final_points(updates, evaluation, last_row)
+    assert {(point.step, point.milliseconds) for point in final} == {(0, 1000)}  # drawn as bars
+    assert {point.key: point.value for point in final} == {
         "summary/deploy_return": 7.0,
         "summary/deploy_cost_0": 5.0,
         "evaluation/deterministic_return": 9.5,
@@ -145,6 +148,21 @@ def test_the_summary_weighs_updates_by_their_episodes() -> None:
     }
     training = final_points(updates[:1], evaluation[:0], last_row)
     assert training == []
+
+
+def test_the_view_has_each_cost_and_its_limit_in_one_chart() -> None:
+    view = json.loads(view_tag(2)["mlflow.sharedViewState.recrl"])
+    charts = view["compareRunCharts"]
+    names = [name for section in ("deploy", "train") for i in range(2) for name in charts_of(section, i)]
+    assert [(it["metricKey"], it["deleted"]) for it in charts] == names
+    assert charts[0]["selectedMetricKeys"] == ["deploy/cost_0", "deploy/limit_0"]
+    assert {it["metricSectionId"] for it in charts} < {it["uuid"] for it in view["compareRunSections"]}
+    assert json.loads(view_tag(0)["mlflow.sharedViewState.recrl"])["compareRunCharts"] == []
+
+
+def charts_of(section: str, i: int) -> list[tuple[str, bool]]:
+    """Metrics of two charts, and whether MLflow leaves them out."""
+    return [(f"{section}/cost_{i}", False), (f"{section}/limit_{i}", True)]
 
 
 def test_the_note_has_a_line_a_group_with_means_over_seeds() -> None:
@@ -522,6 +540,7 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
     parent, run = shown["made-up"], shown[DYNAMIC]
     final = {key: value for key, value in run.data.metrics.items() if key.startswith("final/")}
     assert final == {"final/return": 15.0, "final/cost_0": 9.0625, "final/limit_0": 5.0}
+    assert {step for key in final for step, _, _ in history(store, run)[key]} == {0}
     assert [shown[name].data.tags["recrl.verdict"] for name in (NONE, DYNAMIC)] == ["solved", "infeasible"]
     assert run.data.tags["mlflow.note.content"].startswith(
         "**infeasible by 4.06**: return 15.00, cost 9.062, limit d_d 5.00, training limit d_t 100.00."
@@ -535,6 +554,58 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
     assert sync(store, uri).points == 0
     sync(store, uri, rebuild=True)
     assert runs(store)[NONE].data.metrics["final/cost_0"] == 5.0
+
+
+GRID = """\
+name: small
+tasks: [{name: two-state, deploy_limits: 2}]
+agents: [ppo-lag]
+methods: [none]
+seeds: 1
+run: {total_steps: 80, deploy_fraction: 0.5, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
+"""
+LAUNCH = ("launch", "grid.yaml", "--executor", "inline", "--no-figures")
+
+
+class FakeSync:
+    """A sync that only notes which files there are at its last pass."""
+
+    def __init__(self, store: SweepStore) -> None:
+        self.folder = store.figures_folder
+        self.found: list[str] = []
+
+    def stop(self, timeout: float) -> bool:
+        self.found = [path.name for path in self.folder.glob("*")]
+        return True
+
+
+def test_a_launch_without_figures_measures_the_final_policies_for_mlflow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("grid.yaml").write_text(GRID)
+    fake = FakeSync(SweepStore(Path("runs"), "small"))
+    monkeypatch.setattr("recrl.orchestrator.launching._sync_to", lambda uri: lambda store: fake)
+    assert main(LAUNCH) == ExitCode.OK
+    assert fake.found == ["outcomes.csv"]
+
+
+def test_sync_measures_the_final_policies_that_no_report_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, empty_database: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("grid.yaml").write_text(GRID)
+    store = SweepStore(Path("runs"), "small")
+    assert main([*LAUNCH, "--no-mlflow"]) == ExitCode.OK
+    assert not store.figures_folder.exists()
+    shutil.copy(empty_database, store.mlflow_database)
+    assert main(["sync", "small"]) == ExitCode.OK
+    run = runs(store)["two-state ppo-lag none seed 0"]
+    assert run.data.metrics.keys() >= {"final/return", "final/cost_0", "final/limit_0"}
+    assert run.data.tags["recrl.verdict"] in ("solved", "feasible", "infeasible")
+    written = (store.figures_folder / "outcomes.csv").stat().st_mtime_ns
+    assert main(["sync", "small"]) == ExitCode.OK
+    assert (store.figures_folder / "outcomes.csv").stat().st_mtime_ns == written
 
 
 def test_a_long_table_of_verdicts_leaves_room_for_the_rest() -> None:
