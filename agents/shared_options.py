@@ -157,6 +157,12 @@ class ActorCriticConfig(BaseModel):
         description="Decay of the exponential moving average over the policies after each update. The "
         "average is the final policy, for evaluation and export (ours). 0: the last policy (paper).",
     )
+    min_std: NonNegative = Field(
+        default=0.0,
+        description="Lower bound of the standard deviations of continuous actions, as a fraction of half "
+        "the action's range (ours). Under a falling limit a policy without it can become too certain to "
+        "change in time. 0: no bound (paper).",
+    )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",
         description="Meaning of policy noise (ours; the paper does not define it). match-mixture: "

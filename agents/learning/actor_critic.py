@@ -322,7 +322,9 @@ def fresh_agent(
     def first_policy() -> tuple[StochasticPolicy, torch.Generator]:
         """Make the policy before the first update; return the generator for further networks, too."""
         generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
-        made = StochasticPolicy(encoder.size, cmdp.action_space, form, config.last_layer_scale, generator)
+        made = StochasticPolicy(
+            encoder.size, cmdp.action_space, form, config.last_layer_scale, generator, min_std=config.min_std
+        )
         return made, generator
 
     policy, generator = first_policy()

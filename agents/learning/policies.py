@@ -46,6 +46,7 @@ class StochasticPolicy:
         form: of the network.
         last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
         generator: the initialisation's randomness.
+        min_std: lower bound of a Gaussian's standard deviations, as a fraction of half the action's range.
 
     Attributes:
         parameters: all of them, in one block.
@@ -60,6 +61,8 @@ class StochasticPolicy:
         form: NetworkForm,
         last_scale: float,
         generator: torch.Generator,
+        *,
+        min_std: float = 0.0,
     ) -> None:
         num_outputs = action_size(action_space)
         self.is_categorical = isinstance(action_space, Discrete)
@@ -77,6 +80,7 @@ class StochasticPolicy:
             self.log_std.fill_(INITIAL_LOG_STD)
             half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
             self._half_ranges = np.where(np.isfinite(half), half, 1.0)
+        self._min_std = min_std
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
         acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
         self._acting_log_std = acting[-1]
@@ -207,6 +211,12 @@ class StochasticPolicy:
         if self.is_categorical:
             return self._soften(noise, observations, form)
         return self._widen(noise, form)
+
+    def bound_std(self) -> None:
+        """Raise a Gaussian's standard deviations to their lower bound."""
+        if self._min_std > 0.0 and not self.is_categorical:
+            least = torch.as_tensor(np.log(self._min_std * self._half_ranges), dtype=self.log_std.dtype)
+            self.log_std.copy_(torch.maximum(self.log_std, least.to(self.log_std.device)))
 
     def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
         distinct = find_repeated(observations)

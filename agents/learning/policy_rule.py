@@ -76,6 +76,7 @@ def improve_and_measure(
         ``surrogate_reward`` and ``surrogate_cost_i``, the gains to first order in the advantages' unit.
     """
     metrics = rule.improve(policy, experience, generator)
+    policy.bound_std()
     batch, advantages = experience.batch, experience.advantages
     new = policy.distribution(batch.unique_observations)
     centred = batch.per_pair(advantages - advantages.mean(axis=0))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
 
 from recrl.agents.agent import Agent, EntropyRewarded, Rollout
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
@@ -289,3 +290,14 @@ def test_an_agent_on_a_gpu_learns_what_one_on_a_cpu_learns(agent: str, task: str
     np.testing.assert_array_equal(
         on_gpu.agent.act_greedily(observations), on_cpu.agent.act_greedily(observations)
     )
+
+
+@every_agent
+def test_no_update_lets_a_standard_deviation_fall_below_its_bound(agent: str) -> None:
+    lessons = Lessons(agent, "continuous-bandit", {"min_std": 0.9})
+    space = make_vector("continuous-bandit", 4).cmdp.action_space
+    assert isinstance(space, Box)
+    log_std = np.log(0.9 * 0.5 * (space.high - space.low))
+    least = float(log_std.sum()) + 0.5 * len(log_std) * math.log(2.0 * math.pi * math.e)
+    for _ in range(SEVERAL_UPDATES):
+        assert lessons.update()["entropy"] >= least - 1e-5

@@ -208,6 +208,22 @@ def test_an_unbounded_action_is_noised_as_if_its_half_range_were_one() -> None:
     assert policy.log_std.exp().item() == pytest.approx(3.0**-0.5)
 
 
+def test_standard_deviations_are_raised_to_a_fraction_of_half_the_range() -> None:
+    space = Box(np.array([-1.0, -4.0, -np.inf]), np.array([1.0, 4.0, np.inf]), dtype=np.float64)
+    policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0), min_std=0.5)
+    policy.log_std.copy_(torch.log(torch.tensor([0.7, 0.7, 0.1])))
+    policy.bound_std()
+    assert policy.log_std.exp().tolist() == pytest.approx([0.7, 2.0, 0.5])
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_without_a_bound_the_parameters_stay(space: Space[object]) -> None:
+    policy = policy_for(space)
+    before = policy.parameters.to_numpy()
+    policy.bound_std()
+    np.testing.assert_array_equal(policy.parameters.to_numpy(), before)
+
+
 def test_probabilities_are_the_distributions() -> None:
     policy, rows = policy_for(THREE_ACTIONS), random_rows()
     expected = torch.stack(
