@@ -13,7 +13,7 @@ from recrl.analysis.data import export
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.redaction import redacted
-from recrl.orchestrator.tracking.read import downloaded_export
+from recrl.orchestrator.tracking.export_download import downloaded_export
 
 TRIES = 3  # a file that is being uploaded is incomplete
 PAUSE_SECONDS = 1.0

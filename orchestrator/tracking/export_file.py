@@ -18,8 +18,8 @@ from pathlib import Path
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import Position
-from recrl.orchestrator.tracking.runs import SweepRuns
 
 FOLDER = "export"
 FILE_NAME = "sweep.zip"

@@ -33,8 +33,8 @@ from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
+from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import exclusive, sync_folder
-from recrl.orchestrator.tracking.runs import SweepRuns
 from recrl.orchestrator.tracking.sweep_sync import SweepSync
 from recrl.orchestrator.tracking.trial_sync import TrialSync
 

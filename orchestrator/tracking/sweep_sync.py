@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -14,9 +14,10 @@ from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes, verdict_lines
-from recrl.orchestrator.tracking.points import Summary, note, report_page
+from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import Position, read_position, sync_folder
-from recrl.orchestrator.tracking.runs import SweepRuns
+from recrl.orchestrator.tracking.run_content import Summary, note, report_page
+from recrl.orchestrator.tracking.run_status import sweep_run_status
 
 
 class SweepSync:
@@ -74,7 +75,7 @@ class SweepSync:
         from mlflow.entities import RunTag  # noqa: PLC0415
 
         counts = Counter(display_status(record, now=time.time()) for record in records.values())
-        status = sweep_status(counts, live=live)
+        status = sweep_run_status(counts, live=live)
         summaries = filter(None, map(self._summary, self._store.trials()))
         text = note(
             self._store.name,
@@ -107,13 +108,3 @@ class SweepSync:
         if position != self._position:
             position.write(self._path)
             self._position = position
-
-
-def sweep_status(counts: Mapping[DisplayStatus, int], *, live: bool) -> str:
-    """Return MLflow's state of a sweep with these numbers of trials by status."""
-    if live or counts[DisplayStatus.RUNNING]:
-        return "RUNNING"
-    if counts[DisplayStatus.FAILED]:
-        return "FAILED"
-    complete = counts[DisplayStatus.COMPLETE] == sum(counts.values())
-    return "FINISHED" if complete else "KILLED"

@@ -6,7 +6,6 @@ was damaged), MLflow has points that no longer exist. Then the run is deleted an
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +17,10 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, trial_note
-from recrl.orchestrator.tracking.points import (
+from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
+from recrl.orchestrator.tracking.positions import Position, file_mark, read_position, sync_folder
+from recrl.orchestrator.tracking.run_content import (
     Point,
     Row,
     Summary,
@@ -31,13 +31,10 @@ from recrl.orchestrator.tracking.points import (
     single_values,
     thinned,
 )
-from recrl.orchestrator.tracking.positions import Position, file_mark, read_position, sync_folder
-from recrl.orchestrator.tracking.runs import SweepRuns
+from recrl.orchestrator.tracking.run_status import state_tags, trial_run_status
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric
-
-MAX_ERROR = 5_000  # characters of a failed trial's error
 
 
 class TrialSync:
@@ -150,7 +147,7 @@ def _shown(
     """Return the content of the run besides points; nothing is sent while it does not change."""
     known = {} if outcome is None else {"outcome": repr(outcome)}
     return known | {
-        "status": mlflow_status(record, live=live),
+        "status": trial_run_status(record, live=live),
         "attempt": record.attempt,
         "committed": record.committed.get(trial.updates_path.name, 0),
         "error": record.error,
@@ -220,34 +217,3 @@ def _added_afterwards(trial: TrialStore) -> list[Path]:
     """Return evaluations and videos of the final policy, for artifacts in folders of these names."""
     folders = (trial.evaluations_folder, trial.videos_folder)
     return [path for folder in folders for path in sorted(folder.glob("update-*"))]
-
-
-def mlflow_status(record: TrialRecord, *, live: bool) -> str:
-    """Return MLflow's state of a trial that has begun.
-
-    Args:
-        record: of the trial; ``attempt`` is at least 1.
-        live: whether a launch runs that will resume waiting trials.
-    """
-    match display_status(record, now=time.time()):
-        case DisplayStatus.COMPLETE:
-            return "FINISHED"
-        case DisplayStatus.FAILED | DisplayStatus.DAMAGED:
-            return "FAILED"
-        case DisplayStatus.RUNNING:
-            return "RUNNING"
-        case DisplayStatus.INTERRUPTED:
-            return "KILLED"
-        case DisplayStatus.STOPPED | DisplayStatus.WAITING:
-            return "SCHEDULED" if live else "KILLED"
-
-
-def state_tags(record: TrialRecord) -> dict[str, str]:
-    """Return the changing tags of a trial's run; empty ones are left out."""
-    tags = {
-        "recrl.status": str(record.status),
-        "recrl.attempt": str(record.attempt),
-        "recrl.host": record.host,
-        "recrl.error": record.error[:MAX_ERROR],
-    }
-    return {name: value for name, value in tags.items() if value}

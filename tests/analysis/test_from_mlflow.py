@@ -21,9 +21,9 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking import export_file
 from recrl.orchestrator.tracking.client import connect, tracking_uri
 from recrl.orchestrator.tracking.export_file import ExportUpload, write_in_own_process
+from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.mlflow_sync import Tracker, sync
 from recrl.orchestrator.tracking.positions import Position
-from recrl.orchestrator.tracking.runs import SweepRuns
 from recrl.orchestrator.tracking.ui import UI, open_ui
 from tests.faults.committing import commit_file
 

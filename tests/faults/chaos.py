@@ -42,7 +42,7 @@ import numpy as np
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.tracking.points import final_points, points, rows_after, thinned
+from recrl.orchestrator.tracking.run_content import final_points, points, rows_after, thinned
 
 GRID = """\
 name: chaos

@@ -31,7 +31,7 @@ from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
-from recrl.orchestrator.tracking.points import (
+from recrl.orchestrator.tracking.run_content import (
     Summary,
     final_points,
     note,
@@ -40,7 +40,7 @@ from recrl.orchestrator.tracking.points import (
     rows_after,
     thinned,
 )
-from recrl.orchestrator.tracking.trial_sync import mlflow_status
+from recrl.orchestrator.tracking.run_status import trial_run_status
 from recrl.orchestrator.tracking.ui import open_ui, ui_command, ui_url
 from tests.faults.committing import commit_file
 
@@ -72,14 +72,14 @@ def updates_shown(num_updates: int) -> list[int]:
 
 
 def test_a_long_trial_is_thinned_evenly_and_keeps_its_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.tracking.points.POINTS_PER_METRIC", 4)
+    monkeypatch.setattr("recrl.orchestrator.tracking.run_content.POINTS_PER_METRIC", 4)
     assert updates_shown(4) == [1, 2, 3, 4]
     assert updates_shown(11) == [1, 3, 6, 9, 11]
     assert updates_shown(1) == [1]
 
 
 def test_thinning_does_not_depend_on_when_the_file_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.tracking.points.POINTS_PER_METRIC", 2)
+    monkeypatch.setattr("recrl.orchestrator.tracking.run_content.POINTS_PER_METRIC", 2)
     whole = list(thinned(rows_after(ROWS, 0), 4))
     lengths = [end for end, _ in rows_after(ROWS, 0)]
     for cut in lengths:
@@ -89,7 +89,7 @@ def test_thinning_does_not_depend_on_when_the_file_is_read(monkeypatch: pytest.M
 
 
 def test_a_burst_of_noise_is_not_thinned_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.tracking.points.POINTS_PER_METRIC", 1)
+    monkeypatch.setattr("recrl.orchestrator.tracking.run_content.POINTS_PER_METRIC", 1)
     assert [row["noise"] for _, row in thinned(rows_after(ROWS, 0), 4)] == ["0.0", "0.5"]
 
 
@@ -237,7 +237,7 @@ def test_run_states_are_true(status: TrialState, live: bool, expected: str) -> N
     record = TrialRecord(
         status=status, attempt=1, heartbeat=time.time(), host=socket.gethostname(), pid=os.getpid()
     )
-    assert mlflow_status(record, live=live) == expected
+    assert trial_run_status(record, live=live) == expected
 
 
 def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
@@ -246,10 +246,10 @@ def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
     here = TrialRecord(
         status=TrialState.RUNNING, heartbeat=time.time(), host=socket.gethostname(), pid=process.pid
     )
-    assert mlflow_status(here, live=True) == "KILLED"
+    assert trial_run_status(here, live=True) == "KILLED"
     elsewhere = replace(here, host="elsewhere")
-    assert mlflow_status(elsewhere, live=True) == "RUNNING"
-    assert mlflow_status(replace(elsewhere, heartbeat=time.time() - 301.0), live=True) == "KILLED"
+    assert trial_run_status(elsewhere, live=True) == "RUNNING"
+    assert trial_run_status(replace(elsewhere, heartbeat=time.time() - 301.0), live=True) == "KILLED"
 
 
 # Against a real database

@@ -24,7 +24,7 @@ ALLOWED = {
         "recrl.orchestrator.provenance.code_changes",
         "recrl.orchestrator.redaction",
         "recrl.orchestrator.spec",
-        "recrl.orchestrator.tracking.read",
+        "recrl.orchestrator.tracking.export_download",
         "recrl.orchestrator.trial.phase_totals",
         "recrl.orchestrator.untrusted",
         "recrl.orchestrator.validation",
