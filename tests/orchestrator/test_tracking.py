@@ -585,7 +585,7 @@ def test_a_launch_without_figures_measures_the_final_policies_for_mlflow(
     monkeypatch.chdir(tmp_path)
     Path("grid.yaml").write_text(GRID)
     fake = FakeSync(SweepStore(Path("runs"), "small"))
-    monkeypatch.setattr("recrl.orchestrator.launching._sync_to", lambda uri: lambda store: fake)
+    monkeypatch.setattr("recrl.orchestrator.launch_grid._sync_to", lambda uri: lambda store: fake)
     assert main(LAUNCH) == ExitCode.OK
     assert fake.found == ["outcomes.csv"]
 
