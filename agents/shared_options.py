@@ -33,6 +33,7 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "normalise_observations": "none",
     "constraint_window": 1,
     "policy_average": 0.0,
+    "min_std": 0.0,
     "noise_form": "match-mixture",
 }
 
@@ -160,8 +161,8 @@ class ActorCriticConfig(BaseModel):
     min_std: NonNegative = Field(
         default=0.0,
         description="Lower bound of the standard deviations of continuous actions, as a fraction of half "
-        "the action's range (ours). Under a falling limit a policy without it can become too certain to "
-        "change in time. 0: no bound (paper).",
+        "the action's range; they are raised to it after each update (ours). Under a falling limit a policy "
+        "without it can become too certain to change in time. 0: no bound (paper).",
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",

@@ -166,7 +166,7 @@ def launch_grid(
             if options.figures:
                 _draw(read[0], store, listener)
             elif uri:
-                _write_outcomes(read[0], store)
+                _write_outcomes(read[0], store, listener)
         if not stop.is_set():
             _film(grid, after, store, stop, listener)
 
@@ -260,11 +260,15 @@ def _draw(sweep: Sweep, store: SweepStore, listener: LaunchListener) -> None:
         listener.drawn(store.figures_folder)
 
 
-def _write_outcomes(sweep: Sweep, store: SweepStore) -> None:
+def _write_outcomes(sweep: Sweep, store: SweepStore, listener: LaunchListener) -> None:
     """Write the outcomes of the final policies, which MLflow shows also without figures."""
     from recrl.analysis.report.table_files import write_outcomes  # noqa: PLC0415
 
-    write_outcomes(sweep, store.figures_folder)
+    try:
+        write_outcomes(sweep, store.figures_folder)
+    except Exception as error:  # MLflow must still be updated
+        logger.debug("outcomes of %s", store.name, exc_info=True)
+        listener.failed_to_draw(error)
 
 
 def _film(

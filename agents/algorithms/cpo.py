@@ -120,9 +120,10 @@ def constrained_step(
     metric = model.metric(config, generator)
     problem, solved = linearise(model, active, metric, config)
     solution = solve(problem)
-    integral.note_step(active.index, problem.unmet(solution))
     is_acceptable = acceptance(model, active, solution, config.target_kl)
     metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
+    rejected = metrics["policy_steps"] == 0.0
+    integral.note_step(active.index, problem.beyond_reach() | (rejected & (active.violations > 0.0)))
     multipliers[:] = 0.0
     multipliers[active.index] = solution.multipliers
     return {

@@ -149,9 +149,7 @@ class CPOConfig(TrustRegionConfig):
 class PCPOConfig(TrustRegionConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""
 
-    paper: ClassVar[Mapping[str, Any]] = {**TrustRegionConfig.paper, "violation_integral_gain": 0.0}
-
-    violation_integral_gain: ViolationIntegralGain = 0.1
+    violation_integral_gain: ViolationIntegralGain = 0.0
 
 
 class TRPOConfig(TrustRegionConfig):

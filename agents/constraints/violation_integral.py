@@ -13,11 +13,12 @@ Without the bound a few such updates would add more than hundreds of later ones 
 that has long kept the limit would still avoid all cost. The multipliers' integral is bounded likewise
 (``multiplier_rules.pid``).
 
-If the last step did not meet its constraint, because the trust region is too small, a larger I would change
-nothing, and would delay the return to the reward. Then I does not grow (anti-wind-up).
+If the last step could not meet its constraint, a larger I would change nothing, and would delay the return to
+the reward. Then I does not grow (anti-wind-up). Under a limit of 0 c is never negative, so there I falls by
+the fraction K while the limit is kept.
 
-c, e and I are in the unit of the surrogates, cost per step, so the units of the task do not matter. K = 0 is
-the published algorithm.
+c, e and I are in the unit of the surrogates, cost per step, so K has no unit. K = 0 is the published
+algorithm.
 
 Notation: k costs, j of the k limits are finite.
 """
@@ -61,12 +62,13 @@ class ViolationIntegral:
         """
         change = self._gain * np.minimum(violations, sizes)
         grows = np.where(self._unmet[index], np.minimum(change, 0.0), change)
-        self._integral[index] = np.maximum(self._integral[index] + grows, 0.0)
+        forgotten = np.where(violations == 0.0, self._gain * self._integral[index], 0.0)
+        self._integral[index] = np.maximum(self._integral[index] + grows - forgotten, 0.0)
         corrected: Floats = violations + self._integral[index]
         return corrected
 
     def note_step(self, index: npt.NDArray[np.int64], unmet: npt.NDArray[np.bool_]) -> None:
-        """Remember which of the constraints, [j], the step taken does not meet."""
+        """Remember which of the constraints, [j], the step taken could not meet."""
         self._unmet[:] = False
         self._unmet[index] = unmet
 

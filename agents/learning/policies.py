@@ -81,6 +81,7 @@ class StochasticPolicy:
             half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
             self._half_ranges = np.where(np.isfinite(half), half, 1.0)
         self._min_std = min_std
+        self.bound_std()
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
         acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
         self._acting_log_std = acting[-1]

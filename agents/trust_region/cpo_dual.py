@@ -91,12 +91,11 @@ class StepProblem:
             self.violations - solution.gradient_weight * self.mixed - self.gram @ solution.constraint_weights
         )
 
-    def unmet(self, solution: DualSolution) -> npt.NDArray[np.bool_]:
-        """Return which constraints a step does not meet, to first order and beyond rounding, [k]."""
+    def beyond_reach(self) -> npt.NDArray[np.bool_]:
+        """Return which constraints no step within the trust region meets, each taken alone, [k]."""
         reach = np.sqrt(2.0 * self.radius * np.maximum(np.diag(self.gram), 0.0))
-        rounding = FEASIBILITY_TOLERANCE * (reach + np.abs(self.violations))
-        unmet: npt.NDArray[np.bool_] = self.after(solution) > rounding
-        return unmet
+        beyond: npt.NDArray[np.bool_] = self.violations > reach
+        return beyond
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.tracking.client import tracking_uri
+from recrl.orchestrator.tracking.client import one_line, tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
 from recrl.orchestrator.tracking.mlflow_sync import sync
@@ -39,13 +39,14 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     """Bring MLflow up to date with the files."""
     store = open_store(request)
     uri = tracking_uri(store, request.tracking_uri)
-    if FinalOutcomes(store).lack_a_complete_trial():
-        _measure(store)
+    outcomes = FinalOutcomes(store)
+    if outcomes.lack_a_complete_trial() or (request.trust and outcomes.has_sampled()):
+        _measure(store, console)
     report = sync(store, uri, rebuild=request.rebuild, write_export=write_in_own_process)
     if not report.is_up_to_date:
         raise TrackingError(
             f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}; the files "
-            "have everything: sync again later"
+            "have all that was committed: sync again later, or see 'recrl-sweep check' for damaged files"
         )
     say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:
@@ -53,9 +54,12 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     return ExitCode.OK
 
 
-def _measure(store: SweepStore) -> None:
-    """Write the outcomes of the final policies, for the metrics ``final/...``."""
+def _measure(store: SweepStore, console: Console) -> None:
+    """Write the outcomes of the final policies, for the metrics ``final/...``; if that fails, say so."""
     from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
     from recrl.analysis.report.table_files import write_outcomes  # noqa: PLC0415
 
-    write_outcomes(sweep_data.load(store), store.figures_folder)
+    try:
+        write_outcomes(sweep_data.load(store), store.figures_folder)
+    except Exception as error:  # a task of the user's may raise anything
+        say(console, f"without the values final/...: {one_line(error)}")

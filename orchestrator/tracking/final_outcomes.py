@@ -95,9 +95,14 @@ class FinalOutcomes:
         return list(self._found.values())
 
     def lack_a_complete_trial(self) -> bool:
-        """Whether a complete trial is not in the file."""
-        complete = (it for it in self._store.trials() if it.record().status is TrialState.COMPLETE)
-        return any(self.of(trial.spec) is None for trial in complete)
+        """Whether a complete trial of the grid, whose policy was evaluated, is not in the file."""
+        trials = map(self._store.trial, self._store.specs())
+        complete = (it for it in trials if it.record().status is TrialState.COMPLETE)
+        return any(it.spec.evaluation_episodes and self.of(it.spec) is None for it in complete)
+
+    def has_sampled(self) -> bool:
+        """Whether an outcome is sampled: its task is not finite, or was not trusted when it was measured."""
+        return not all(outcome.exact for outcome in self.all())
 
     def _refresh(self) -> None:
         try:

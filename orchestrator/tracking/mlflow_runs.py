@@ -47,6 +47,7 @@ class SweepRuns:
         self._uri = uri
         self._tags = {"recrl.sweep": store.name, "recrl.sweep_id": _sweep_id(store)}
         self.experiment_id = self._find_experiment()
+        self._offer_charts()
         self._artifacts: dict[str, str] = {}  # artifact location of each run
         self._of_trials = self._find_runs()
         if rebuild:
@@ -113,7 +114,7 @@ class SweepRuns:
 
     def _find_experiment(self) -> str:
         name = f"{EXPERIMENTS}{self._store.name}"
-        tags = {"mlflow.experimentKind": "custom_model_development"} | view_tag(_num_costs(self._store))
+        tags = {"mlflow.experimentKind": "custom_model_development"}
         experiment = self.client.get_experiment_by_name(name)
         if experiment is None:
             # A server knows its artifact location; for a bare database the default would be the current
@@ -126,6 +127,16 @@ class SweepRuns:
             if experiment.tags.get(key) != value:
                 self.client.set_experiment_tag(experiment.experiment_id, key, value)
         return str(experiment.experiment_id)
+
+    def _offer_charts(self) -> None:
+        """Store the view of the charts; a server that refuses so long a tag still gets the runs."""
+        from mlflow.exceptions import MlflowException  # noqa: PLC0415
+
+        tags = self.client.get_experiment(self.experiment_id).tags
+        for key, value in view_tag(_num_costs(self._store)).items():
+            if tags.get(key) != value:
+                with suppress(MlflowException):
+                    self.client.set_experiment_tag(self.experiment_id, key, value)
 
     def _find_runs(self) -> dict[str, str]:
         """Return runs by trial id, the parent by the empty id; the oldest if there are several."""

@@ -3,7 +3,7 @@
 No trial's process imports mlflow: ``background_sync`` makes the passes in a separate process. A sweep's name
 has one experiment (``recrl/<name>``). The sweep has one parent run with a note, and with figures and the
 export file as artifacts. It has no metrics, so that it is in no chart. Each trial has one child run, whose
-content is in ``points``. States of runs:
+content is in ``run_content``. States of runs:
 
     the trial's files say                                       the run is
     waiting, never started                                      not there; the parent's note counts it
@@ -14,7 +14,7 @@ content is in ``points``. States of runs:
     failed                                                      FAILED, with the tag ``recrl.error``
 
 ``positions`` and ``trial_sync`` explain why no point is lost or duplicated. To get the data back, read the
-export file (``read``): MLflow's points are only for its charts.
+export file (``export_download``): MLflow's points are only for its charts.
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ def points(row: Row, spec: TrialSpec) -> list[Point]:
             values[f"curriculum/{column}"] = float(row[column])
         else:
             values[f"agent/{_safe(column)}"] = float(row[column])
-    return _points_at(int(row["end_step"]), values, row)
+    return _points_at(int(row["end_step"]), values, float(row["time"]))
 
 
 def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row) -> list[Point]:
@@ -147,7 +147,7 @@ def final_points(updates: pd.DataFrame, evaluation: pd.DataFrame, last_row: Row)
             values[f"summary/deploy_{name}"] = total / int(deployed["episodes"].sum())
         for policy, episodes in evaluation.groupby("policy"):
             values[f"evaluation/{policy}_{name}"] = float(episodes[column].mean())
-    return single_values(values, last_row)
+    return single_values(values, float(last_row["time"]))
 
 
 def params(spec: TrialSpec) -> dict[str, str]:
@@ -242,19 +242,20 @@ def note(
     return "\n".join(lines)
 
 
-def single_values(values: Mapping[str, float], last_row: Row) -> list[Point]:
+def single_values(values: Mapping[str, float], seconds: float) -> list[Point]:
     """Return the finite values as points at step 0, so that the UI draws bars.
 
     Args:
         values: by the names of their metrics, each once in a trial.
-        last_row: the last row of ``updates.csv``, for the time.
+        seconds: the time of the points. Of several points at one step MLflow shows the one with the latest
+            time, so a value that is sent again needs a later one.
     """
-    return _points_at(0, values, last_row)
+    return _points_at(0, values, seconds)
 
 
-def _points_at(step: int, values: Mapping[str, float], row: Row) -> list[Point]:
-    """Return the finite values as points at the time of a row of ``updates.csv``."""
-    milliseconds = round(float(row["time"]) * 1000)
+def _points_at(step: int, values: Mapping[str, float], seconds: float) -> list[Point]:
+    """Return the finite values as points at a step and a time."""
+    milliseconds = round(seconds * 1000)
     return [
         Point(key, value, milliseconds, step) for key, value in sorted(values.items()) if math.isfinite(value)
     ]

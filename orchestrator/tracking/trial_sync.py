@@ -6,6 +6,7 @@ was damaged), MLflow has points that no longer exist. Then the run is deleted an
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -184,7 +185,7 @@ def _points_to_send(
         row = _last_row(data, position)
         last = final_points(trial.updates(), trial.evaluation(), row)
         if outcome is not None:
-            last += single_values(outcome.metrics, row)
+            last += single_values(outcome.metrics, time.time())  # measured again: the newest counts
         summary = {point.key: point.value for point in last if point.key.startswith("summary/")}
         found, position = [*found, *last], replace(position, summary=summary)
     return found, position

@@ -1,13 +1,10 @@
 """The integral of the violations: its arithmetic, its anti-wind-up, and the steady error that it removes."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.constraints.violation_integral import ViolationIntegral
-from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
+from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, solve_dual
 
 BOTH = np.array([0, 1])
 LARGE = np.array([100.0, 100.0])
@@ -40,7 +37,7 @@ def test_it_does_not_grow_after_a_step_that_did_not_meet_the_constraint() -> Non
     integral.note_step(BOTH, np.array([True, False]))
     assert integral.corrected(BOTH, np.array([1.0, 1.0]), LARGE).tolist() == [1.5, 2.0]
     integral.note_step(BOTH, np.array([True, False]))
-    assert integral.corrected(BOTH, np.array([-0.4, 0.0]), LARGE).tolist() == pytest.approx([-0.1, 1.0])
+    assert integral.corrected(BOTH, np.array([-0.4, 0.2]), LARGE).tolist() == pytest.approx([-0.1, 1.3])
 
 
 def test_a_restored_integral_goes_on_exactly() -> None:
@@ -52,14 +49,21 @@ def test_a_restored_integral_goes_on_exactly() -> None:
     assert first.corrected(BOTH, new, LARGE).tolist() == second.corrected(BOTH, new, LARGE).tolist()
 
 
-@pytest.mark.parametrize("solve", [solve_dual, projected_step])
-def test_unmet_says_which_constraint_the_trust_region_is_too_small_for(
-    solve: Callable[[StepProblem], DualSolution],
-) -> None:
+def test_a_limit_of_0_that_is_kept_forgets_old_violations() -> None:
+    integral = ViolationIntegral(0.5, 1)
+    integral.corrected(BOTH[:1], np.array([2.0]), LARGE[:1])
+    assert integral.values.tolist() == [1.0]
+    for expected in (0.5, 0.25):
+        assert integral.corrected(BOTH[:1], np.array([0.0]), LARGE[:1]).tolist() == [expected]
+
+
+@pytest.mark.parametrize("mixed", [-2.0, -0.2, 0.0])
+def test_a_constraint_is_beyond_reach_if_no_step_of_the_trust_region_meets_it(mixed: float) -> None:
     # A step of length sqrt(2 * 0.5) = 1 along b, of length 2, decreases the cost by at most 2.
     for violation, expected in [(-5.0, False), (0.0, False), (1.9, False), (2.1, True)]:
-        problem = StepProblem(1.0, np.array([-2.0]), np.array([[4.0]]), np.array([violation]), 0.5)
-        assert problem.unmet(solve(problem)).tolist() == [expected]
+        problem = StepProblem(1.0, np.array([mixed]), np.array([[4.0]]), np.array([violation]), 0.5)
+        assert problem.beyond_reach().tolist() == [expected]
+        assert (solve_dual(problem).case is StepCase.RECOVERY) == expected
 
 
 @pytest.mark.parametrize(("gain", "settled"), [(0.0, 0.6), (0.1, 0.0)])
@@ -80,7 +84,7 @@ def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_rea
         )
         solution = solve_dual(problem)
         assert solution.case is StepCase.CONSTRAINED
-        integral.note_step(BOTH[:1], problem.unmet(solution))
+        integral.note_step(BOTH[:1], problem.beyond_reach())
         predicted = problem.after(solution) - problem.violations
         cost += 0.3 + 0.5 * float(predicted[0])
     assert cost - limit == pytest.approx(settled, abs=1e-6)
