@@ -143,7 +143,7 @@ class CPOConfig(TrustRegionConfig):
 
     paper: ClassVar[Mapping[str, Any]] = {**TrustRegionConfig.paper, "violation_integral_gain": 0.0}
 
-    violation_integral_gain: ViolationIntegralGain = 0.1
+    violation_integral_gain: ViolationIntegralGain = 0.03
 
 
 class PCPOConfig(TrustRegionConfig):
