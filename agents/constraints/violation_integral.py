@@ -2,15 +2,15 @@
 
 A constrained trust-region step solves b.x + c <= 0: c is the violation, b.x the predicted change of the
 cost. Both come from one rollout, and the step follows the noise of b. So the cost falls by less than
-predicted, and it settles above the limit, where the realised fall balances the rise that the rest of the step
+predicted. It settles above the limit, where the realised fall balances the rise that the rest of the step
 causes. An integral term removes this steady error, as in every controller:
 
     I <- max(I + K min(c, e), 0),  and the step solves b.x + c + I <= 0.
 
 e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost, bounds what a violation adds. An
 episode costs at least 0, so c is at least -d, but an untrained policy may exceed the limit by any amount.
-Without the bound a few such updates would add more than hundreds of later ones could subtract, and an agent
-that has long kept the limit would still avoid all cost. The multipliers' integral is bounded likewise
+Without the bound a few such updates would add more than hundreds of later ones could subtract. An agent that
+has long kept the limit would still avoid all cost. The multipliers' integral is bounded likewise
 (``multiplier_rules.pid``).
 
 If the last step could not meet its constraint, a larger I would change nothing, and would delay the return to
