@@ -197,8 +197,10 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
 
     Args:
         stop: the event of the launch.
-        say: called on the first signal.
+        say: called on the first signal, in a thread of its own: the signal may have interrupted the main
+            thread while it printed, and a stream cannot be written to within its own write.
     """
+    speaker = threading.Thread(target=say, name="recrl-stopping", daemon=True)
 
     def handle(number: int, frame: FrameType | None) -> None:
         if stop.is_set():
@@ -206,7 +208,7 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
                 signal.signal(signum, signal.SIG_DFL)
             raise KeyboardInterrupt
         stop.set()
-        say()
+        speaker.start()
 
     signals = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, handle) for number in signals}
@@ -215,6 +217,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        if speaker.is_alive():
+            speaker.join()
 
 
 def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) -> None:

@@ -410,6 +410,7 @@ SHIPPED = {
     "rivergrid": 100,
     "safety-gym": 150,
     "safety-gym-agents": 27,
+    "safety-gym-curricula": 54,
     "safety-gym-small": 36,
     "velocity": 180,
     "velocity-curricula": 180,

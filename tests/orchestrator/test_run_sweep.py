@@ -240,7 +240,17 @@ def test_one_signal_stops_gently_and_a_second_at_once(number: signal.Signals) ->
     with pytest.raises(KeyboardInterrupt), stopping_on_signals(stop, lambda: said.append("stopping")):
         os.kill(os.getpid(), number)
         assert stop.wait(10.0)
-        assert said == ["stopping"]
         os.kill(os.getpid(), number)
         threading.Event().wait(10.0)
+    assert said == ["stopping"]
     assert signal.getsignal(number) is before
+
+
+def test_what_is_said_of_a_signal_does_not_interrupt_a_write_of_the_main_thread() -> None:
+    """A buffered stream raises if a handler writes to it while the interrupted write still holds it."""
+    stop, threads = threading.Event(), []
+    with stopping_on_signals(stop, lambda: threads.append(threading.current_thread())):
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.wait(10.0)
+    assert len(threads) == 1
+    assert threads[0] is not threading.main_thread()

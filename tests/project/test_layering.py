@@ -53,7 +53,7 @@ ADAPTERS = {
     "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
     "numba": r"environments\.simulation\.machine_code",
     "ray": r"orchestrator\.ray\..*",
-    "mlflow": r"orchestrator\.tracking\.(client|read|runs|sweep_sync|trial_sync)",
+    "mlflow": r"orchestrator\.tracking\.(client|export_download|mlflow_runs|sweep_sync|trial_sync)",
     "matplotlib": r"analysis\..*",
     "yaml": r"orchestrator\.located_yaml",
     "rich": r"orchestrator\.cli\..*",
