@@ -197,8 +197,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
 
     Args:
         stop: the event of the launch.
-        say: called on the first signal, in a thread of its own: the signal may have interrupted the main
-            thread while it printed, and a stream cannot be written to within its own write.
+        say: called on the first signal, in a thread of its own. The signal may have interrupted the main
+            thread while it printed, and a stream refuses a write within its own write.
     """
     speaker = threading.Thread(target=say, name="recrl-stopping", daemon=True)
 
