@@ -28,8 +28,8 @@ class FinalOutcome:
     """Outcome of one final policy (stochastic, without learning).
 
     Attributes:
+        trial_id: of the trial.
         group: labels of task, agent and curriculum.
-        seed: of the trial.
         episode_return: exact where ``exact``, else a mean over episodes.
         costs: episode costs, likewise, [k].
         limits: d_d, [k].
@@ -38,8 +38,8 @@ class FinalOutcome:
         exact: whether the values were computed, not sampled.
     """
 
+    trial_id: str
     group: tuple[str, str, str]
-    seed: int
     episode_return: float
     costs: tuple[float, ...]
     limits: tuple[float, ...]
@@ -77,17 +77,14 @@ class FinalOutcomes:
         self._store = store
         self._path = store.figures_folder / FILE_NAME
         self._mark = ""
-        self._found: dict[tuple[str, str, str, int], FinalOutcome] = {}
+        self._found: dict[
+            str, FinalOutcome
+        ] = {}  # by trial id, as labels may be those of an earlier grid
 
     def of(self, spec: TrialSpec) -> FinalOutcome | None:
         """Return the outcome of a trial; None before the file has it."""
         self._refresh()
-        method = spec.method.label
-        for label in (method, f"{method} [{spec.group}]"):  # the report adds the group to equal labels
-            found = self._found.get((spec.task.label, spec.agent.label, label, spec.seed))
-            if found is not None:
-                return found
-        return None
+        return self._found.get(spec.trial_id)
 
     def all(self) -> Sequence[FinalOutcome]:
         """Return all outcomes, in the report's order."""
@@ -117,7 +114,7 @@ class FinalOutcomes:
         except (KeyError, TypeError, ValueError):  # another version wrote it, or it is being written
             return
         self._mark = mark
-        self._found = {(*it.group, it.seed): it for it in outcomes}
+        self._found = {outcome.trial_id: outcome for outcome in outcomes}
 
 
 def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
@@ -176,8 +173,8 @@ def _verdicts(seeds: Sequence[FinalOutcome]) -> str:
 def _outcome(row: Mapping[str, str]) -> FinalOutcome:
     costs = sorted(name for name in row if re.fullmatch(r"cost_\d+", name) and row[name])
     return FinalOutcome(
+        trial_id=row["trial_id"],
         group=(row["task"], row["agent"], row["method"]),
-        seed=int(row["seed"]),
         episode_return=float(row["episode_return"]),
         costs=tuple(float(row[name]) for name in costs),
         limits=tuple(float(row[f"deploy_limit_{name.removeprefix('cost_')}"]) for name in costs),

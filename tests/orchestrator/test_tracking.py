@@ -518,12 +518,16 @@ def test_figures_are_artifacts_of_the_parent_and_survive_a_rebuild(write: Callab
     assert [file.path for file in connect(store).list_artifacts(parent, "figures")] == ["figures/curves.png"]
 
 
-OUTCOMES = """\
-task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal
-river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False
-river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True
-river-a,cpo,dynamic,0,stochastic,True,15.0,9.0625,5.0,False,False
-"""
+def write_outcomes(store: SweepStore, *, dynamic_cost: float = 9.0625) -> None:
+    """Write the table beside the report: NONE is solved, DYNAMIC infeasible."""
+    none, dynamic = (trial_titled(store, title).spec.trial_id for title in (NONE, DYNAMIC))
+    store.figures_folder.mkdir(exist_ok=True)
+    (store.figures_folder / "outcomes.csv").write_text(f"""\
+trial_id,task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal
+{none},river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False
+{none},river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True
+{dynamic},river-a,cpo,dynamic,0,stochastic,True,15.0,{dynamic_cost},5.0,False,False
+""")
 
 
 def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]) -> None:
@@ -532,8 +536,7 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
     uri = tracking_uri(store, None)
     sync(store, uri)
     assert "final/return" not in runs(store)[NONE].data.metrics
-    store.figures_folder.mkdir()
-    (store.figures_folder / "outcomes.csv").write_text(OUTCOMES)
+    write_outcomes(store)
     (store.figures_folder / "report.html").write_text("<p>")
     sync(store, uri)
     shown = runs(store)
@@ -554,6 +557,29 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
     assert sync(store, uri).points == 0
     sync(store, uri, rebuild=True)
     assert runs(store)[NONE].data.metrics["final/cost_0"] == 5.0
+
+
+def test_of_outcomes_measured_twice_the_newest_is_shown(write: Callable[..., SweepStore]) -> None:
+    """Of equal steps MLflow shows the latest time, and of equal times the largest value."""
+    store = write()
+    uri = tracking_uri(store, None)
+    for cost in (9.0625, 7.5):
+        write_outcomes(store, dynamic_cost=cost)
+        sync(store, uri)
+    assert runs(store)[DYNAMIC].data.metrics["final/cost_0"] == 7.5
+
+
+def test_a_trial_of_an_earlier_grid_does_not_get_the_outcome_of_its_namesake(
+    write: Callable[..., SweepStore],
+) -> None:
+    store = write()
+    write_outcomes(store)
+    path = store.figures_folder / "outcomes.csv"
+    path.write_text(path.read_text().replace(trial_titled(store, DYNAMIC).spec.trial_id, "0123456789"))
+    sync(store, tracking_uri(store, None))
+    shown = runs(store)
+    assert "final/cost_0" not in shown[DYNAMIC].data.metrics
+    assert shown[NONE].data.metrics["final/cost_0"] == 5.0
 
 
 GRID = """\
