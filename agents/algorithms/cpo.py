@@ -4,6 +4,9 @@ Each update takes one trust-region step. Its direction is from ``recrl.agents.tr
 search shortens it until the true surrogates and the true KL agree with the linear model. Cost advantages are
 centred and not scaled, and the constraints enter in cost per step, so that b and c have one unit.
 
+Costs fall by less than the linear model predicts. So an integral of the violations is added to them, unless
+its gain is 0, as in the source (``recrl.agents.constraints.violation_integral``).
+
 If no episode finished, nothing is known about the constraints and the policy does not change. A cost whose
 limit is infinite is no constraint.
 

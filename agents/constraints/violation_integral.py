@@ -5,7 +5,7 @@ cost. Both come from one rollout, and the step follows the noise of b. So the co
 predicted. It settles above the limit, where the realised fall balances the rise that the rest of the step
 causes. An integral term removes this steady error, as in every controller:
 
-    I <- max(I + K min(c, e), 0),  and the step solves b.x + c + I <= 0.
+    I <- max(I + K min(c, e), 0),    if c = 0: I <- (1 - K) I;    the step solves b.x + c + I <= 0.
 
 e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost, bounds what a violation adds. An
 episode costs at least 0, so c is at least -d, but an untrained policy may exceed the limit by any amount.
@@ -14,8 +14,8 @@ has long kept the limit would still avoid all cost. The multipliers' integral is
 (``multiplier_rules.pid``).
 
 If the last step could not meet its constraint, a larger I would change nothing, and would delay the return to
-the reward. Then I does not grow (anti-wind-up). Under a limit of 0 c is never negative, so there I falls by
-the fraction K while the limit is kept.
+the reward. Then I does not grow (anti-wind-up). Under a limit of 0 c is never negative: there I falls only by
+the second rule, while c is 0.
 
 c, e and I are in the unit of the surrogates, cost per step, so K has no unit. K = 0 is the published
 algorithm.

@@ -1,7 +1,7 @@
 """The page of charts that a sweep's experiment opens with: its sections, columns and charts.
 
-The UI makes one chart for each metric by itself. While a policy learns, this view has each cost and its limit
-in one chart instead. Elsewhere both are neighbours, because the UI sorts a section's charts by name.
+Of its own, the UI draws one chart a metric. This view draws each cost of the training and the deployment
+phase in one chart with its limit. On other pages their charts are neighbours, because a section is sorted by name.
 """
 
 from __future__ import annotations

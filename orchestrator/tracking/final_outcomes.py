@@ -77,9 +77,7 @@ class FinalOutcomes:
         self._store = store
         self._path = store.figures_folder / FILE_NAME
         self._mark = ""
-        self._found: dict[
-            str, FinalOutcome
-        ] = {}  # by trial id, as labels may be those of an earlier grid
+        self._found: dict[str, FinalOutcome] = {}  # by trial id, as labels may be those of an earlier grid
 
     def of(self, spec: TrialSpec) -> FinalOutcome | None:
         """Return the outcome of a trial; None before the file has it."""

@@ -105,3 +105,31 @@ def test_violations_enter_in_cost_per_step() -> None:
     assert active.index.tolist() == [0, 2]
     assert active.violations.tolist() == pytest.approx([0.05, -0.0005])
     assert active.sizes.tolist() == pytest.approx([0.065, 0.001])
+
+
+def updates(gain: float, gap: float, count: int) -> list[dict[str, float]]:
+    """The metrics of updates of one rule, each from the same samples and with the same gap of cost 0."""
+    rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=gain), 2)
+    constraints = Constraints(np.array([10.0, 10.0]), np.array([gap, -9.0]), np.zeros(2), LENGTH)
+    metrics = []
+    for _ in range(count):
+        policy, batch, advantages = sampled(SPACES[1])
+        experience = Experience.of(policy, batch, advantages, constraints)
+        metrics.append(improve_and_measure(rule, policy, experience, np.random.default_rng(0)))
+    return metrics
+
+
+def test_the_step_decreases_the_cost_by_the_violation_plus_the_integral() -> None:
+    violation = 0.05 / LENGTH
+    [published] = updates(0.0, 0.05, 1)
+    first, second = updates(1.0, 0.05, 2)
+    assert (published["violation_integral_0"], first["violation_integral_0"]) == (0.0, pytest.approx(0.05))
+    for metrics, multiple in ((published, 1.0), (first, 2.0), (second, 3.0)):
+        assert StepCase(int(metrics["case"])) is StepCase.CONSTRAINED
+        assert metrics["surrogate_cost_0"] == pytest.approx(-multiple * violation, rel=0.1)
+
+
+def test_the_integral_does_not_grow_while_steps_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recrl.agents.algorithms.cpo.acceptance", lambda *_: lambda: False)
+    values = [metrics["violation_integral_0"] for metrics in updates(1.0, 0.05, 3)]
+    assert values == pytest.approx([0.05, 0.05, 0.05])

@@ -71,7 +71,7 @@ def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_rea
     gain: float, settled: float
 ) -> None:
     # Each update the rest of the step raises the cost by 0.3, unpredicted, and half the predicted fall comes
-    # true: J' = J + 0.3 - (c + I) / 2. Without I it stands still at c = 0.6.
+    # true: J' = J + 0.3 - (c + I) / 2. Without I the cost settles at c = 0.6.
     integral = ViolationIntegral(gain, 1)
     cost, limit = 3.0, 2.0
     for _ in range(400):
