@@ -1,7 +1,8 @@
 """The page of charts that a sweep's experiment opens with: its sections, columns and charts.
 
 Of its own, the UI draws one chart a metric. This view draws each cost of the training and the deployment
-phase in one chart with its limit. On other pages their charts are neighbours, because a section is sorted by name.
+phase in one chart with its limit. On other pages their charts are neighbours, because a section is sorted by
+name.
 """
 
 from __future__ import annotations
