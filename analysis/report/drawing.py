@@ -186,7 +186,8 @@ def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
         lines += _list(verdict_texts.explanation(judged))
     else:
         lines.append(verdict_texts.NO_VERDICT)
-    lines += ["", "## Warnings", "", _count(sweep), "", *_list(missing(sweep)), "", "## Figures", ""]
+    lines += ["", "## Trials and warnings", "", _count(sweep), "", *_list(missing(sweep))]
+    lines += ["", "## Figures", ""]
     for path in _full_sizes(drawn):
         lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
     for it in tables.shown:
@@ -299,7 +300,7 @@ def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     further = {path: file for path, file in figures.items() if path not in first}
     settings = html_page.verbatim(sweep.grid) + html_page.verbatim(_settings(sweep))
     sections = [
-        Section("Warnings", html_page.items(sentences, kind="failed" if failed else "plain")),
+        Section("Trials and warnings", html_page.items(sentences, kind="failed" if failed else "plain")),
         Section("Figures", _figures(first)),
         *([Section("More figures", _figures(further), folded=True)] if further else []),
         *(

@@ -54,7 +54,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
     assert text[2] == "- river-a: none of 2 final policies (1 agent x 1 curriculum x 2 seeds) solves it."
     assert text[6].startswith("| river-a | my cpo | none | feasible | ")
     assert "4 trials: 1 running, 2 complete, 1 failed." in text
-    assert text.index("## Warnings") < text.index("## Figures") < text.index("## Provenance")
+    assert text.index("## Trials and warnings") < text.index("## Figures") < text.index("## Provenance")
     assert (
         "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
     )
