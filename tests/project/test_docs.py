@@ -111,3 +111,14 @@ def test_no_page_quotes_a_test_that_is_not_there() -> None:
     quoted = re.findall(r"`(?:test_\w+\.py::)?(test_\w+)`", (DOCS / "faults.md").read_text())
     assert quoted
     assert not [name for name in quoted if f"def {name}(" not in tests]
+
+
+ELSEWHERE = {".venv", "build", "docs", "runs"}  # not ours, or checked by Sphinx
+OUTSIDE = [page for page in sorted(ROOT.rglob("*.md")) if not ELSEWHERE & set(page.relative_to(ROOT).parts)]
+
+
+@pytest.mark.parametrize("page", OUTSIDE, ids=label)
+def test_relative_links_outside_the_site_lead_to_files(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    targets = [target for target in re.findall(r"\]\(([^)\s#]+)", text) if "://" not in target]
+    assert not [target for target in targets if not (page.parent / target).exists()]
