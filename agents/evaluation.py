@@ -3,6 +3,9 @@
 Episodes are counted per environment, not in the order in which they end. The first ones to end would be
 biased to short episodes, which on RiverGrid are good ones.
 
+Nothing learns here: networks and statistics of observations change only in
+``recrl.agents.learning.actor_critic.ActorCritic.update``.
+
 Notation: B environments, k costs, n observation components.
 """
 

@@ -1,4 +1,4 @@
-"""Constrained Markov decision processes: the vocabulary, RiverGrid, Safety Gym's tasks, exact solvers.
+"""Constrained Markov decision processes: RiverGrid, Safety Gym, velocity tasks, users' tasks, exact solvers.
 
 Depends on Gymnasium, not on torch. Import the modules by name; this file imports nothing.
 """

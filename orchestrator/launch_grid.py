@@ -21,7 +21,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.file_models import Resources
-from recrl.orchestrator.grid.plan import Plan, trials_at_once
+from recrl.orchestrator.launch_plan import Plan, trials_at_once
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.run_sweep import (
@@ -51,7 +51,7 @@ class LaunchOptions:
     Attributes:
         root: the folder of all sweeps.
         storage: the address of an object store that keeps the sweep, or None.
-        only: the selected trials, see ``selection.select``; all by default.
+        only: the selected trials, see ``only_selection.select``; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again.
         rerun_changed: whether trials that ran other code than is installed now are run again.

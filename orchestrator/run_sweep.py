@@ -1,8 +1,8 @@
-"""A launch runs the trials of a grid that are not complete on disk.
+"""A launch runs the trials of a grid that its plan (``launch_plan``) selects.
 
 First run, resume after a crash, retry of failed trials and more seeds are the same call. A lock permits one
-launch at a time. The plan selects the trials, the executor runs them, and the results are read from the
-files.
+launch at a time. The plan compares the grid with the files, the executor runs the trials, and the results
+are read from the files.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
-from recrl.orchestrator.grid.plan import Plan, PlannedAction, make_plan
-from recrl.orchestrator.grid.selection import select
+from recrl.orchestrator.grid.only_selection import select
+from recrl.orchestrator.launch_plan import Plan, PlannedAction, make_plan
 from recrl.orchestrator.provenance.versions import collect
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
@@ -79,7 +79,7 @@ class SweepRunSettings:
         grid: the checked grid.
         place: of the sweep's files.
         executor: runs the trials.
-        only: the selected trials, see ``selection.select``; all by default.
+        only: the selected trials, see ``only_selection.select``; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again.
         rerun_changed: whether trials that ran other code than is installed now are run again.

@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_type_hints
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from recrl.orchestrator.redaction import printable
-from recrl.orchestrator.validation import as_written, sentences
+from recrl.orchestrator.validation_sentences import as_written, sentences
 
 LONGEST_NAME = 200
 _NAME = re.compile(r"[^\W_.-][^/\\\x00-\x1f]{0,127}")

@@ -44,7 +44,7 @@ from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.untrusted import LimitValues, checked_name
-from recrl.orchestrator.validation import sentences
+from recrl.orchestrator.validation_sentences import sentences
 
 SUFFIX = ".zip"
 FORMAT = 2

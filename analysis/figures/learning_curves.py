@@ -1,4 +1,4 @@
-"""The paper's figures from a sweep's data frames, as matplotlib figures.
+"""The paper's Figures 3, 4 and 5 from a sweep's data frames, as matplotlib figures.
 
 ``learning_curves`` is Figures 3 and 4 (one per agent): return and cost over training, and magnified over
 deployment. ``curricula`` is Figure 5: the limits in force. Trials are averaged on a common grid of

@@ -14,7 +14,7 @@ from typing import NoReturn
 from recrl.orchestrator.cli import requests
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.requests import VIDEOS
-from recrl.orchestrator.grid.selection import number_of_pairs
+from recrl.orchestrator.grid.only_selection import number_of_pairs
 
 DESCRIPTION = """\
 Run constrained reinforcement learning under cost-limit curricula: every task x agent x method x seed of a

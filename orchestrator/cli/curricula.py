@@ -17,9 +17,9 @@ from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.grid.selection import parse_only, select
+from recrl.orchestrator.grid.only_selection import parse_only, select
 from recrl.orchestrator.spec import Choice, TrialState
-from recrl.orchestrator.validation import sentences
+from recrl.orchestrator.validation_sentences import sentences
 from recrl.teachers.registry import find_teacher, teacher_config
 
 

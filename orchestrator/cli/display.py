@@ -16,7 +16,7 @@ from rich.text import Text
 
 from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.plan import Estimate, Plan, PlannedAction
+from recrl.orchestrator.launch_plan import Estimate, Plan, PlannedAction
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, display_status
 

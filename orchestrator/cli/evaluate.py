@@ -11,7 +11,7 @@ from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.selection import parse_only, select
+from recrl.orchestrator.grid.only_selection import parse_only, select
 from recrl.orchestrator.provenance.code_changes import has_other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import tracking_uri

@@ -21,9 +21,9 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
-from recrl.orchestrator.grid.plan import Plan
-from recrl.orchestrator.grid.selection import parse_only
+from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, LaunchOutcome, launch_grid
+from recrl.orchestrator.launch_plan import Plan
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.run_sweep import SweepResult
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress

@@ -14,9 +14,9 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
-from recrl.orchestrator.grid.plan import Plan, estimate, kind_of, make_plan, unmeasured
-from recrl.orchestrator.grid.selection import parse_only
+from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import room
+from recrl.orchestrator.launch_plan import Plan, estimate, kind_of, make_plan, unmeasured
 from recrl.orchestrator.provenance.code_changes import other_code_sentence
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialState

@@ -22,7 +22,7 @@ from recrl.orchestrator.files.curriculum_warnings import (
 )
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.plan import make_plan
+from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.run_sweep import REQUEST_SECONDS
 from recrl.orchestrator.spec import TrialSpec, TrialState

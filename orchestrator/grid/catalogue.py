@@ -29,7 +29,7 @@ from recrl.orchestrator.grid.file_models import (
     TaskEntry,
     TrainLimits,
 )
-from recrl.orchestrator.validation import model_in
+from recrl.orchestrator.validation_sentences import model_in
 from recrl.teachers.registry import TEACHERS, find_teacher
 
 REQUIRED = "required"

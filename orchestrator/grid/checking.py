@@ -1,4 +1,4 @@
-"""The grid file: the trials of a sweep, checked completely before any of them starts.
+"""Checks of a grid file: all mistakes at once, each with its line, before any trial starts.
 
     name: rivergrid
     tasks:
@@ -42,7 +42,13 @@ from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, Sw
 from recrl.orchestrator.grid.problem_list import TASK_MARK, ProblemList
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice
-from recrl.orchestrator.validation import NotJsonError, as_written, misspells, require_json, sentences
+from recrl.orchestrator.validation_sentences import (
+    NotJsonError,
+    as_written,
+    misspells,
+    require_json,
+    sentences,
+)
 from recrl.teachers.registry import teacher_config
 
 MAX_TRIALS = 100_000

@@ -23,7 +23,7 @@ from pydantic import (
 
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.untrusted import PlainText, ShortText
-from recrl.orchestrator.validation import as_written
+from recrl.orchestrator.validation_sentences import as_written
 
 MAX_SEEDS = 10_000
 MAX_STEPS = 10**12

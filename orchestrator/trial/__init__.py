@@ -1,1 +1,1 @@
-"""One trial: its specification, the training loop, saved policies and videos."""
+"""One trial: the training loop, its attempts, saved policies and videos (its specification: ``spec.py``)."""

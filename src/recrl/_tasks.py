@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import NotDrawnError, make_drawn, make_vector, options_model
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.validation import sentences
+from recrl.orchestrator.validation_sentences import sentences
 
 if TYPE_CHECKING:
     import gymnasium

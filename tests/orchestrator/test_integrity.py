@@ -23,7 +23,7 @@ from recrl.orchestrator.files.row_files import Extent, RowFile
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.grid.plan import PlannedAction, make_plan
+from recrl.orchestrator.launch_plan import PlannedAction, make_plan
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace

@@ -15,7 +15,7 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.grid.plan import Plan, PlannedAction
+from recrl.orchestrator.launch_plan import Plan, PlannedAction
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep, stopping_on_signals
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace

@@ -13,7 +13,7 @@ from recrl.orchestrator.cli.output import print_table
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.grid.plan import make_plan
+from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import (
     SILENCE_SECONDS,

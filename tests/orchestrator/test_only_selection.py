@@ -4,7 +4,7 @@ import pytest
 
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.grid.selection import number_of_pairs, parse_only, select
+from recrl.orchestrator.grid.only_selection import number_of_pairs, parse_only, select
 
 GRID = b"""\
 name: selection

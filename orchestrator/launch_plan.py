@@ -14,7 +14,7 @@ from enum import StrEnum
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.grid.selection import select
+from recrl.orchestrator.grid.only_selection import select
 from recrl.orchestrator.provenance.code_changes import has_other_code
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 
@@ -140,7 +140,7 @@ def make_plan(
     Args:
         specs: the trials of the grid, all of them.
         store: of the sweep; need not exist.
-        only: the selected trials, see ``selection.select``; all by default.
+        only: the selected trials, see ``only_selection.select``; all by default.
         retry_failed: whether failed trials are tried again.
         rerun_damaged: whether damaged trials that were complete or failed are run again; other damaged ones
             always are. If true, every file is read and its digest checked.

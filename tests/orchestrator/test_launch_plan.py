@@ -6,7 +6,7 @@ import pytest
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.grid.plan import PlannedAction, estimate, make_plan, trials_at_once
+from recrl.orchestrator.launch_plan import PlannedAction, estimate, make_plan, trials_at_once
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 GRID = b"""\
