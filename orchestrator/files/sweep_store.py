@@ -31,6 +31,9 @@ writes a checkpoint with the files' lengths and digests, then ``state.json``. Af
 restart truncates the files to the newest intact checkpoint, and no row is duplicated. Readers use committed
 bytes only, and check them against the record's digests.
 
+``sweep.json`` and ``trials.jsonl`` belong together if they have one creation time. So a folder may be renamed
+or copied: the sweep then has the folder's name.
+
 A file that is shorter than its committed length, or whose committed bytes have changed, is damaged. Then the
 trial's status is DAMAGED and its data are not used. An attempt moves unusable or replaced files to
 ``aside/``.
@@ -115,8 +118,8 @@ class SweepStore:
         """
         try:
             info = read_sealed(self.info_path, version=INFO_FORMAT)
-            if info.get("name") != self.name:
-                raise DamagedError(f"{self.info_path.name} is that of another sweep, {info.get('name')}")
+            if info["name"] != self.name and self._header().get("created") != info["created"]:
+                raise DamagedError(f"{self.info_path.name} is that of another sweep, {info['name']}")
             return info
         except FileNotFoundError:
             return {}
@@ -190,9 +193,18 @@ class SweepStore:
         if Extent.of(lines).sha256 != told["lines"]:
             raise DamagedError(f"{name} is not what was written: its checksum differs")
         created = self._created()
-        if told["name"] != self.name or (created and told["created"] not in (None, created)):
+        both_known = created is not None and told["created"] is not None
+        if told["created"] != created if both_known else told["name"] != self.name:
             raise DamagedError(f"{name} is not of this sweep, or {self.info_path.name} is not")
         return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
+
+    def _header(self) -> dict[str, Any]:
+        """Return the first line of ``trials.jsonl``; empty if it is missing or damaged."""
+        try:
+            first = read_whole(self.specs_path).partition(b"\n")[0]
+            return unsealed(first, self.specs_path.name, version=SPECS_FORMAT)
+        except (FileNotFoundError, StorageError):
+            return {}
 
     def _created(self) -> float | None:
         """Time of the sweep's first launch, seconds since 1970; None if unknown."""

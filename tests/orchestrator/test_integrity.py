@@ -355,6 +355,29 @@ def test_a_file_where_a_trials_folder_should_be_is_moved_aside(
     assert [path.read_text() for path in (store.folder / "aside").iterdir()] == ["not a folder"]
 
 
+def test_a_sweep_whose_folder_was_renamed_is_read_under_its_new_name(store: SweepStore) -> None:
+    run(store)
+    renamed = SweepStore(store.folder.parent, "renamed")
+    store.folder.rename(renamed.folder)
+    assert renamed.damages() == []
+    assert [spec.trial_id for spec in renamed.specs()] == [spec.trial_id for spec in SPECS]
+    assert main(["check", "renamed"]) == ExitCode.OK
+
+
+@pytest.mark.parametrize("file", ["info_path", "specs_path"])
+def test_one_file_of_another_sweep_is_damage_whatever_the_sweeps_are_called(
+    store: SweepStore, file: str
+) -> None:
+    run(store)
+    other = SweepStore(store.folder.parent, "other")
+    shutil.copytree(store.folder, other.folder)
+    other.write_info({**other.info(), "name": "other", "created": 1.0})
+    other.write_specs(SPECS, store.grid_path.read_bytes())
+    assert other.damages() == []
+    shutil.copy(getattr(other, file), getattr(store, file))
+    assert store.damages()
+
+
 @pytest.mark.parametrize(
     ("name", "code", "sentence"),
     [
