@@ -23,7 +23,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.algorithms.own_options import CPOConfig
+from recrl.agents.algorithms.own_options import CPOConfig, PCPOConfig
 from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
@@ -87,56 +87,6 @@ class LocalModel:
         return self._surrogates(distribution).numpy(force=True), float(divergence)
 
 
-def constrained_step(
-    policy: StochasticPolicy,
-    experience: Experience,
-    solve: Callable[[StepProblem], DualSolution],
-    config: TrustRegionConfig,
-    generator: np.random.Generator,
-    *,
-    integral: ViolationIntegral,
-) -> dict[str, float]:
-    """Take one step in the trust region; skip it if nothing is known about the constraints.
-
-    Args:
-        policy: changed in place.
-        experience: the samples.
-        solve: the step of the linearised problem.
-        config: the trust region, conjugate gradients and line search.
-        generator: for the choice of the metric's samples.
-        integral: of the violations; changed in place.
-
-    Returns:
-        Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages,
-        ``violation_integral_i`` in episode cost.
-    """
-    constraints = experience.constraints
-    multipliers = np.full_like(constraints.limits, NAN)
-    if not constraints.known:
-        stayed = {"policy_steps": 0.0, "case": NAN, "line_search_steps": NAN, "step_norm": 0.0}
-        return {**stayed, **indexed("multiplier", multipliers), **indexed("violation_integral", multipliers)}
-    centred = experience.advantages - experience.advantages.mean(axis=0)
-    centred[:, 0] /= reward_spread(centred)  # does not change the step, only the unit of the multipliers
-    model = LocalModel(policy, experience, centred)
-    active = ActiveConstraints.of(constraints)
-    active = replace(active, violations=integral.corrected(active.index, active.violations, active.sizes))
-    metric = model.metric(config, generator)
-    problem, solved = linearise(model, active, metric, config)
-    solution = solve(problem)
-    is_acceptable = acceptance(model, active, solution, config.target_kl)
-    metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
-    rejected = metrics["policy_steps"] == 0.0
-    integral.note_step(active.index, problem.beyond_reach() | (rejected & (active.violations > 0.0)))
-    multipliers[:] = 0.0
-    multipliers[active.index] = solution.multipliers
-    return {
-        **metrics,
-        "case": float(solution.case),
-        **indexed("multiplier", multipliers),
-        **indexed("violation_integral", integral.values * constraints.episode_length),
-    }
-
-
 def linearise(
     model: LocalModel, active: ActiveConstraints, metric: FisherMetric, config: TrustRegionConfig
 ) -> tuple[StepProblem, Tensor]:
@@ -195,20 +145,62 @@ def acceptance(
 
 
 class ConstrainedPolicyOptimisation:
-    """The rule of ``cpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
+    """The rule of ``cpo`` and ``pcpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``.
 
-    def __init__(self, config: CPOConfig, num_costs: int) -> None:
-        self._config = config
+    Args:
+        config: the agent's settings.
+        num_costs: k.
+        solve: gives the step of the linear and quadratic model; ``solve_dual`` is CPO's.
+    """
+
+    def __init__(
+        self,
+        config: CPOConfig | PCPOConfig,
+        num_costs: int,
+        solve: Callable[[StepProblem], DualSolution] = solve_dual,
+    ) -> None:
+        self._config, self._solve = config, solve
         self._integral = ViolationIntegral(config.violation_integral_gain, num_costs)
         self.parts: dict[str, Stateful] = {"violation_integral": self._integral}
 
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one constrained trust-region step; skip it if nothing is known about the constraints."""
-        return constrained_step(
-            policy, experience, solve_dual, self._config, generator, integral=self._integral
-        )
+        """Take one step in the trust region; skip it if nothing is known about the constraints.
+
+        Returns:
+            Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages,
+            ``violation_integral_i`` in episode cost.
+        """
+        config, integral, constraints = self._config, self._integral, experience.constraints
+        multipliers = np.full_like(constraints.limits, NAN)
+        if not constraints.known:
+            stayed = {"policy_steps": 0.0, "case": NAN, "line_search_steps": NAN, "step_norm": 0.0}
+            return {
+                **stayed,
+                **indexed("multiplier", multipliers),
+                **indexed("violation_integral", multipliers),
+            }
+        centred = experience.advantages - experience.advantages.mean(axis=0)
+        centred[:, 0] /= reward_spread(centred)  # does not change the step, only the unit of the multipliers
+        model = LocalModel(policy, experience, centred)
+        active = ActiveConstraints.of(constraints)
+        active = replace(active, violations=integral.corrected(active.index, active.violations, active.sizes))
+        metric = model.metric(config, generator)
+        problem, solved = linearise(model, active, metric, config)
+        solution = self._solve(problem)
+        is_acceptable = acceptance(model, active, solution, config.target_kl)
+        metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
+        rejected = metrics["policy_steps"] == 0.0
+        integral.note_step(active.index, problem.beyond_reach() | (rejected & (active.violations > 0.0)))
+        multipliers[:] = 0.0
+        multipliers[active.index] = solution.multipliers
+        return {
+            **metrics,
+            "case": float(solution.case),
+            **indexed("multiplier", multipliers),
+            **indexed("violation_integral", integral.values * constraints.episode_length),
+        }
 
 
 def make_cpo(cmdp: CMDPSpec, config: CPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

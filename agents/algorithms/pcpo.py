@@ -21,13 +21,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from recrl.agents.algorithms.cpo import constrained_step
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.own_options import PCPOConfig
-from recrl.agents.constraints.violation_integral import ViolationIntegral
-from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.learning.policy_rule import Stateful
 from recrl.agents.trust_region.cpo_dual import (
     NO_INFLUENCE,
     DualSolution,
@@ -63,24 +59,7 @@ def projected_step(problem: StepProblem) -> DualSolution:
     return DualSolution(case, scale * reach, scale * weights, multipliers, ())
 
 
-class ProjectionBasedConstrainedPolicyOptimisation:
-    """The rule of ``pcpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
-
-    def __init__(self, config: PCPOConfig, num_costs: int) -> None:
-        self._config = config
-        self._integral = ViolationIntegral(config.violation_integral_gain, num_costs)
-        self.parts: dict[str, Stateful] = {"violation_integral": self._integral}
-
-    def improve(
-        self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
-    ) -> dict[str, float]:
-        """Take one projected step; skip it if nothing is known about the constraints."""
-        return constrained_step(
-            policy, experience, projected_step, self._config, generator, integral=self._integral
-        )
-
-
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """Make a new PCPO agent."""
-    rule = ProjectionBasedConstrainedPolicyOptimisation(config, cmdp.num_costs)
+    rule = ConstrainedPolicyOptimisation(config, cmdp.num_costs, projected_step)
     return fresh_agent(cmdp, config, seed, lambda _: rule)

@@ -9,6 +9,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 from scipy.optimize import nnls
 
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.crpo import (
     ConstraintRectifiedPolicyOptimisation,
     cost_step,
@@ -16,7 +17,7 @@ from recrl.agents.algorithms.crpo import (
     reward_step,
 )
 from recrl.agents.algorithms.own_options import CRPOConfig, PCPOConfig, TRPOLagConfig
-from recrl.agents.algorithms.pcpo import ProjectionBasedConstrainedPolicyOptimisation, projected_step
+from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.learning_batch import LearningBatch
@@ -111,9 +112,8 @@ def test_every_projected_step_stays_in_the_trust_region(num_costs: int) -> None:
 
 def rule_of(name: str, num_costs: int) -> PolicyRule:
     if name == "pcpo":
-        return ProjectionBasedConstrainedPolicyOptimisation(
-            PCPOConfig(target_kl=DELTA, violation_integral_gain=0.0), num_costs
-        )
+        config = PCPOConfig(target_kl=DELTA, violation_integral_gain=0.0)
+        return ConstrainedPolicyOptimisation(config, num_costs, projected_step)
     if name == "crpo":
         return ConstraintRectifiedPolicyOptimisation(CRPOConfig(target_kl=DELTA))
     return TRPOLagrangian(TRPOLagConfig(target_kl=DELTA), num_costs)
