@@ -79,6 +79,11 @@ class ActiveConstraints:
         length = constraints.episode_length
         return cls(index, constraints.gaps[index] / length, sizes / length)
 
+    def divided_by(self, units: Floats) -> ActiveConstraints:
+        """Return the constraints with each of the k costs divided by a unit, cost per step, [k]."""
+        own = units[self.index]
+        return ActiveConstraints(self.index, self.violations / own, self.sizes / own)
+
 
 @dataclass(frozen=True, eq=False)
 class Experience:

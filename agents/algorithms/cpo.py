@@ -1,8 +1,9 @@
 """Constrained policy optimisation (Achiam et al. 2017), for any small number of constraints.
 
 Each update takes one trust-region step. Its direction is from ``recrl.agents.trust_region.cpo_dual``. A line
-search shortens it until the true surrogates and the true KL agree with the linear model. Cost advantages are
-centred and not scaled, and the constraints enter in cost per step, so that b and c have one unit.
+search shortens it until the true surrogates and the true KL agree with the linear model. Advantages are
+centred, and each signal's are divided by their standard deviation. Violations per step are divided by the
+same numbers, so that b and c have one unit. So the step does not depend on the units of reward and costs.
 
 Costs fall by less than the linear model predicts. So an integral of the violations is added to them, unless
 its gain is 0, as in the source (``recrl.agents.constraints.violation_integral``).
@@ -28,7 +29,7 @@ from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import reward_spread
+from recrl.agents.learning.advantages import each_by_its_spread
 from recrl.agents.learning.distributions import Distribution, mean_divergence
 from recrl.agents.learning.learning_batch import to_tensor
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
@@ -181,11 +182,11 @@ class ConstrainedPolicyOptimisation:
                 **indexed("multiplier", multipliers),
                 **indexed("violation_integral", multipliers),
             }
-        centred = experience.advantages - experience.advantages.mean(axis=0)
-        centred[:, 0] /= reward_spread(centred)  # does not change the step, only the unit of the multipliers
-        model = LocalModel(policy, experience, centred)
+        advantages, spreads = each_by_its_spread(experience.advantages)
+        model = LocalModel(policy, experience, advantages)
         active = ActiveConstraints.of(constraints)
-        active = replace(active, violations=integral.corrected(active.index, active.violations, active.sizes))
+        violations = integral.corrected(active.index, active.violations, active.sizes)
+        active = replace(active, violations=violations).divided_by(spreads[1:])
         metric = model.metric(config, generator)
         problem, solved = linearise(model, active, metric, config)
         solution = self._solve(problem)
@@ -194,7 +195,7 @@ class ConstrainedPolicyOptimisation:
         rejected = metrics["policy_steps"] == 0.0
         integral.note_step(active.index, problem.beyond_reach() | (rejected & (active.violations > 0.0)))
         multipliers[:] = 0.0
-        multipliers[active.index] = solution.multipliers
+        multipliers[active.index] = solution.multipliers / spreads[1 + active.index]
         return {
             **metrics,
             "case": float(solution.case),

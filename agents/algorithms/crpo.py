@@ -38,7 +38,7 @@ from recrl.agents.algorithms.cpo import LocalModel, linearise, to_parameter_step
 from recrl.agents.algorithms.own_options import CRPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import SMALLEST_STD, reward_spread
+from recrl.agents.learning.advantages import each_by_its_spread
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.trust_region.cpo_dual import (
@@ -123,12 +123,10 @@ class ConstraintRectifiedPolicyOptimisation:
         if not constraints.known:
             stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
             return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
-        centred = experience.advantages - experience.advantages.mean(axis=0)
-        spreads = np.maximum(centred[:, 1:].std(axis=0), SMALLEST_STD)
-        centred[:, 0] /= reward_spread(centred)
-        corrected = most_violated(constraints.gaps, spreads, config.tolerance)
-        active = ActiveConstraints.of(constraints)
-        model = LocalModel(policy, experience, centred)
+        advantages, spreads = each_by_its_spread(experience.advantages)
+        corrected = most_violated(constraints.gaps, spreads[1:], config.tolerance)
+        active = ActiveConstraints.of(constraints).divided_by(spreads[1:])
+        model = LocalModel(policy, experience, advantages)
         problem, solved = linearise(model, active, model.metric(config, generator), config)
         multipliers = np.zeros_like(constraints.limits)
         if corrected is None:

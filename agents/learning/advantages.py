@@ -80,6 +80,23 @@ def reward_spread(advantages: Floats) -> float:
     return max(float(advantages[:, 0].std()), SMALLEST_STD)
 
 
+def each_by_its_spread(advantages: Floats) -> tuple[Floats, Floats]:
+    """Centre all advantages and divide each signal's by its own standard deviation.
+
+    A constrained step does not depend on the units of reward and costs, if its violations are divided by
+    the same numbers.
+
+    Args:
+        advantages: raw, [N, 1 + k].
+
+    Returns:
+        The quotients, [N, 1 + k], and the standard deviations, above 0, [1 + k].
+    """
+    centred = advantages - advantages.mean(axis=0)
+    spreads = np.maximum(centred.std(axis=0), SMALLEST_STD)
+    return centred / spreads, spreads
+
+
 def scaled_advantages(advantages: Floats) -> tuple[Floats, Floats]:
     """Centre all advantages and divide them by the standard deviation of the reward's.
 

@@ -18,6 +18,7 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
 LAGRANGIANS = [(agent, rule) for agent in ("ppo-lag", "trpo-lag", "focops") for rule in STARTS]
+TRUST_REGIONS = ("cpo", "pcpo", "crpo")
 LIMITS = {"two-state": 3.0, "continuous-bandit": 2.5}
 
 
@@ -60,6 +61,15 @@ def test_a_power_of_two_changes_no_bit(agent: str, rule: str, task: str) -> None
     plain = learnt(agent, task, options_of(rule))
     assert learnt(agent, task, options_of(rule), reward=1024.0).tobytes() == plain.tobytes()
     assert learnt(agent, task, options_of(rule), cost=1024.0).tobytes() == plain.tobytes()
+
+
+@pytest.mark.parametrize("task", LIMITS)
+@pytest.mark.parametrize("agent", TRUST_REGIONS)
+def test_a_power_of_two_changes_no_bit_of_a_constrained_step(agent: str, task: str) -> None:
+    plain = learnt(agent, task, {})
+    for factor in (2.0**30, 2.0**-20):
+        assert learnt(agent, task, {}, reward=factor).tobytes() == plain.tobytes()
+        assert learnt(agent, task, {}, cost=factor).tobytes() == plain.tobytes()
 
 
 @pytest.mark.parametrize(("agent", "rule"), LAGRANGIANS)
