@@ -1,6 +1,6 @@
 """The cluster of docker/compose.yaml without Docker, and a sweep on it while its nodes fail.
 
-    python -m tests.faults.cluster [--steps 300000] [--log results/cluster/log.txt]      (make cluster-test)
+    python -m tests.faults.cluster [--steps 600000] [--log results/cluster/log.txt]      (make cluster-test)
 
 Every service of the compose file becomes a process in namespaces of its own (network, mounts, processes, host
 name), from the file's own command, environment, user, networks, volumes, secrets, health check and read-only
@@ -52,7 +52,7 @@ tasks: [{{name: rivergrid-1a, deploy_limits: 5}}]
 agents: [ppo-lag, cpo]
 methods: [linear, {{name: dynamic, options: {{window: 5}}}}]
 seeds: 3
-run: {{total_steps: {steps}, evaluation_episodes: 10}}
+run: {{num_envs: 4, rollout_steps: 200, total_steps: {steps}, evaluation_episodes: 10}}
 """
 SMALL_GRID = """\
 name: shipped
@@ -638,7 +638,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description="Run docker/compose.yaml's cluster in namespaces, and harm it."
     )
-    parser.add_argument("--steps", type=int, default=300_000, help="of a trial")
+    parser.add_argument("--steps", type=int, default=600_000, help="of a trial")
     parser.add_argument("--log", type=Path, default=Path(os.devnull), help="write what happened there too")
     given = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -47,7 +47,7 @@ tasks: [{{name: rivergrid-1a, deploy_limits: 5}}]
 agents: [ppo-lag]
 methods: [linear, {{name: dynamic, options: {{window: 5}}}}]
 seeds: 3
-run: {{total_steps: {steps}, evaluation_episodes: 10}}
+run: {{num_envs: 4, rollout_steps: 200, total_steps: {steps}, evaluation_episodes: 10}}
 """
 STORAGE = "s3://results/runs"
 SERVICES = ("ray-head", "ray-worker-1", "ray-worker-2")
