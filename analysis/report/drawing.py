@@ -14,7 +14,7 @@
     summary.csv                 averaged over seeds, with interquartile means
     comparisons.csv             paired differences to the agent without a curriculum
     training.csv                cost of relaxed training, one row per trial
-    claims.csv                  the paper's claims about RiverGrid's maps, counted, if the grid has them
+    claims.csv                  the paper's claims about the grid's tasks, counted, if there are any
     bounds.csv                  the cumulative cost against Proposition 1, one row per trial and cost
     outcomes.tex                the first tables for LaTeX (booktabs)
     outcomes.parquet            outcomes.csv with its types, for programs

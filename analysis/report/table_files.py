@@ -39,6 +39,11 @@ BOUNDS_NOTE = (
     "problem (CPO only). Discounted bound: Proposition 1 of the paper. Trivial bound: every step at the "
     "largest cost."
 )
+CLAIMS_NOTE = (
+    "Counted for the stochastic final policies of trials; for a comparison, of the seeds that have all its "
+    "trials. Costs of training are those of the training phase. A difference is the mean over seeds with "
+    "Student's 95% interval; beside it the fraction of the other curriculum's mean."
+)
 
 
 @dataclass(frozen=True)
@@ -81,10 +86,10 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     Returns:
         The files, and the report's content.
     """
-    rows = metrics.outcomes(sweep)
+    rows, totals = metrics.outcomes(sweep), metrics.training_totals(sweep)
     bounds = [cumulative_costs(sweep, cost=i).assign(cost=i) for i in range(sweep.num_costs)]
     written = [
-        table_formats.write_csv(metrics.training_totals(sweep), folder / "training.csv"),
+        table_formats.write_csv(totals, folder / "training.csv"),
         table_formats.write_csv(pd.concat(bounds), folder / "bounds.csv"),
     ]
     if not len(rows):
@@ -93,7 +98,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     averaged = metrics.summary(rows)
     robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
     compared = metrics.comparisons(rows, generator)
-    weighed = claims.weigh(rows)
+    weighed = claims.weigh(rows, totals)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
     judged = count_verdicts(rows, compared, curriculum_flags(sweep), cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
@@ -102,7 +107,9 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
     if len(weighed):
         written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
-        shown.append(ShownTable("What the paper says of these maps", claims.claims_table(weighed)))
+        shown.append(
+            ShownTable("What the paper says of these tasks", claims.claims_table(weighed), CLAIMS_NOTE)
+        )
     for i, costs in enumerate(bounds):
         which = f" (cost{suffixes[i]})" if suffixes[i] else ""
         if len(costs):

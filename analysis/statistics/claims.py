@@ -1,25 +1,40 @@
-"""Count in how many seeds each of the paper's claims about RiverGrid's two instances holds.
+"""Count in how many seeds each of the paper's claims holds.
 
-The paper (sections 5, 5.1 and 5.3) describes results on its figure 1a, where every path crosses the river,
-and on 1b, which has a safe path. Here each sentence is a predicate of a trial's final policy. The table has
-the fraction of seeds in which it holds, with Wilson's interval. It also has the count for the deployment
-phase, in which learning goes on.
+RiverGrid (sections 5, 5.1 and 5.3): on figure 1a every path crosses the river, and 1b has a safe path. Each
+sentence is a predicate of a trial's final policy.
 
-The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``.
+Safety Gym (section 6): which agents keep the limit is a predicate, too. Which curriculum returns more, or
+costs more during training, is a comparison of the trials of one seed. The paper's relative gains are beside
+the paired difference.
+
+The fraction of trials or seeds has Wilson's interval. Beside it is the count for the deployment phase, in
+which learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from recrl.analysis.statistics.intervals import share_text, wilson_interval
+from recrl.analysis.statistics.intervals import (
+    Interval,
+    mean_interval,
+    share_text,
+    wilson_interval,
+)
 from recrl.analysis.statistics.metrics import Measure
-from recrl.analysis.statistics.verdicts import solved, within_limits
+from recrl.analysis.statistics.verdicts import ROUNDING, solved, within_limits
 
 STATIC = ("linear", "cosine", "exponential")
+CURRICULA = (*STATIC, "dynamic")
+PAPER_TASKS = ("CarButton2", "CarGoal2", "CarPush2")
+RETURN = "episode_return"
+TRAINING_COST = "training_cost"
 
 
 def violates(rows: pd.DataFrame) -> pd.Series[bool]:
@@ -29,12 +44,12 @@ def violates(rows: pd.DataFrame) -> pd.Series[bool]:
 
 def stays(rows: pd.DataFrame) -> pd.Series[bool]:
     """Whether the return is below 0: most episodes end without the goal, whose reward is 10."""
-    return rows["episode_return"] < 0.0
+    return rows[RETURN] < 0.0
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence of the paper.
+    """A sentence of the paper about single trials.
 
     Attributes:
         section: of the paper.
@@ -42,6 +57,7 @@ class Claim:
         task: of the claim.
         methods: of the claim, by the grid's names.
         holds: predicate on rows of ``metrics.outcomes``.
+        agent: of the claim; every agent if empty.
     """
 
     section: str
@@ -49,9 +65,45 @@ class Claim:
     task: str
     methods: tuple[str, ...]
     holds: Callable[[pd.DataFrame], pd.Series[bool]]
+    agent: str = ""
 
 
-CLAIMS = (
+@dataclass(frozen=True)
+class Comparison:
+    """A sentence of the paper that compares the trials of one seed.
+
+    Attributes:
+        section: of the paper.
+        text: the claim.
+        task: of the claim.
+        methods: they are claimed to have more, each of them.
+        against: than each of these.
+        agent: of the claim; every agent if empty.
+        quantity: RETURN of the final policy, or TRAINING_COST, the mean cost of an episode of training.
+        paper: the relative gain that the paper gives, or empty.
+    """
+
+    section: str
+    text: str
+    task: str
+    methods: tuple[str, ...]
+    against: tuple[str, ...]
+    agent: str = ""
+    quantity: str = RETURN
+    paper: str = ""
+
+
+GAINS = {
+    ("ppo-lag", "linear"): "20% to 600%",
+    ("ppo-lag", "cosine"): "20% to 400%",
+    ("ppo-lag", "exponential"): "10% to 300%",
+    ("ppo-lag", "dynamic"): "40% to 900%",
+    ("cpo", "linear"): "5% to 60%",
+    ("cpo", "cosine"): "10% to 40%",
+    ("cpo", "exponential"): "3% to 30%",
+    ("cpo", "dynamic"): "15% to 80%",
+}
+RIVERGRID_CLAIMS = (
     Claim("5", "the plain agent stays at the start on 1a", "rivergrid-1a", ("none",), stays),
     Claim("5.1", "every static curriculum finds the crossing on 1a", "rivergrid-1a", STATIC, solved),
     Claim("5.3", "every static curriculum violates d_d on 1b", "rivergrid-1b", STATIC, violates),
@@ -61,59 +113,139 @@ CLAIMS = (
 )
 
 
-def weigh(rows: pd.DataFrame) -> pd.DataFrame:
-    """Count the trials in which each claim holds, one row per claim and agent.
+def _safety_gym_claims(task: str) -> Iterator[Claim | Comparison]:
+    everything = ("none", *CURRICULA)
+    yield Claim("6", f"ppo-lag keeps d_d on {task}", task, everything, within_limits, "ppo-lag")
+    yield Claim("6", f"cpo violates d_d on {task}", task, everything, violates, "cpo")
+    for (agent, method), gain in GAINS.items():
+        text = f"{method} returns more than none on {task}"
+        yield Comparison("6", text, task, (method,), ("none",), agent, paper=gain)
+    text = f"dynamic returns more than every static curriculum on {task}"
+    yield Comparison("6", text, task, ("dynamic",), STATIC)
+    text = f"exponential has the lowest cost of training of the static curricula on {task}"
+    yield Comparison("6", text, task, ("linear", "cosine"), ("exponential",), quantity=TRAINING_COST)
+    text = f"cosine has the highest cost of training of the static curricula on {task}"
+    yield Comparison("6", text, task, ("cosine",), ("linear", "exponential"), quantity=TRAINING_COST)
+
+
+CLAIMS = (*RIVERGRID_CLAIMS, *(claim for task in PAPER_TASKS for claim in _safety_gym_claims(task)))
+
+
+def weigh(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
+    """Count the trials or seeds in which each claim holds, one row per claim and agent.
 
     Args:
         rows: of ``metrics.outcomes``.
+        training: of ``metrics.training_totals``.
 
     Returns:
-        section, claim, agent, trials, held, share, share_low, share_high (95%), deployment_held (for the
-        deployment phase instead of the final policy); no row without such trials.
+        section, claim, agent, trials (of a comparison: seeds), held, share, share_low, share_high (95%),
+        deployment_held (for the deployment phase instead of the final policy; -1 for costs of training); of a
+        comparison difference, the mean over seeds, with Student's interval, relative_difference, and the
+        paper's range. No row without such trials.
     """
-    lines = []
     final, deployed = (
         rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     )
+    costs = training.assign(**{TRAINING_COST: training["cost_0_total"] / training["episodes"]})
+    lines = []
     for claim in CLAIMS:
-        for agent, chosen in _about(final, claim).groupby("agent", observed=True, sort=False):
-            held = int(claim.holds(chosen).sum())
-            interval = wilson_interval(held, len(chosen))
+        of_training = isinstance(claim, Comparison) and claim.quantity == TRAINING_COST
+        about = _about(costs if of_training else final, claim)
+        for agent, chosen in about.groupby("agent", observed=True, sort=False):
             beside = _about(deployed, claim)
-            lines.append(
-                {
-                    "section": claim.section,
-                    "claim": claim.text,
-                    "agent": str(agent),
-                    "trials": len(chosen),
-                    "held": held,
-                    "share": interval.estimate,
-                    "share_low": interval.low,
-                    "share_high": interval.high,
-                    "deployment_held": int(claim.holds(beside[beside["agent"] == agent]).sum()),
-                }
-            )
+            beside = beside[beside["agent"] == agent]
+            if isinstance(claim, Comparison):
+                counted = _compared(chosen, beside, claim)
+            else:
+                counted = _counted(claim.holds(chosen), claim.holds(beside)) | _NO_DIFFERENCE
+            if counted["trials"]:
+                named = {"section": claim.section, "claim": claim.text, "agent": str(agent)}
+                lines.append(named | counted)
     return pd.DataFrame(lines)
 
 
-def _about(rows: pd.DataFrame, claim: Claim) -> pd.DataFrame:
-    return rows[(rows["task"] == claim.task) & rows["method"].isin(claim.methods)]
+def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
+    methods = claim.methods if isinstance(claim, Claim) else (*claim.methods, *claim.against)
+    agents = (rows["agent"] == claim.agent) | (claim.agent == "")
+    return rows[(rows["task"] == claim.task) & agents & rows["method"].isin(methods)]
+
+
+def _counted(held: pd.Series[bool], deployed: pd.Series[bool] | None) -> dict[str, Any]:
+    count = int(held.sum())
+    share = wilson_interval(count, len(held))
+    return {
+        "trials": len(held),
+        "held": count,
+        "share": share.estimate,
+        "share_low": share.low,
+        "share_high": share.high,
+        "deployment_held": -1 if deployed is None else int(deployed.sum()),
+    }
+
+
+def _compared(chosen: pd.DataFrame, deployed: pd.DataFrame, claim: Comparison) -> dict[str, Any]:
+    """Count the seeds that have all trials of a comparison, and in which it holds."""
+    differences, base = _differences(chosen, claim)
+    deployed_too = None if claim.quantity == TRAINING_COST else _differences(deployed, claim)[0] > ROUNDING
+    interval = mean_interval(np.asarray(differences, dtype=np.float64))
+    mean = float(base.mean())
+    return {
+        **_counted(differences > ROUNDING, deployed_too),
+        **_ends(interval),
+        "relative_difference": interval.estimate / mean if mean > 0.0 else math.nan,
+        "paper": claim.paper,
+    }
+
+
+def _differences(rows: pd.DataFrame, claim: Comparison) -> tuple[pd.Series[float], pd.Series[float]]:
+    """Return per seed by how much the least of the methods exceeds the most of the others, and that most."""
+    table = rows.pivot_table(index="seed", columns="method", values=claim.quantity, observed=True)
+    table = table.reindex(columns=[*claim.methods, *claim.against]).dropna()
+    base = table[list(claim.against)].max(axis=1)
+    return table[list(claim.methods)].min(axis=1) - base, base
+
+
+def _ends(interval: Interval) -> dict[str, float]:
+    ends = (interval.estimate, interval.low, interval.high)
+    return dict(zip(("difference", "difference_low", "difference_high"), ends, strict=True))
+
+
+_NO_DIFFERENCE = {
+    **_ends(Interval(math.nan, math.nan, math.nan, 0, True)),
+    "relative_difference": math.nan,
+    "paper": "",
+}
 
 
 def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
-    """Format the result of ``weigh``: "mixed", "4 of 5 (38–96%)"."""
+    """Format the result of ``weigh``: "mixed", "4 of 5 (38–96%)", "+1.2 (+0.3 to +2.1)", "+40%"."""
     shares = zip(weighed["held"], weighed["trials"], weighed["share_low"], weighed["share_high"], strict=True)
     beside = zip(weighed["deployment_held"], weighed["trials"], strict=True)
-    return pd.DataFrame(
-        {
-            "section": weighed["section"],
-            "claim": weighed["claim"],
-            "agent": weighed["agent"],
-            "holds here": [
-                "yes" if held == trials else "mixed" if held else "no"
-                for held, trials in zip(weighed["held"], weighed["trials"], strict=True)
-            ],
-            "final policy": [share_text(*share) for share in shares],
-            "deployment phase (learning goes on)": [f"{held} of {trials}" for held, trials in beside],
-        }
-    )
+    columns = {
+        "section": weighed["section"],
+        "claim": weighed["claim"],
+        "agent": weighed["agent"],
+        "holds here": [
+            "yes" if held == trials else "mixed" if held else "no"
+            for held, trials in zip(weighed["held"], weighed["trials"], strict=True)
+        ],
+        "holds in": [share_text(*share) for share in shares],
+        "deployment phase (learning goes on)": [
+            f"{held} of {trials}" if held >= 0 else "" for held, trials in beside
+        ],
+    }
+    if weighed["difference"].notna().any():
+        columns["difference"] = [_difference_text(row) for _, row in weighed.iterrows()]
+        relative = weighed["relative_difference"]
+        columns["relative"] = [f"{value:+.0%}" if math.isfinite(value) else "" for value in relative]
+        columns["in the paper"] = weighed["paper"]
+    return pd.DataFrame(columns)
+
+
+def _difference_text(row: pd.Series) -> str:
+    if not math.isfinite(row["difference"]):
+        return ""
+    if not math.isfinite(row["difference_low"]):
+        return f"{row['difference']:+.2f}"
+    return f"{row['difference']:+.2f} ({row['difference_low']:+.2f} to {row['difference_high']:+.2f})"
