@@ -63,8 +63,9 @@ class ActiveConstraints:
 
     Attributes:
         index: their indices, [j].
-        violations: c, (constrained value - limit) / mean episode length, [j].
-        sizes: sqrt(d^2 + s^2) / mean episode length, s the standard error of the mean cost, [j].
+        violations: c, (constrained value - limit) / mean episode length, in cost per step or another unit
+            (``divided_by``), [j].
+        sizes: sqrt(d^2 + s^2) / mean episode length, s the standard error of the mean cost, likewise, [j].
     """
 
     index: npt.NDArray[np.int64]
@@ -80,7 +81,7 @@ class ActiveConstraints:
         return cls(index, constraints.gaps[index] / length, sizes / length)
 
     def divided_by(self, units: Floats) -> ActiveConstraints:
-        """Return the constraints with each of the k costs divided by a unit, cost per step, [k]."""
+        """Return the constraints with ``violations`` and ``sizes`` divided by units of the k costs, [k]."""
         own = units[self.index]
         return ActiveConstraints(self.index, self.violations / own, self.sizes / own)
 

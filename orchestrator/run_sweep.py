@@ -222,12 +222,14 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
 
 
 def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) -> None:
-    """Write the sweep's own files."""
+    """Write the sweep's own files; a renamed or copied sweep becomes another one."""
+    created = time.time()
     try:
-        created = store.info().get("created", time.time())
+        info = store.info()
+        if info.get("name") == grid.name:
+            created = info["created"]
     except DamagedError as error:
         logger.warning("%s; MLflow shows it as a new sweep", error)
-        created = time.time()
     store.write_info({"name": grid.name, "created": created, "launched": time.time(), **collect()})
     store.write_specs(specs, grid.text)
 

@@ -6,9 +6,9 @@ step by a trust region:
     minimise g.x  subject to  b_i.x + c_i <= 0 for i = 1..k  and  x.H x / 2 <= delta,
 
 with g minus the gradient of the reward surrogate, b_i the gradient of cost surrogate i, H the Hessian of the
-mean KL and c_i how far constraint i is violated. **c is in the unit of the surrogates, cost per step**:
-c_i = (mean episode cost i - limit i) / mean episode length. Two well-known libraries wrongly combine episode
-units with b.
+mean KL and c_i how far constraint i is violated. **c_i is in the unit of b_i**: if surrogates are in cost per
+step, c_i = (mean episode cost i - limit i) / mean episode length. Two well-known libraries wrongly combine
+episode units with b.
 
 The optimum is x = -(v + sum_i nu_i w_i) / lam with v = H^-1 g, w_i = H^-1 b_i, so only the products
 q = g.v, r_i = g.w_i, S_ij = b_i.w_j matter. The paper and safety-starter-agents solve k = 1 by distinguishing
@@ -70,7 +70,7 @@ class StepProblem:
         squared_gradient: q = g.H^-1 g, at least 0.
         mixed: r_i = g.H^-1 b_i, [k].
         gram: S_ij = b_i.H^-1 b_j, [k, k], symmetric and positive semidefinite.
-        violations: c_i, cost per step, [k]; negative where the constraint holds.
+        violations: c_i, in the unit of b_i, [k]; negative where the constraint holds.
         radius: delta, the largest mean KL, above 0.
     """
 
@@ -196,7 +196,7 @@ def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
     array([0.5])
     """
     usable = [i for i in range(len(excesses)) if gram[i, i] > NO_INFLUENCE]
-    scale = max(float(np.abs(excesses).max(initial=0.0)), NO_INFLUENCE)
+    scale = max(float(np.abs(excesses[usable]).max(initial=0.0)), NO_INFLUENCE)
     for size in range(len(usable) + 1):
         for binding in itertools.combinations(usable, size):
             index = list(binding)

@@ -32,7 +32,8 @@ restart truncates the files to the newest intact checkpoint, and no row is dupli
 bytes only, and check them against the record's digests.
 
 ``sweep.json`` and ``trials.jsonl`` belong together if they have one creation time. So a folder may be renamed
-or copied: the sweep then has the folder's name.
+or copied: the sweep then has the folder's name. To launch it, change ``name`` in its grid, too. A local copy
+of a remote sweep must keep its name, by which ``storage.json`` finds it.
 
 A file that is shorter than its committed length, or whose committed bytes have changed, is damaged. Then the
 trial's status is DAMAGED and its data are not used. An attempt moves unusable or replaced files to
@@ -118,7 +119,7 @@ class SweepStore:
         """
         try:
             info = read_sealed(self.info_path, version=INFO_FORMAT)
-            if info["name"] != self.name and self._header().get("created") != info["created"]:
+            if info["name"] != self.name and self._header().get("created") not in (None, info["created"]):
                 raise DamagedError(f"{self.info_path.name} is that of another sweep, {info['name']}")
             return info
         except FileNotFoundError:

@@ -308,7 +308,8 @@ def remembered_uri(store: SweepStore) -> str | None:
     try:
         kept = read_sealed(store.storage_path, version=STORAGE_FORMAT)
         if kept["name"] != store.name:
-            raise DamagedError(f"{store.storage_path.name} is that of another sweep, {kept['name']}")
+            own = f"that of the sweep {kept['name']}, whose name the folder must have"
+            raise DamagedError(f"{store.storage_path.name} is {own}")
     except FileNotFoundError:
         return None
     except StorageError as error:

@@ -1,6 +1,7 @@
 """CPO's own rules: when it steps, how far, and what the line search accepts."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,12 +10,13 @@ from gymnasium.spaces import Box, Discrete, Space
 
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.own_options import CPOConfig
+from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal
-from recrl.agents.trust_region.cpo_dual import StepCase
+from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.environments.cmdp import Floats
 
 NUM_SAMPLES, DELTA = 400, 0.01
@@ -105,6 +107,42 @@ def test_violations_enter_in_cost_per_step() -> None:
     assert active.index.tolist() == [0, 2]
     assert active.violations.tolist() == pytest.approx([0.05, -0.0005])
     assert active.sizes.tolist() == pytest.approx([0.065, 0.001])
+    divided = active.divided_by(np.array([2.0, 3.0, 5.0]))
+    assert divided.violations.tolist() == pytest.approx([0.025, -0.0001])
+    assert divided.sizes.tolist() == pytest.approx([0.0325, 0.0002])
+
+
+def test_multipliers_are_per_unit_of_cost() -> None:
+    """Twice the cost and its limit: half the multiplier, and the same step."""
+
+    def one_update(factor: float) -> dict[str, float]:
+        policy, batch, advantages = sampled(SPACES[1])
+        advantages[:, 1] *= factor
+        constraints = Constraints(np.array([10.0, 10.0]), np.array([0.1 * factor, -9.0]), np.zeros(2), LENGTH)
+        experience = Experience.of(policy, batch, advantages, constraints)
+        rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=0.0), 2)
+        return improve_and_measure(rule, policy, experience, np.random.default_rng(0))
+
+    plain, twice = one_update(1.0), one_update(2.0)
+    assert plain["multiplier_0"] > 0.0
+    assert twice["multiplier_0"] == pytest.approx(plain["multiplier_0"] / 2.0)
+    assert twice["step_norm"] == pytest.approx(plain["step_norm"])
+
+
+@pytest.mark.parametrize("solve", [solve_dual, projected_step])
+def test_a_cost_that_no_step_can_change_does_not_hide_another_one(
+    solve: Callable[[StepProblem], DualSolution],
+) -> None:
+    """Its advantages do not vary, so in units of its spread its violation is 1e8 times that of others."""
+    policy, batch, advantages = sampled(SPACES[1])
+    advantages[:, 2] = 1.0
+    constraints = Constraints(np.array([10.0, 10.0]), np.array([9.0, 300.0]), np.zeros(2), LENGTH)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    config = CPOConfig(target_kl=DELTA, violation_integral_gain=0.0)
+    rule = ConstrainedPolicyOptimisation(config, 2, solve)
+    metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
+    assert metrics["policy_steps"] == 1.0
+    assert metrics["surrogate_cost_0"] < 0.0
 
 
 def updates(gain: float, gap: float, count: int) -> list[dict[str, float]]:

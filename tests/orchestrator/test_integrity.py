@@ -364,18 +364,44 @@ def test_a_sweep_whose_folder_was_renamed_is_read_under_its_new_name(store: Swee
     assert main(["check", "renamed"]) == ExitCode.OK
 
 
+@pytest.mark.parametrize("name", ["other", "small"])
 @pytest.mark.parametrize("file", ["info_path", "specs_path"])
 def test_one_file_of_another_sweep_is_damage_whatever_the_sweeps_are_called(
-    store: SweepStore, file: str
+    store: SweepStore, tmp_path: Path, file: str, name: str
 ) -> None:
     run(store)
-    other = SweepStore(store.folder.parent, "other")
+    other = SweepStore(tmp_path / "elsewhere", name)
     shutil.copytree(store.folder, other.folder)
-    other.write_info({**other.info(), "name": "other", "created": 1.0})
+    other.write_info({**other.info(), "name": name, "created": 1.0})
     other.write_specs(SPECS, store.grid_path.read_bytes())
     assert other.damages() == []
     shutil.copy(getattr(other, file), getattr(store, file))
     assert store.damages()
+    with pytest.raises(DamagedError, match=r"not of this sweep|that of another sweep"):
+        (store.info(), store.specs())
+
+
+def test_a_copy_that_is_launched_is_another_sweep(store: SweepStore) -> None:
+    run(store)
+    copied = SweepStore(store.folder.parent, "copied")
+    shutil.copytree(store.folder, copied.folder)
+    grid = parse_grid(GRID.replace("name: small", "name: copied").encode(), source="grid.yaml")
+    settings = SweepRunSettings(grid, SweepPlace(copied), InlineExecutor())
+    run_sweep(settings, stop=threading.Event())
+    assert copied.info()["created"] != store.info()["created"]
+    shutil.copy(store.specs_path, copied.specs_path)
+    assert any("not of this sweep" in problem for problem in copied.damages())
+
+
+@pytest.mark.parametrize("file", ["info_path", "specs_path"])
+def test_a_renamed_sweep_that_lacks_a_file_says_which(store: SweepStore, file: str) -> None:
+    run(store)
+    renamed = SweepStore(store.folder.parent, "renamed")
+    store.folder.rename(renamed.folder)
+    missing: Path = getattr(renamed, file)
+    missing.unlink()
+    assert any(missing.name in problem for problem in renamed.damages())
+    assert not any("that of another sweep" in problem for problem in renamed.damages())
 
 
 @pytest.mark.parametrize(
