@@ -1,11 +1,13 @@
-"""Count in how many seeds each of the paper's claims holds.
+"""Count in how many seeds the paper's claims hold.
 
 RiverGrid (sections 5, 5.1 and 5.3): on figure 1a every path crosses the river, and 1b has a safe path. Each
 sentence is a predicate of a trial's final policy.
 
-Safety Gym (section 6): which agents keep the limit is a predicate, too. Which curriculum returns more, or
-costs more during training, is a comparison of the trials of one seed. The paper's relative gains are beside
-the paired difference.
+Safety Gym (section 6): which agents keep the limit is a predicate, too. Which of two curricula returns more,
+or costs more during training, is a comparison of the two trials of each seed, with the mean paired
+difference. Beside it are the paper's relative gains. Only trials with the labels ``ppo-lag`` and ``cpo`` are
+counted. Not counted are which static curriculum is the best in how many tasks, and that the costs of training
+of ``dynamic`` and ``linear`` are comparable.
 
 The fraction of trials or seeds has Wilson's interval. Beside it is the count for the deployment phase, in
 which learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``.
@@ -29,10 +31,12 @@ from recrl.analysis.statistics.intervals import (
 )
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdicts import ROUNDING, solved, within_limits
+from recrl.environments.cmdp import Floats
 
 STATIC = ("linear", "cosine", "exponential")
 CURRICULA = (*STATIC, "dynamic")
 PAPER_TASKS = ("CarButton2", "CarGoal2", "CarPush2")
+PAPER_AGENTS = ("ppo-lag", "cpo")
 RETURN = "episode_return"
 TRAINING_COST = "training_cost"
 
@@ -70,25 +74,25 @@ class Claim:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A sentence of the paper that compares the trials of one seed.
+    """A sentence of the paper that compares two trials of each seed.
 
     Attributes:
         section: of the paper.
         text: the claim.
         task: of the claim.
-        methods: they are claimed to have more, each of them.
-        against: than each of these.
-        agent: of the claim; every agent if empty.
+        agent: of the claim.
+        method: it is claimed to have more.
+        against: than this.
         quantity: RETURN of the final policy, or TRAINING_COST, the mean cost of an episode of training.
-        paper: the relative gain that the paper gives, or empty.
+        paper: the relative gain that the paper gives for its three tasks, or empty.
     """
 
     section: str
     text: str
     task: str
-    methods: tuple[str, ...]
-    against: tuple[str, ...]
-    agent: str = ""
+    agent: str
+    method: str
+    against: str
     quantity: str = RETURN
     paper: str = ""
 
@@ -113,22 +117,27 @@ RIVERGRID_CLAIMS = (
 )
 
 
-def _safety_gym_claims(task: str) -> Iterator[Claim | Comparison]:
+def _safety_gym_claims(task: str, agent: str) -> Iterator[Claim | Comparison]:
     everything = ("none", *CURRICULA)
-    yield Claim("6", f"ppo-lag keeps d_d on {task}", task, everything, within_limits, "ppo-lag")
-    yield Claim("6", f"cpo violates d_d on {task}", task, everything, violates, "cpo")
-    for (agent, method), gain in GAINS.items():
+    if agent == "ppo-lag":
+        yield Claim("6", f"ppo-lag keeps d_d on {task}", task, everything, within_limits, agent)
+    else:
+        yield Claim("6", f"cpo violates d_d on {task}", task, everything, violates, agent)
+    for method in CURRICULA:
         text = f"{method} returns more than none on {task}"
-        yield Comparison("6", text, task, (method,), ("none",), agent, paper=gain)
-    text = f"dynamic returns more than every static curriculum on {task}"
-    yield Comparison("6", text, task, ("dynamic",), STATIC)
-    text = f"exponential has the lowest cost of training of the static curricula on {task}"
-    yield Comparison("6", text, task, ("linear", "cosine"), ("exponential",), quantity=TRAINING_COST)
-    text = f"cosine has the highest cost of training of the static curricula on {task}"
-    yield Comparison("6", text, task, ("cosine",), ("linear", "exponential"), quantity=TRAINING_COST)
+        yield Comparison("6", text, task, agent, method, "none", paper=GAINS[agent, method])
+    for method in STATIC:
+        text = f"dynamic returns more than {method} on {task}"
+        yield Comparison("6", text, task, agent, "dynamic", method)
+    for method, against in (("linear", "exponential"), ("cosine", "exponential"), ("cosine", "linear")):
+        text = f"{method} costs more in training than {against} on {task}"
+        yield Comparison("6", text, task, agent, method, against, quantity=TRAINING_COST)
 
 
-CLAIMS = (*RIVERGRID_CLAIMS, *(claim for task in PAPER_TASKS for claim in _safety_gym_claims(task)))
+CLAIMS = (
+    *RIVERGRID_CLAIMS,
+    *(claim for task in PAPER_TASKS for agent in PAPER_AGENTS for claim in _safety_gym_claims(task, agent)),
+)
 
 
 def weigh(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
@@ -136,29 +145,30 @@ def weigh(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
 
     Args:
         rows: of ``metrics.outcomes``.
-        training: of ``metrics.training_totals``.
+        training: of ``metrics.training_totals``; costs of training are compared if there is one cost.
 
     Returns:
-        section, claim, agent, trials (of a comparison: seeds), held, share, share_low, share_high (95%),
-        deployment_held (for the deployment phase instead of the final policy; -1 for costs of training); of a
-        comparison difference, the mean over seeds, with Student's interval, relative_difference, and the
-        paper's range. No row without such trials.
+        section, claim, agent, trials (of a comparison: seeds with both trials), held, share, share_low,
+        share_high (95%); deployment_trials and deployment_held, the same for the deployment phase instead of
+        the final policy; of a comparison difference, the mean over seeds, with Student's interval,
+        relative_difference where the other curriculum's mean is above 0 beyond its interval, and the paper's
+        range. No row without such trials.
     """
     final, deployed = (
         rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     )
     costs = training.assign(**{TRAINING_COST: training["cost_0_total"] / training["episodes"]})
+    if "cost_1_total" in training:
+        costs = costs.iloc[:0]
     lines = []
     for claim in CLAIMS:
         of_training = isinstance(claim, Comparison) and claim.quantity == TRAINING_COST
-        about = _about(costs if of_training else final, claim)
-        for agent, chosen in about.groupby("agent", observed=True, sort=False):
-            beside = _about(deployed, claim)
-            beside = beside[beside["agent"] == agent]
-            if isinstance(claim, Comparison):
-                counted = _compared(chosen, beside, claim)
-            else:
-                counted = _counted(claim.holds(chosen), claim.holds(beside)) | _NO_DIFFERENCE
+        chosen, beside = _about(costs if of_training else final, claim), _about(deployed, claim)
+        for agent, own in chosen.groupby("agent", observed=True, sort=False):
+            same = beside[beside["agent"] == agent]
+            counted = (
+                _compared(own, same, claim) if isinstance(claim, Comparison) else _held(own, same, claim)
+            )
             if counted["trials"]:
                 named = {"section": claim.section, "claim": claim.text, "agent": str(agent)}
                 lines.append(named | counted)
@@ -166,12 +176,33 @@ def weigh(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
 
 
 def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
-    methods = claim.methods if isinstance(claim, Claim) else (*claim.methods, *claim.against)
+    methods = claim.methods if isinstance(claim, Claim) else (claim.method, claim.against)
     agents = (rows["agent"] == claim.agent) | (claim.agent == "")
     return rows[(rows["task"] == claim.task) & agents & rows["method"].isin(methods)]
 
 
-def _counted(held: pd.Series[bool], deployed: pd.Series[bool] | None) -> dict[str, Any]:
+def _held(final: pd.DataFrame, deployed: pd.DataFrame, claim: Claim) -> dict[str, Any]:
+    nothing = _ends(Interval(math.nan, math.nan, math.nan, 0, True))
+    counted = _counted(claim.holds(final), claim.holds(deployed))
+    return {**counted, **nothing, "relative_difference": math.nan, "paper": ""}
+
+
+def _compared(final: pd.DataFrame, deployed: pd.DataFrame, claim: Comparison) -> dict[str, Any]:
+    differences, base = _differences(final, claim)
+    if claim.quantity == TRAINING_COST:
+        deployed = deployed.iloc[:0]
+    beside = _differences(deployed.assign(**{claim.quantity: deployed[RETURN]}), claim)[0]
+    interval, ground = mean_interval(_numbers(differences)), mean_interval(_numbers(base))
+    relative = interval.estimate / ground.estimate if ground.low > 0.0 else math.nan
+    return {
+        **_counted(differences > ROUNDING, beside > ROUNDING),
+        **_ends(interval),
+        "relative_difference": relative,
+        "paper": claim.paper,
+    }
+
+
+def _counted(held: pd.Series[bool], deployed: pd.Series[bool]) -> dict[str, Any]:
     count = int(held.sum())
     share = wilson_interval(count, len(held))
     return {
@@ -180,30 +211,20 @@ def _counted(held: pd.Series[bool], deployed: pd.Series[bool] | None) -> dict[st
         "share": share.estimate,
         "share_low": share.low,
         "share_high": share.high,
-        "deployment_held": -1 if deployed is None else int(deployed.sum()),
-    }
-
-
-def _compared(chosen: pd.DataFrame, deployed: pd.DataFrame, claim: Comparison) -> dict[str, Any]:
-    """Count the seeds that have all trials of a comparison, and in which it holds."""
-    differences, base = _differences(chosen, claim)
-    deployed_too = None if claim.quantity == TRAINING_COST else _differences(deployed, claim)[0] > ROUNDING
-    interval = mean_interval(np.asarray(differences, dtype=np.float64))
-    mean = float(base.mean())
-    return {
-        **_counted(differences > ROUNDING, deployed_too),
-        **_ends(interval),
-        "relative_difference": interval.estimate / mean if mean > 0.0 else math.nan,
-        "paper": claim.paper,
+        "deployment_trials": len(deployed),
+        "deployment_held": int(deployed.sum()),
     }
 
 
 def _differences(rows: pd.DataFrame, claim: Comparison) -> tuple[pd.Series[float], pd.Series[float]]:
-    """Return per seed by how much the least of the methods exceeds the most of the others, and that most."""
+    """Return by how much the method exceeds the other one, and the other one's value, for each seed."""
     table = rows.pivot_table(index="seed", columns="method", values=claim.quantity, observed=True)
-    table = table.reindex(columns=[*claim.methods, *claim.against]).dropna()
-    base = table[list(claim.against)].max(axis=1)
-    return table[list(claim.methods)].min(axis=1) - base, base
+    table = table.reindex(columns=[claim.method, claim.against]).dropna()
+    return table[claim.method] - table[claim.against], table[claim.against]
+
+
+def _numbers(values: pd.Series[float]) -> Floats:
+    return np.asarray(values, dtype=np.float64)
 
 
 def _ends(interval: Interval) -> dict[str, float]:
@@ -211,17 +232,10 @@ def _ends(interval: Interval) -> dict[str, float]:
     return dict(zip(("difference", "difference_low", "difference_high"), ends, strict=True))
 
 
-_NO_DIFFERENCE = {
-    **_ends(Interval(math.nan, math.nan, math.nan, 0, True)),
-    "relative_difference": math.nan,
-    "paper": "",
-}
-
-
 def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
     """Format the result of ``weigh``: "mixed", "4 of 5 (38–96%)", "+1.2 (+0.3 to +2.1)", "+40%"."""
     shares = zip(weighed["held"], weighed["trials"], weighed["share_low"], weighed["share_high"], strict=True)
-    beside = zip(weighed["deployment_held"], weighed["trials"], strict=True)
+    beside = zip(weighed["deployment_held"], weighed["deployment_trials"], strict=True)
     columns = {
         "section": weighed["section"],
         "claim": weighed["claim"],
@@ -232,14 +246,14 @@ def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
         ],
         "holds in": [share_text(*share) for share in shares],
         "deployment phase (learning goes on)": [
-            f"{held} of {trials}" if held >= 0 else "" for held, trials in beside
+            f"{held} of {trials}" if trials else "" for held, trials in beside
         ],
     }
     if weighed["difference"].notna().any():
         columns["difference"] = [_difference_text(row) for _, row in weighed.iterrows()]
         relative = weighed["relative_difference"]
         columns["relative"] = [f"{value:+.0%}" if math.isfinite(value) else "" for value in relative]
-        columns["in the paper"] = weighed["paper"]
+        columns["paper, over its three tasks"] = weighed["paper"]
     return pd.DataFrame(columns)
 
 
