@@ -149,10 +149,10 @@ def weigh(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         section, claim, agent, trials (of a comparison: seeds with both trials), held, share, share_low,
-        share_high (95%); deployment_trials and deployment_held, the same for the deployment phase instead of
-        the final policy; of a comparison difference, the mean over seeds, with Student's interval,
-        relative_difference where the other curriculum's mean is above 0 beyond its interval, and the paper's
-        range. No row without such trials.
+        share_high (95%); deployment_trials and deployment_held, the same for the deployment phase. Of a
+        comparison also difference, the mean over seeds, with Student's interval; relative_difference, where
+        the other curriculum's mean is above 0 beyond its interval; and the paper's range. No row without such
+        trials.
     """
     final, deployed = (
         rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
