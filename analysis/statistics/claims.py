@@ -4,10 +4,10 @@ RiverGrid (sections 5, 5.1 and 5.3): on figure 1a every path crosses the river, 
 sentence is a predicate of a trial's final policy.
 
 Safety Gym (section 6): which agents keep the limit is a predicate, too. Which of two curricula returns more,
-or costs more during training, is a comparison of the two trials of each seed, with the mean paired
-difference. Beside it are the paper's relative gains. Only trials with the labels ``ppo-lag`` and ``cpo`` are
-counted. Not counted are which static curriculum is the best in how many tasks, and that the costs of training
-of ``dynamic`` and ``linear`` are comparable.
+or costs more in training, is a comparison of the two trials of each seed. It has the mean paired difference,
+and beside it the paper's relative gains. Only trials with the labels ``ppo-lag`` and ``cpo`` are counted. Not
+counted are which static curriculum is the best in how many tasks, and that the costs of training of
+``dynamic`` and ``linear`` are comparable.
 
 The fraction of trials or seeds has Wilson's interval. Beside it is the count for the deployment phase, in
 which learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``.
