@@ -204,8 +204,8 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
         """Render one RGB frame per environment, uint8 [height * 32, width * 32, 3], with MiniGrid."""
-        # MiniGrid takes long to import, and minigrid_env imports this module.
-        from recrl.environments.rivergrid.minigrid_env import render_frame  # noqa: PLC0415
+        # MiniGrid takes long to import
+        from recrl.environments.rivergrid.minigrid_drawing import render_frame  # noqa: PLC0415
 
         frames = []
         for state in self.states.tolist():

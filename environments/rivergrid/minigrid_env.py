@@ -11,16 +11,13 @@ of your own, ``recrl/RiverGrid-v0``:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box, Discrete
-from minigrid.core.grid import Grid
 from minigrid.core.mission import MissionSpace
-from minigrid.core.world_object import Floor, Goal, Wall, WorldObj
 from minigrid.minigrid_env import MiniGridEnv
 
 from recrl.environments.cmdp import Floats
@@ -36,38 +33,13 @@ from recrl.environments.rivergrid.grid_world import (
     state_index,
     task_map,
 )
-from recrl.environments.rivergrid.maps import GOAL, MAPS, MUD, RIVER, WALL, Cell, RiverMap, parse_map
-
-TILE_PIXELS = 32
-OBJECTS: dict[str, Callable[[], WorldObj]] = {
-    WALL: Wall,
-    RIVER: Floor,  # a Floor is blue
-    MUD: partial(Floor, "yellow"),
-    GOAL: Goal,
-}
+from recrl.environments.rivergrid.maps import MAPS, MUD, RIVER, parse_map
+from recrl.environments.rivergrid.minigrid_drawing import TILE_PIXELS, river_minigrid
 
 
 def mission() -> str:
     """Return MiniGrid's mission text; a named function, because MiniGrid pickles it."""
     return "reach the goal, mind the river"
-
-
-def river_minigrid(river_map: RiverMap) -> Grid:
-    """Return the map as MiniGrid's objects."""
-    grid = Grid(river_map.width, river_map.height)
-    for x in range(river_map.width):
-        for y in range(river_map.height):
-            kind = OBJECTS.get(river_map.tile((x, y)))
-            grid.set(x, y, kind() if kind else None)
-    return grid
-
-
-def render_frame(
-    river_map: RiverMap, cell: Cell, heading: int, *, tile_pixels: int = TILE_PIXELS
-) -> npt.NDArray[np.uint8]:
-    """Render the map with the agent in ``cell``, uint8 [height tile_pixels, width tile_pixels, 3]."""
-    frame: npt.NDArray[np.uint8] = river_minigrid(river_map).render(tile_pixels, cell, heading)
-    return frame
 
 
 class RiverGridEnv(MiniGridEnv):

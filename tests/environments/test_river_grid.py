@@ -27,7 +27,8 @@ from recrl.environments.rivergrid.grid_world import (
     state_index,
 )
 from recrl.environments.rivergrid.maps import MAPS, MapGenerator, generate_map, parse_map
-from recrl.environments.rivergrid.minigrid_env import RiverGridEnv, render_frame
+from recrl.environments.rivergrid.minigrid_drawing import render_frame
+from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
 
 register_all()
 IDENTIFIERS = ["recrl/RiverGrid-1a-v0", "recrl/RiverGrid-1b-v0", "recrl/RiverGrid-v0"]
