@@ -1,4 +1,4 @@
-"""A RiverGrid map as MiniGrid's objects, and its picture."""
+"""A RiverGrid map as MiniGrid's objects, and its rendering."""
 
 from __future__ import annotations
 
