@@ -29,7 +29,9 @@ def power(difference: float, seeds: int) -> float:
 
 def detectable(seeds: int) -> float:
     """Return the difference, in standard deviations, that is found with probability POWER."""
-    return float(optimize.brentq(lambda difference: power(difference, seeds) - POWER, 0.0, 6.0 / math.sqrt(seeds)))
+    return float(
+        optimize.brentq(lambda difference: power(difference, seeds) - POWER, 0.0, 6.0 / math.sqrt(seeds))
+    )
 
 
 def pooled(returns: pd.DataFrame) -> tuple[float, int]:
