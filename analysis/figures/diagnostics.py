@@ -68,7 +68,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
         f"{EXPLAINED}cost_{cost}",
         "kl",
     )
-    rows = [name for name in quantities if _known(updates, name)]
+    rows = [quantities[0], *(name for name in quantities[1:] if _known(updates, name))]
     limit = float(trials[f"deploy_limit_{cost}"].iloc[0])
     target = _target(sweep, agent)
     with styles.context():
@@ -90,7 +90,8 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             column[0].set_title(method)
             panels.step_axis(column[-1], 0.0, total)
             column[-1].set_xlabel("environment steps")
-        panels.cost_axis(grid[0, 0], limit, float(np.nanmax(updates[f"cost_{cost}"].to_numpy(np.float64))))
+        largest = updates[f"cost_{cost}"].fillna(0.0).max()  # 0 before the first episode has finished
+        panels.cost_axis(grid[0, 0], limit, float(largest))
         low, high = grid[0, 0].get_ylim()
         for axes in grid[0]:
             panels.infeasible_region(axes, limit)

@@ -227,7 +227,8 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Calla
     made: dict[str, Callable[[], Figure | None]] = {
         "return-against-cost": partial(return_against_cost, sweep)
     }
-    for agent in agents:
+    curveless = _without_episodes(sweep)
+    for agent in (it for it in agents if it not in curveless):
         made[f"learning-curves_{_safe(agent)}"] = partial(
             learning_curves.learning_curves, sweep, agent, averaging=averaging
         )
@@ -256,9 +257,17 @@ def _safe(label: str) -> str:
     return re.sub(r"[^A-Za-z0-9.+-]+", "-", label)
 
 
+def _without_episodes(sweep: Sweep) -> list[str]:
+    """Return the agents that have updates, but no finished episode in any of them."""
+    finished = sweep.updates["episode_return"].notna().groupby(sweep.updates["agent"], observed=True).any()
+    return [str(agent) for agent in finished.index[~finished]]
+
+
 def missing(sweep: Sweep) -> list[str]:
     """Return sentences on incomplete results; empty for a complete sweep."""
     sentences = [*sweep.notes, *doubts(sweep)]
+    for agent in _without_episodes(sweep):
+        sentences.append(f"{agent}: no episode has finished, so there are no learning curves")
     for status, what in (
         (TrialState.DAMAGED, "damaged"),
         (TrialState.FAILED, "failed"),

@@ -33,7 +33,7 @@ figcaption { color: #555; font-size: 0.85rem; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; overflow-wrap: normal; padding: 0.2rem 0.6rem 0.2rem 0; white-space: nowrap;
          border-bottom: 1px solid #e6e6e6; }
-th { border-bottom: 2px solid #999; vertical-align: bottom; }
+th { border-bottom: 2px solid #999; vertical-align: bottom; white-space: normal; }
 pre { font-size: 0.8rem; background: #f6f6f6; padding: 0.6rem; overflow-x: auto; }
 details { border-top: 1px solid #ddd; padding: 0.5rem 0; }
 summary { cursor: pointer; }
@@ -48,7 +48,6 @@ tr.infeasible td { background: #fbe9e7; }
 tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
 .verdicts td.verdict { white-space: normal; min-width: 13rem; }
 .verdicts td:last-child { white-space: normal; min-width: 9rem; }
-.verdicts th { white-space: normal; }
 @media screen and (max-width: 44rem) {
   .verdicts td.verdict { min-width: 7rem; }
   .verdicts th { white-space: nowrap; }

@@ -162,8 +162,10 @@ def _comparison_tables(
     tables = []
     for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT) if len(compared) else ():
         rows = table_formats.compared_rows(compared, averaged, measure)
+        if not len(rows):
+            continue
         table = table_formats.comparison_table(rows, suffixes)
-        marked = table["P(higher return)"].str.contains(table_formats.TOO_FEW).any() if len(table) else False
+        marked = table["P(higher return)"].str.contains(table_formats.TOO_FEW).any()
         note = f"{TIES} {FEW}" if marked else TIES
         tables.append(
             ShownTable(f"{_heading(measure)}, minus none", table, note, table_formats.row_kinds(rows))

@@ -1,9 +1,11 @@
 """One call draws a sweep, as far as it has come."""
 
+import dataclasses
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from recrl.analysis.data import sweep_data
@@ -169,3 +171,14 @@ def test_the_page_holds_everything_and_fetches_nothing(
     assert set(reader.outside) <= {path.name for path in (tmp_path / "figures").iterdir()}
     for sentence in ("<b>bold & wide", "<script>alert(1)</script>", '{"torch": "9.9"}', "Provenance"):
         assert sentence in reader.text
+
+
+def test_a_sweep_in_which_no_episode_has_finished_can_be_drawn(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    sweep = sweep_data.load(made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none", "step"]))
+    updates = sweep.updates.assign(episode_return=np.nan, cost_0=np.nan)
+    files = drawing.draw(dataclasses.replace(sweep, updates=updates), tmp_path)
+    assert not [path for path in files if path.stem.startswith("learning-curves")]
+    assert (tmp_path / "diagnostics_a_cpo.png").exists()
+    assert "no episode has finished, so there are no learning curves" in (tmp_path / "report.md").read_text()
