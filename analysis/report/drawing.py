@@ -227,8 +227,8 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Calla
     made: dict[str, Callable[[], Figure | None]] = {
         "return-against-cost": partial(return_against_cost, sweep)
     }
-    curveless = _without_episodes(sweep)
-    for agent in (it for it in agents if it not in curveless):
+    without_episodes = _without_episodes(sweep)
+    for agent in (it for it in agents if it not in without_episodes):
         made[f"learning-curves_{_safe(agent)}"] = partial(
             learning_curves.learning_curves, sweep, agent, averaging=averaging
         )
