@@ -411,7 +411,6 @@ SHIPPED = {
     "safety-gym": 150,
     "safety-gym-agents": 27,
     "safety-gym-curricula": 54,
-    "safety-gym-small": 36,
     "safety-gym-table": 90,
     "velocity": 180,
     "velocity-curricula": 180,
