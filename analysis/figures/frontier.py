@@ -50,7 +50,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     agents = occurring(rows["agent"])
     cells = _cells(sweep, rows)
-    clipped = False
+    clipped = known = False
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 2.0 * len(cells) + 1.05), layout="constrained")
         grid = figure.subplots(len(cells), len(agents), squeeze=False, sharex="row", sharey="row")
@@ -62,6 +62,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
             far = _right_edge(chosen)
             clipped = clipped or bool((chosen[COST] > far).any())
             costs, returns = _frontier(sweep, trials, far=far)
+            known = known or bool(costs.size)
             for axes, agent in zip(line, agents, strict=True):
                 axes.plot(costs, returns, color=OPTIMUM_COLOUR, linewidth=0.9, zorder=1.0)
                 _points(axes, chosen[chosen["agent"] == agent], look, far=far)
@@ -72,7 +73,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
                 axes.set_xlabel(f"episode cost{cost_suffix(sweep, i, task)}")
             line[0].set_ylabel("return")
         present = [method for method in look if (rows["method"] == method).any()]
-        _legend(figure, look, present, clipped=clipped)
+        _legend(figure, look, present, known=known, clipped=clipped)
     return figure
 
 
@@ -157,13 +158,14 @@ def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far
     axes.set_xlim(-0.05 * far, far)
 
 
-def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str], *, clipped: bool) -> None:
+def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str], *, known: bool, clipped: bool) -> None:
     """Draw the legends.
 
     Args:
         figure: the whole one.
         look: of all methods.
         methods: that are drawn.
+        known: whether a best return is drawn.
         clipped: whether a mark is on the right edge because its cost is larger.
     """
     handles = [
@@ -182,8 +184,10 @@ def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str], *,
     references: list[Line2D | Patch] = [
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, label="limit $d_d$"),
         panels.infeasible_patch(),
-        Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.9, label="best return $J^*(d)$, where known"),
     ]
+    if known:
+        best = Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.9, label="best return $J^*(d)$, where known")
+        references.append(best)
     panels.legend_below(figure, references)
     title = "final policies, one mark per run: filled if feasible, hollow if not"
     if clipped:

@@ -174,6 +174,9 @@ def test_without_a_known_optimum_there_are_policies_and_limits_but_no_frontier(f
     assert figure is not None
     assert len(np.asarray(lines_of(figure.axes[0], OPTIMUM_COLOUR)[0].get_xydata())) == 0
     assert lines_of(figure.axes[0], LIMIT_COLOUR)[0].get_xdata() == [5.0, 5.0]
+    named = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert "limit $d_d$" in named
+    assert not any("best return" in name for name in named)
 
 
 def test_each_cost_has_its_own_row(made_up_sweep: Callable[..., SweepStore]) -> None:
