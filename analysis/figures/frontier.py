@@ -158,7 +158,9 @@ def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far
     axes.set_xlim(-0.05 * far, far)
 
 
-def _legend(figure: Figure, look: dict[str, MethodStyle], methods: list[str], *, known: bool, clipped: bool) -> None:
+def _legend(
+    figure: Figure, look: dict[str, MethodStyle], methods: list[str], *, known: bool, clipped: bool
+) -> None:
     """Draw the legends.
 
     Args:
