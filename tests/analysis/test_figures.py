@@ -8,6 +8,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from PIL import Image
@@ -24,6 +25,10 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 
 def lines_of(axes: Axes, colour: str) -> list[Line2D]:
     return [line for line in axes.get_lines() if line.get_color() == colour]
+
+
+def legend_texts(figure: Figure) -> list[str]:
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
 @pytest.fixture
@@ -137,6 +142,7 @@ def test_final_policies_lie_under_the_frontier_left_of_the_shaded_region(finishe
     panel = figure.axes[0]
     frontier = np.asarray(lines_of(panel, OPTIMUM_COLOUR)[0].get_xydata())
     assert [5.0, 14.0] in frontier.tolist()
+    assert "best return $J^*(d)$, where known" in legend_texts(figure)
     feasible = [len(np.asarray(marks.get_facecolor())) for marks in panel.collections]
     assert feasible[:2] == [3, 3]  # filled
     runs = [np.asarray(marks.get_offsets()).tolist() for marks in panel.collections]
@@ -174,9 +180,8 @@ def test_without_a_known_optimum_there_are_policies_and_limits_but_no_frontier(f
     assert figure is not None
     assert len(np.asarray(lines_of(figure.axes[0], OPTIMUM_COLOUR)[0].get_xydata())) == 0
     assert lines_of(figure.axes[0], LIMIT_COLOUR)[0].get_xdata() == [5.0, 5.0]
-    named = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert "limit $d_d$" in named
-    assert not any("best return" in name for name in named)
+    assert "limit $d_d$" in legend_texts(figure)
+    assert not any("best return" in text for text in legend_texts(figure))
 
 
 def test_each_cost_has_its_own_row(made_up_sweep: Callable[..., SweepStore]) -> None:
