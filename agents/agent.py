@@ -51,16 +51,19 @@ class Rollout:
     carried_costs: Floats
     carried_lengths: npt.NDArray[np.int64]
 
+    def ages(self) -> npt.NDArray[np.int64]:
+        """Number of earlier steps of the episode of each step, [T, B]."""
+        ages = np.empty(self.rewards.shape, np.int64)
+        so_far = self.carried_lengths.copy()
+        for step, over in enumerate(self.terminated | self.truncated):
+            ages[step] = so_far
+            so_far += 1
+            so_far[over] = 0
+        return ages
+
     def finished_lengths(self) -> npt.NDArray[np.int64]:
         """Lengths of the E episodes that ended in the rollout, earlier steps included, [E], by (t, b)."""
-        ended = self.terminated | self.truncated
-        lengths = np.empty(ended.shape, np.int64)
-        so_far = self.carried_lengths.copy()
-        for step, over in enumerate(ended):
-            so_far += 1
-            lengths[step] = so_far
-            so_far[over] = 0
-        return lengths[ended]
+        return self.ages()[self.terminated | self.truncated] + 1
 
 
 class Policy(Protocol):

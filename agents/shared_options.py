@@ -135,9 +135,9 @@ class ActorCriticConfig(BaseModel):
     )
     constraint_window: Count = Field(
         default=16,
-        description="Least number of episodes for a mean cost. If fewer finish in an update, the "
-        "mean cost of the rollout's steps times the mean episode length is used; with "
-        "fewer environments than this, episodes of earlier updates are included (ours).",
+        description="Least number of episodes for a mean cost. If fewer finish in an update, it is that "
+        "of a life table. For every age of an episode, this has the newest steps of at least this "
+        "number of episodes, finished or not (ours).",
     )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",

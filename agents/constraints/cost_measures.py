@@ -39,6 +39,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.agents.agent import Rollout
+from recrl.agents.learning.scales import quotient
 from recrl.environments.cmdp import Floats
 
 
@@ -109,25 +110,59 @@ def standard_errors(costs: Floats) -> Floats:
     return errors
 
 
-def cost_of_steps(costs: Floats, episode_length: float) -> tuple[Floats, Floats]:
-    """Estimate the mean episode cost from steps: the mean cost per step times the mean episode length.
+class LifeTable:
+    """Mean episode cost from the steps of episodes, finished or not, by age: the number of earlier steps.
 
-    The environments are at different stages of their episodes, so their steps are a sample of whole episodes
-    under the current policy. Episodes that finish in a rollout shorter than they are were begun many updates
-    ago.
+    Episodes that finish in a rollout much shorter than they are were begun many updates ago, while the
+    rollout's steps are of the current policy. But these steps may belong to one part of the episodes only.
+    Environments get in step with one another if their episodes end after similar times. So every age has its
+    own mean,
+
+        J = sum over ages t of S_t c_t,  S_t = product over u < t of (1 - h_u),
+
+    with c_t the mean cost of a step of age t, and h_t the fraction of such steps that ended an episode
+    (Kaplan and Meier 1958). Both are over the newest rollouts that contain at least ``window`` steps of that
+    age. The mean of the older ones counts with the number of steps that the newest one lacks.
 
     Args:
-        costs: of each step, [T, B, k].
-        episode_length: mean number of steps of an episode.
-
-    Returns:
-        The estimate and its standard error over the B environments, [k] each; the error is 0 if B is 1.
-
-    >>> cost_of_steps(np.array([[[0.0], [1.0]], [[0.0], [1.0]]]), 10.0)
-    (array([5.]), array([5.]))
+        window: the least number of steps of an age, at least 1; fewer are used only at the start.
+        num_costs: k.
     """
-    of_environments = episode_length * costs.mean(axis=0)
-    return of_environments.mean(axis=0), standard_errors(of_environments)
+
+    def __init__(self, window: int, num_costs: int) -> None:
+        self._window = window
+        self._steps: Floats = np.zeros(0)
+        self._sums: Floats = np.zeros((1 + num_costs, 0))
+
+    def add(self, rollout: Rollout) -> None:
+        """Include a rollout of T steps in each of B environments."""
+        ages, ended = rollout.ages().ravel(), rollout.terminated | rollout.truncated
+        steps = np.bincount(ages, minlength=len(self._steps)).astype(np.float64)
+        counted = [ended, *np.moveaxis(rollout.costs, -1, 0)]
+        sums = np.array([np.bincount(ages, each.ravel(), len(steps)) for each in counted])
+        older = len(steps) - len(self._steps)
+        before, sums_before = np.pad(self._steps, (0, older)), np.pad(self._sums, ((0, 0), (0, older)))
+        kept = np.clip(self._window - steps, 0.0, before)
+        self._steps = steps + kept
+        self._sums = sums + sums_before * quotient(kept, before)
+
+    def mean_cost(self) -> tuple[Floats, float]:
+        """Return the mean episode cost J, [k], and the number of episodes: the steps at each age, averaged.
+
+        The average is the harmonic one, weighted by S_t, as the variance of a mean falls with 1 / steps.
+        """
+        ended, *costs = quotient(self._sums, self._steps)
+        survival = np.cumprod(np.concatenate([[1.0], 1.0 - ended[:-1]]))
+        number = survival.sum() / (survival @ quotient(np.ones_like(self._steps), self._steps))
+        return np.array(costs) @ survival, float(number)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the number of steps of each of A ages, [A], and their sums of ends and costs, [1 + k, A]."""
+        return {"steps": self._steps, "sums": self._sums}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._steps, self._sums = np.array(state["steps"]), np.array(state["sums"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,43 +245,46 @@ class MeasuredCosts:
 
 
 class MeanCost:
-    """Constraint on the mean episode cost; it has no state.
+    """Constraint on the mean episode cost.
 
     Args:
-        window: the least number of episodes for an estimate.
+        window: the least number of episodes for an estimate; fewer are used only at the start.
+        num_costs: k.
     """
 
-    def __init__(self, window: int) -> None:
+    def __init__(self, window: int, num_costs: int) -> None:
         self._window = window
+        self._table = LifeTable(window, num_costs)
 
     def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
-        """Estimate the mean cost, preferably from what the current policy did.
+        """Estimate the mean cost from what the newest policies did.
 
-        That is the mean of the episodes that finished in the rollout, if there are as many as the window
-        needs. Else it is the cost of the rollout's steps (``cost_of_steps``), if they belong to as many
-        episodes. Else the window includes episodes of earlier updates. If no episode finished, the last is
-        unknown.
+        If at least ``window`` episodes finished in the rollout, it is their mean, else the life table's. It
+        is unknown until an episode has finished. The standard error is that of the mean of as many
+        episodes as the estimate is based on, with the deviation of recent ones.
 
         Args:
             rollout: the steps.
             episodes: of the window.
             limits: d, [k], possibly infinite; the mean does not need them.
         """
-        enough_environments = rollout.costs.shape[1] >= self._window
-        if episodes.finished < self._window and enough_environments and len(episodes.lengths):
-            values, errors = cost_of_steps(rollout.costs, float(episodes.lengths.mean()))
-        elif episodes.finished:
+        self._table.add(rollout)
+        if not len(episodes.costs):
+            values, errors = np.full_like(limits, np.nan), np.zeros_like(limits)
+        elif episodes.finished >= self._window:
             values, errors = episodes.costs.mean(axis=0), standard_errors(episodes.costs)
         else:
-            values, errors = np.full_like(limits, np.nan), np.zeros_like(limits)
+            values, number = self._table.mean_cost()
+            errors = standard_errors(episodes.costs) * math.sqrt(len(episodes.costs) / number)
         return MeasuredCosts(rollout.costs, values, errors)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return an empty state."""
-        return {}
+        """Return the life table."""
+        return self._table.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Load nothing."""
+        """Continue exactly where ``state_dict`` was taken."""
+        self._table.load_state_dict(state)
 
 
 class TailCost:

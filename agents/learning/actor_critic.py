@@ -87,7 +87,7 @@ class ActorCritic:
         self._constraint = (
             TailCost(config.cvar_level, cmdp.num_costs)
             if config.constraint == "cvar"
-            else MeanCost(config.constraint_window)
+            else MeanCost(config.constraint_window, cmdp.num_costs)
         )
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,

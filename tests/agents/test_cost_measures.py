@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy import stats
 from scipy.optimize import brentq
@@ -13,6 +14,7 @@ from recrl.agents.agent import Rollout
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.constraints.cost_measures import (
     Episodes,
+    LifeTable,
     MeanCost,
     RecentEpisodes,
     TailCost,
@@ -98,8 +100,8 @@ def test_at_level_0_and_value_at_risk_0_tail_costs_are_costs() -> None:
     np.testing.assert_allclose(found, costs)
 
 
-def rollout_of(costs: Floats) -> Rollout:
-    """Steps with one cost, [T] or [T, B], none of which ends an episode."""
+def rollout_of(costs: Floats, age: int | npt.NDArray[np.int64] = 0, ended: npt.ArrayLike = False) -> Rollout:
+    """Steps with one cost, [T] or [T, B], in episodes that had ``age`` steps before; ``ended`` [T, B]."""
     costs = costs.reshape(len(costs), -1, 1)
     shape = costs.shape[:2]
     never, nothing = np.zeros(shape, bool), np.zeros((0, 1), np.float32)
@@ -108,12 +110,12 @@ def rollout_of(costs: Floats) -> Rollout:
         actions=np.zeros(shape, np.int64),
         rewards=np.zeros(shape),
         costs=costs,
-        terminated=never,
+        terminated=never | np.array(ended, bool),
         truncated=never,
         final_observations=nothing,
         last_observations=np.zeros((shape[1], 1), np.float32),
         carried_costs=np.zeros((shape[1], 1)),
-        carried_lengths=np.zeros(shape[1], np.int64),
+        carried_lengths=np.full(shape[1], age),
     )
 
 
@@ -144,48 +146,89 @@ def test_without_a_finished_episode_the_value_at_risk_stays_and_nothing_is_known
 
 def test_the_mean_is_that_of_the_episodes_where_enough_finished() -> None:
     rollout = rollout_of(np.array([[1.0, 1.0], [3.0, 3.0]]))
-    found = MeanCost(2).measure(rollout, episodes_of(1.0, 3.0), np.array([9.0]))
+    found = MeanCost(2, 1).measure(rollout, episodes_of(1.0, 3.0), np.array([9.0]))
     assert found.step_costs is rollout.costs
     assert (found.values.tolist(), found.standard_errors.tolist()) == ([2.0], [1.0])
 
 
 def test_where_few_episodes_finished_the_mean_is_that_of_the_steps() -> None:
-    """Two environments cost 0.5 and 1.5 a step; episodes of 10 steps cost 5 and 15 by that, 99 long ago."""
+    """Steps of age 0 cost 0 and 1, of age 1 then 1 and 2: 0.5 + 1.5 an episode; 98 and 100 long ago."""
     rollout = rollout_of(np.array([[0.0, 1.0], [1.0, 2.0]]))
     for finished in (0, 1):
-        found = MeanCost(2).measure(rollout, episodes_of(99.0, 99.0, finished=finished), np.array([9.0]))
-        assert found.values.tolist() == [10.0]
-        assert found.standard_errors.tolist() == pytest.approx([5.0])
+        found = MeanCost(2, 1).measure(rollout, episodes_of(98.0, 100.0, finished=finished), np.array([9.0]))
+        assert found.values.tolist() == [2.0]
+        assert found.standard_errors.tolist() == pytest.approx([1.0])
 
 
-def test_with_few_environments_the_mean_is_that_of_the_window() -> None:
-    rollout = rollout_of(np.zeros((3, 2)))
-    found = MeanCost(3).measure(rollout, episodes_of(2.0, 4.0, 6.0, finished=1), np.array([9.0]))
-    assert found.values.tolist() == [4.0]
-    unknown = MeanCost(3).measure(rollout, episodes_of(2.0, 4.0, 6.0, finished=0), np.array([9.0]))
-    assert math.isnan(unknown.values[0])
+def test_a_life_table_by_hand() -> None:
+    """Ages 0 to 2: of two steps each none, one and one end an episode; of age 1 they cost 2, of age 2 4.
+
+    So an episode reaches the ages with probability 1, 1 and 1/2, and costs 2 + 4 / 2.
+    """
+    table = LifeTable(2, 1)
+    costs = np.array([[0.0, 0.0], [2.0, 2.0], [0.0, 4.0], [0.0, 4.0]])
+    table.add(rollout_of(costs[:2], ended=[[False, False], [True, False]]))
+    # The first environment is at age 0 again, the second at age 2, and the next time, too.
+    table.add(rollout_of(costs[2:3], age=np.array([0, 2]), ended=[[False, True]]))
+    table.add(rollout_of(costs[3:], age=np.array([0, 2]), ended=[[False, False]]))
+    mean, number = table.mean_cost()
+    assert mean.tolist() == [4.0]
+    assert number == pytest.approx(2.0)
 
 
-def test_the_mean_is_unknown_until_an_episode_tells_its_length() -> None:
-    assert math.isnan(MeanCost(1).measure(rollout_of(np.ones(3)), NONE, np.array([9.0])).values[0])
+def test_older_steps_of_an_age_count_as_far_as_the_newest_rollout_lacks_steps() -> None:
+    """Four steps cost 1, then three cost 5: with a window of 4 one of the older ones counts, (1 + 15) / 4."""
+    table = LifeTable(4, 1)
+    table.add(rollout_of(np.full((1, 4), 1.0)))
+    table.add(rollout_of(np.full((1, 3), 5.0)))
+    resumed = LifeTable(4, 1)
+    resumed.load_state_dict(table.state_dict())
+    for each in (table, resumed):
+        assert each.mean_cost()[0].tolist() == [4.0]
+        each.add(rollout_of(np.full((1, 5), 7.0)))
+        mean, number = each.mean_cost()
+        assert mean.tolist() == [7.0]
+        assert number == pytest.approx(5.0)
 
 
-def test_the_estimate_from_steps_is_right_for_random_lengths() -> None:
-    """Each step costs 1 with probability 0.3 and ends the episode with 0.02: 0.3 x 50 an episode."""
+def test_the_mean_is_unknown_until_an_episode_has_finished() -> None:
+    assert math.isnan(MeanCost(1, 1).measure(rollout_of(np.ones(3)), NONE, np.array([9.0])).values[0])
+
+
+@pytest.mark.parametrize("lengths", ["alike", "two", "random", "full"])
+def test_the_life_table_is_right_whether_or_not_the_environments_are_in_step(lengths: str) -> None:
+    """Only the last 20 steps of an episode cost 1 each; of random lengths, each step by chance.
+
+    In rollouts of 16 steps, environments that are in step have such a cost in few of them.
+    """
     generator = np.random.default_rng(0)
-    window = RecentEpisodes(16, 1)
-    carried, found = np.zeros(64, np.int64), []
-    for _ in range(400):
-        costs = (generator.random((4, 64)) < 0.3).astype(float)
-        ended, lengths = generator.random((4, 64)) < 0.02, []
-        for over in ended:
-            carried += 1
-            lengths += carried[over].tolist()
-            carried[over] = 0
-        episodes = window.add(np.zeros((len(lengths), 1)), np.array(lengths, np.int64))
-        if len(episodes.lengths):
-            found.append(MeanCost(17).measure(rollout_of(costs), episodes, np.array([9.0])).values[0])
-    assert np.mean(found[50:]) == pytest.approx(15.0, rel=0.05)
+
+    def draw(count: int) -> npt.NDArray[np.int64]:
+        if lengths == "alike":
+            return generator.integers(98, 103, count)
+        if lengths == "two":
+            return np.where(generator.random(count) < 0.5, 60, 250)
+        return generator.geometric(0.02, count) if lengths == "random" else np.full(count, 250)
+
+    table, ends = LifeTable(16, 1), draw(64)
+    ages = np.arange(64) * 4 if lengths == "full" else np.zeros(64, np.int64)
+    ages %= ends
+    so_far, truths, found = np.zeros(64), list[float](), list[float]()
+    for update in range(200):
+        costs, ended, before = np.zeros((16, 64)), np.zeros((16, 64), bool), ages.copy()
+        for step in range(16):
+            costs[step] = generator.random(64) < 0.3 if lengths == "random" else ages >= ends - 20
+            so_far, ages = so_far + costs[step], ages + 1
+            ended[step] = ages >= ends
+            if update > 20:
+                truths += so_far[ended[step]].tolist()
+            so_far[ended[step]], ages[ended[step]] = 0.0, 0
+            ends[ended[step]] = draw(int(ended[step].sum()))
+        table.add(rollout_of(costs, age=before, ended=ended))
+        if update > 40:
+            found.append(table.mean_cost()[0][0])
+    assert np.mean(found) == pytest.approx(np.mean(truths), rel=0.05)
+    assert np.std(found) < 0.25 * np.mean(truths)
 
 
 def test_the_window_has_the_newest_update_and_earlier_ones_until_it_is_full() -> None:
