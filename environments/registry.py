@@ -94,11 +94,11 @@ TASKS: dict[str, Task] = {
         optimum="recrl.environments.continuous_bandit:continuous_bandit_optimum",
     ),
     "rivergrid-1a": _river_grid(
-        "The paper's RiverGrid 1a: the goal is only reached through the river, at a cost of 5.",
+        "Our version of the paper's RiverGrid 1a: the goal is only reached through the river, cost 5.",
         costs=("river", "turns"),
     ),
     "rivergrid-1b": _river_grid(
-        "The paper's RiverGrid 1b: through the river at a cost of 5, or round it at a cost of 0."
+        "Our version of the paper's RiverGrid 1b: through the river, cost 5, or round it, cost 0."
     ),
     "rivergrid": _river_grid(
         "RiverGrid on a map of your own or on a random solvable one.",
