@@ -136,8 +136,8 @@ class ActorCriticConfig(BaseModel):
     constraint_window: Count = Field(
         default=16,
         description="Least number of episodes for a mean cost. If fewer finish in an update, it is that "
-        "of a life table. For every age of an episode, this has the newest steps of at least this "
-        "number of episodes, finished or not (ours).",
+        "of a life table, which averages over this number of steps of each age. With "
+        "cvar, episodes of earlier updates are included (ours).",
     )
     value_target: Literal["lambda-return", "reward-to-go"] = Field(
         default="lambda-return",

@@ -121,11 +121,12 @@ class LifeTable:
         J = sum over ages t of S_t c_t,  S_t = product over u < t of (1 - h_u),
 
     with c_t the mean cost of a step of age t, and h_t the fraction of such steps that ended an episode
-    (Kaplan and Meier 1958). Both are over the newest rollouts that contain at least ``window`` steps of that
-    age. The mean of the older ones counts with the number of steps that the newest one lacks.
+    (Kaplan and Meier 1958). Both are exponential averages: if a rollout has n steps of that age, it counts n,
+    and all earlier ones together count what ``window`` steps lack. So ages that few episodes reach have older
+    steps. Until the table has whole episodes, J is too low, as later ages count 0.
 
     Args:
-        window: the least number of steps of an age, at least 1; fewer are used only at the start.
+        window: the least number of steps that an age counts, at least 1; fewer only at the start.
         num_costs: k.
     """
 
@@ -260,8 +261,8 @@ class MeanCost:
         """Estimate the mean cost from what the newest policies did.
 
         If at least ``window`` episodes finished in the rollout, it is their mean, else the life table's. It
-        is unknown until an episode has finished. The standard error is that of the mean of as many
-        episodes as the estimate is based on, with the deviation of recent ones.
+        is unknown until an episode has finished. The standard error is that of
+        a mean of as many episodes as there are steps of each age.
 
         Args:
             rollout: the steps.

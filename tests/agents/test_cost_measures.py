@@ -152,12 +152,17 @@ def test_the_mean_is_that_of_the_episodes_where_enough_finished() -> None:
 
 
 def test_where_few_episodes_finished_the_mean_is_that_of_the_steps() -> None:
-    """Steps of age 0 cost 0 and 1, of age 1 then 1 and 2: 0.5 + 1.5 an episode; 98 and 100 long ago."""
+    """Steps of age 0 cost 0 and 1, of age 1 then 1 and 2: 0.5 + 1.5 an episode; 96 to 100 long ago.
+
+    Those have a standard deviation of 2, and there are two steps of each age.
+    """
     rollout = rollout_of(np.array([[0.0, 1.0], [1.0, 2.0]]))
     for finished in (0, 1):
-        found = MeanCost(2, 1).measure(rollout, episodes_of(98.0, 100.0, finished=finished), np.array([9.0]))
+        found = MeanCost(2, 1).measure(
+            rollout, episodes_of(96.0, 98.0, 100.0, finished=finished), np.array([9.0])
+        )
         assert found.values.tolist() == [2.0]
-        assert found.standard_errors.tolist() == pytest.approx([1.0])
+        assert found.standard_errors.tolist() == pytest.approx([2.0 / math.sqrt(2.0)])
 
 
 def test_a_life_table_by_hand() -> None:
@@ -177,14 +182,19 @@ def test_a_life_table_by_hand() -> None:
 
 
 def test_older_steps_of_an_age_count_as_far_as_the_newest_rollout_lacks_steps() -> None:
-    """Four steps cost 1, then three cost 5: with a window of 4 one of the older ones counts, (1 + 15) / 4."""
+    """Four steps cost 1, then three cost 5: with a window of 4 one of the older ones counts, (1 + 15) / 4.
+
+    Of two more that cost 9, the mean of all earlier ones counts 2: (8 + 18) / 4.
+    """
     table = LifeTable(4, 1)
     table.add(rollout_of(np.full((1, 4), 1.0)))
     table.add(rollout_of(np.full((1, 3), 5.0)))
+    assert table.mean_cost()[0].tolist() == [4.0]
+    table.add(rollout_of(np.full((1, 2), 9.0)))
     resumed = LifeTable(4, 1)
     resumed.load_state_dict(table.state_dict())
     for each in (table, resumed):
-        assert each.mean_cost()[0].tolist() == [4.0]
+        assert each.mean_cost()[0].tolist() == [6.5]
         each.add(rollout_of(np.full((1, 5), 7.0)))
         mean, number = each.mean_cost()
         assert mean.tolist() == [7.0]

@@ -18,7 +18,7 @@ KEYS = ["task", "agent", "method", "seed", "policy"]
 
 
 def final_policies(sweep: Path) -> pd.DataFrame:
-    """Means and standard errors over the episodes of each evaluation; complete trials only."""
+    """Means over the episodes of each evaluation, with standard errors; complete trials only."""
     evaluations = load(SweepStore(sweep.parent, sweep.name)).evaluations
     grouped = evaluations.groupby(KEYS, observed=True)
     columns = {"return": "episode_return", "cost": "cost_0"}
@@ -26,6 +26,7 @@ def final_policies(sweep: Path) -> pd.DataFrame:
     for name, column in columns.items():
         table[name] = grouped[column].mean().round(3)
         table[f"{name}_se"] = grouped[column].sem().round(3)
+    table["length"] = grouped["length"].mean().round(1)
     return pd.DataFrame(table).reset_index()
 
 
