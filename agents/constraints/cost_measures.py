@@ -39,7 +39,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.agents.agent import Rollout
-from recrl.agents.learning.scales import quotient
+from recrl.agents.constraints.life_table import LifeTable
 from recrl.environments.cmdp import Floats
 
 
@@ -108,62 +108,6 @@ def standard_errors(costs: Floats) -> Floats:
         return np.zeros(costs.shape[1])
     errors: Floats = costs.std(axis=0, ddof=1) / math.sqrt(len(costs))
     return errors
-
-
-class LifeTable:
-    """Mean episode cost from the steps of episodes, finished or not, by age: the number of earlier steps.
-
-    Episodes that finish in a rollout much shorter than they are were begun many updates ago, while the
-    rollout's steps are of the current policy. But these steps may belong to one part of the episodes only.
-    Environments get in step with one another if their episodes end after similar times. So every age has its
-    own mean,
-
-        J = sum over ages t of S_t c_t,  S_t = product over u < t of (1 - h_u),
-
-    with c_t the mean cost of a step of age t, and h_t the fraction of such steps that ended an episode
-    (Kaplan and Meier 1958). Both are exponential averages: if a rollout has n steps of that age, it counts n,
-    and all earlier ones together count what ``window`` steps lack. So ages that few episodes reach have older
-    steps. Until the table has whole episodes, J is too low, as later ages count 0.
-
-    Args:
-        window: the least number of steps that an age counts, at least 1; fewer only at the start.
-        num_costs: k.
-    """
-
-    def __init__(self, window: int, num_costs: int) -> None:
-        self._window = window
-        self._steps: Floats = np.zeros(0)
-        self._sums: Floats = np.zeros((1 + num_costs, 0))
-
-    def add(self, rollout: Rollout) -> None:
-        """Include a rollout of T steps in each of B environments."""
-        ages, ended = rollout.ages().ravel(), rollout.terminated | rollout.truncated
-        steps = np.bincount(ages, minlength=len(self._steps)).astype(np.float64)
-        counted = [ended, *np.moveaxis(rollout.costs, -1, 0)]
-        sums = np.array([np.bincount(ages, each.ravel(), len(steps)) for each in counted])
-        older = len(steps) - len(self._steps)
-        before, sums_before = np.pad(self._steps, (0, older)), np.pad(self._sums, ((0, 0), (0, older)))
-        kept = np.clip(self._window - steps, 0.0, before)
-        self._steps = steps + kept
-        self._sums = sums + sums_before * quotient(kept, before)
-
-    def mean_cost(self) -> tuple[Floats, float]:
-        """Return the mean episode cost J, [k], and the number of episodes: the steps at each age, averaged.
-
-        The average is the harmonic one, weighted by S_t, as the variance of a mean falls with 1 / steps.
-        """
-        ended, *costs = quotient(self._sums, self._steps)
-        survival = np.cumprod(np.concatenate([[1.0], 1.0 - ended[:-1]]))
-        number = survival.sum() / (survival @ quotient(np.ones_like(self._steps), self._steps))
-        return np.array(costs) @ survival, float(number)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the number of steps of each of A ages, [A], and their sums of ends and costs, [1 + k, A]."""
-        return {"steps": self._steps, "sums": self._sums}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self._steps, self._sums = np.array(state["steps"]), np.array(state["sums"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,8 +205,8 @@ class MeanCost:
         """Estimate the mean cost from what the newest policies did.
 
         If at least ``window`` episodes finished in the rollout, it is their mean, else the life table's. It
-        is unknown until an episode has finished. The standard error is that of
-        a mean of as many episodes as there are steps of each age.
+        is unknown until an episode has finished. The table's standard error is that of a mean of as many
+        episodes as it has steps of each age.
 
         Args:
             rollout: the steps.

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from recrl.agents.agent import Rollout
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.constraints.cost_measures import (
     Episodes,
-    LifeTable,
     MeanCost,
     RecentEpisodes,
     TailCost,
@@ -22,6 +22,7 @@ from recrl.agents.constraints.cost_measures import (
     tail_costs,
     value_at_risk,
 )
+from recrl.agents.constraints.life_table import LifeTable
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector
@@ -181,6 +182,14 @@ def test_a_life_table_by_hand() -> None:
     assert number == pytest.approx(2.0)
 
 
+def test_a_life_table_of_two_costs() -> None:
+    """At ages 0 and 1 two environments cost (1 + 3) / 2 + (2 + 4) / 2, of the second cost ten times that."""
+    first = rollout_of(np.array([[1.0, 3.0], [2.0, 4.0]]))
+    table = LifeTable(1, 2)
+    table.add(replace(first, costs=np.concatenate([first.costs, 10.0 * first.costs], axis=-1)))
+    assert table.mean_cost()[0].tolist() == [5.0, 50.0]
+
+
 def test_older_steps_of_an_age_count_as_far_as_the_newest_rollout_lacks_steps() -> None:
     """Four steps cost 1, then three cost 5: with a window of 4 one of the older ones counts, (1 + 15) / 4.
 
@@ -206,10 +215,10 @@ def test_the_mean_is_unknown_until_an_episode_has_finished() -> None:
 
 
 @pytest.mark.parametrize("lengths", ["alike", "two", "random", "full"])
-def test_the_life_table_is_right_whether_or_not_the_environments_are_in_step(lengths: str) -> None:
+def test_the_life_table_is_right_whether_or_not_the_environments_are_synchronised(lengths: str) -> None:
     """Only the last 20 steps of an episode cost 1 each; of random lengths, each step by chance.
 
-    In rollouts of 16 steps, environments that are in step have such a cost in few of them.
+    In rollouts of 16 steps, synchronised environments have such a cost in few of them.
     """
     generator = np.random.default_rng(0)
 

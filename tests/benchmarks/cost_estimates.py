@@ -3,28 +3,27 @@
 Over the second half of the steps, a row a trial: mean and standard deviation of the estimates that the agent
 made at each update, and the mean cost of the episodes that finished meanwhile.
 
-python tests/benchmarks/cost_estimates.py runs/velocity --to results/velocity/estimates.csv
+python -m tests.benchmarks.cost_estimates runs/velocity --to results/velocity/estimates.csv
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import pandas as pd
 
 from recrl.analysis.data.sweep_data import load
 from recrl.orchestrator.files.sweep_store import SweepStore
+from tests.benchmarks.final_policies import write_table
 
 KEYS = ["task", "agent", "method", "seed"]
 
 
 def cost_estimates(sweep: Path) -> pd.DataFrame:
     """One row a trial."""
-    data = load(SweepStore(sweep.parent, sweep.name))
-    late = data.updates[
-        data.updates.end_step > data.updates.groupby(KEYS, observed=True).end_step.transform("max") / 2
-    ]
+    updates = load(SweepStore(sweep.parent, sweep.name)).updates
+    last_steps = updates.groupby(KEYS, observed=True).end_step.transform("max")
+    late = updates[updates.end_step > last_steps / 2]
     late = late.assign(estimate=late.cost_gap_0 + late.limit_0, sum_of_costs=late.episodes * late.cost_0)
     trials = late.groupby(KEYS, observed=True)
     columns = {
@@ -37,16 +36,5 @@ def cost_estimates(sweep: Path) -> pd.DataFrame:
     return pd.DataFrame(columns).reset_index()
 
 
-def main() -> None:
-    """Read, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("sweep", type=Path)
-    parser.add_argument("--to", type=Path, required=True)
-    arguments = parser.parse_args()
-    table = cost_estimates(arguments.sweep)
-    print(table.to_string(index=False))
-    table.to_csv(arguments.to, index=False, lineterminator="\n")
-
-
 if __name__ == "__main__":
-    main()
+    write_table(__doc__, cost_estimates)

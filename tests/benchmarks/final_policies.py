@@ -6,6 +6,7 @@ python tests/benchmarks/final_policies.py runs/safety-gym-agents --to results/sa
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +31,16 @@ def final_policies(sweep: Path) -> pd.DataFrame:
     return pd.DataFrame(table).reset_index()
 
 
-def main() -> None:
-    """Read, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def write_table(description: str | None, table_of: Callable[[Path], pd.DataFrame]) -> None:
+    """Print and write the table of the sweep that the command line names."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("sweep", type=Path)
     parser.add_argument("--to", type=Path, required=True)
     arguments = parser.parse_args()
-    table = final_policies(arguments.sweep)
+    table = table_of(arguments.sweep)
     print(table.to_string(index=False))
     table.to_csv(arguments.to, index=False, lineterminator="\n")
 
 
 if __name__ == "__main__":
-    main()
+    write_table(__doc__, final_policies)
