@@ -30,7 +30,7 @@ class Constraints:
         gaps: constrained value (the mean undiscounted episode cost, or its CVaR) minus limit, [k]; -inf where
             the limit is infinite, NaN where it is finite and the value is unknown.
         standard_errors: of the mean episode costs, [k], at least 0; 0 if they are unknown.
-        episode_length: mean steps of recent episodes, at least 1; NaN if none has finished yet.
+        episode_length: mean steps of an episode, at least 1; NaN if none has finished yet.
     """
 
     limits: Floats
@@ -39,17 +39,10 @@ class Constraints:
     episode_length: float
 
     @classmethod
-    def of(cls, measured: MeasuredCosts, lengths: npt.NDArray[np.int64], limits: Floats) -> Constraints:
-        """Compare the constrained values with the limits.
-
-        Args:
-            measured: the constrained values.
-            lengths: steps of recent episodes, [E].
-            limits: d, [k].
-        """
+    def of(cls, measured: MeasuredCosts, limits: Floats) -> Constraints:
+        """Compare the constrained values with the limits, [k]."""
         gaps = np.where(np.isfinite(limits), measured.values - limits, -np.inf)
-        length = float(lengths.mean()) if len(lengths) else float("nan")
-        return cls(limits, gaps, measured.standard_errors, length)
+        return cls(limits, gaps, measured.standard_errors, measured.episode_length)
 
     @property
     def known(self) -> bool:

@@ -124,6 +124,11 @@ class Episodes:
     lengths: npt.NDArray[np.int64]
     finished: int
 
+    @property
+    def mean_length(self) -> float:
+        """Their mean number of steps; NaN without an episode."""
+        return float(self.lengths.mean()) if len(self.lengths) else math.nan
+
 
 class RecentEpisodes:
     """Window of the last finished episodes: of the newest update, and of earlier ones until it is full.
@@ -182,11 +187,13 @@ class MeasuredCosts:
         step_costs: per step, whose sums over an episode are constrained, [T, B, k].
         values: for comparison with the limits, [k]; NaN if unknown.
         standard_errors: of the mean episode costs, [k], at least 0.
+        episode_length: mean steps of an episode, at least 1; NaN if none has finished yet.
     """
 
     step_costs: Floats
     values: Floats
     standard_errors: Floats
+    episode_length: float
 
 
 class MeanCost:
@@ -202,11 +209,11 @@ class MeanCost:
         self._table = LifeTable(window, num_costs)
 
     def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
-        """Estimate the mean cost from what the newest policies did.
+        """Estimate the mean cost and the mean length from what the newest policies did.
 
-        If at least ``window`` episodes finished in the rollout, it is their mean, else the life table's. It
-        is unknown until an episode has finished. The table's standard error is that of a mean of as many
-        episodes as it has steps of each age.
+        If at least ``window`` episodes finished in the rollout, they are their means, else the life table's.
+        They are unknown until an episode has finished. The table's standard error is that of a mean of as
+        many episodes as it has steps of each age.
 
         Args:
             rollout: the steps.
@@ -214,14 +221,14 @@ class MeanCost:
             limits: d, [k], possibly infinite; the mean does not need them.
         """
         self._table.add(rollout)
-        if not len(episodes.costs):
-            values, errors = np.full_like(limits, np.nan), np.zeros_like(limits)
-        elif episodes.finished >= self._window:
-            values, errors = episodes.costs.mean(axis=0), standard_errors(episodes.costs)
-        else:
-            values, number = self._table.mean_cost()
-            errors = standard_errors(episodes.costs) * math.sqrt(len(episodes.costs) / number)
-        return MeasuredCosts(rollout.costs, values, errors)
+        values, length, errors = np.full_like(limits, np.nan), math.nan, standard_errors(episodes.costs)
+        if episodes.finished >= self._window:
+            values, length = episodes.costs.mean(axis=0), episodes.mean_length
+        elif len(episodes.costs):
+            means = self._table.means()
+            values, length = means.costs, means.length
+            errors = errors * math.sqrt(len(episodes.costs) / means.number)
+        return MeasuredCosts(rollout.costs, values, errors, length)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the life table."""
@@ -267,7 +274,7 @@ class TailCost:
             threshold=threshold,
             level=self._level,
         )
-        return MeasuredCosts(costs, values, standard_errors(episodes.costs))
+        return MeasuredCosts(costs, values, standard_errors(episodes.costs), episodes.mean_length)
 
     def state_dict(self) -> dict[str, Any]:
         """The value at risk, [k]."""

@@ -6,6 +6,7 @@ Notation: T steps, B environments, k costs, A ages.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,22 @@ import numpy as np
 from recrl.agents.agent import Rollout
 from recrl.agents.learning.scales import quotient
 from recrl.environments.cmdp import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class LifeTableMeans:
+    """Means over episodes, by a life table.
+
+    Attributes:
+        costs: mean episode costs J, [k].
+        length: mean episode length, the sum of S_t, at least 1.
+        number: number of episodes: the steps at each age, averaged. The average is the harmonic one, weighted
+            by S_t, as the variance of a mean falls with 1 / steps.
+    """
+
+    costs: Floats
+    length: float
+    number: float
 
 
 class LifeTable:
@@ -52,15 +69,12 @@ class LifeTable:
         self._steps = steps + kept
         self._sums = sums + quotient(kept, earlier) * earlier_sums
 
-    def mean_cost(self) -> tuple[Floats, float]:
-        """Return the mean episode cost J, [k], and the number of episodes: the steps at each age, averaged.
-
-        The average is the harmonic one, weighted by S_t, as the variance of a mean falls with 1 / steps.
-        """
+    def means(self) -> LifeTableMeans:
+        """Return the means over episodes, after at least one ``add``."""
         ending, *costs = quotient(self._sums, self._steps)
         survival = np.cumprod(np.concatenate([[1.0], 1.0 - ending[:-1]]))
         number = survival.sum() / (survival @ quotient(np.ones_like(self._steps), self._steps))
-        return np.array(costs) @ survival, float(number)
+        return LifeTableMeans(np.array(costs) @ survival, float(survival.sum()), float(number))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of steps of each age, [A], and their sums of ends and costs, [1 + k, A]."""

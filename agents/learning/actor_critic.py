@@ -147,7 +147,7 @@ class ActorCritic:
         measured = self._constraint.measure(rollout, episodes, limits)
         estimates = self._estimate(rollout, measured.step_costs, batch)
         advantages = estimates.advantages
-        constraints = Constraints.of(measured, episodes.lengths, limits)
+        constraints = Constraints.of(measured, limits)
         experience = Experience.of(self._policy, batch, advantages, constraints)
         if step.entropy_coefficient:
             experience = experience.with_entropy(step.entropy_coefficient)

@@ -150,6 +150,7 @@ def test_the_mean_is_that_of_the_episodes_where_enough_finished() -> None:
     found = MeanCost(2, 1).measure(rollout, episodes_of(1.0, 3.0), np.array([9.0]))
     assert found.step_costs is rollout.costs
     assert (found.values.tolist(), found.standard_errors.tolist()) == ([2.0], [1.0])
+    assert found.episode_length == 10.0
 
 
 def test_where_few_episodes_finished_the_mean_is_that_of_the_steps() -> None:
@@ -162,14 +163,14 @@ def test_where_few_episodes_finished_the_mean_is_that_of_the_steps() -> None:
         found = MeanCost(2, 1).measure(
             rollout, episodes_of(96.0, 98.0, 100.0, finished=finished), np.array([9.0])
         )
-        assert found.values.tolist() == [2.0]
+        assert (found.values.tolist(), found.episode_length) == ([2.0], 2.0)
         assert found.standard_errors.tolist() == pytest.approx([2.0 / math.sqrt(2.0)])
 
 
 def test_a_life_table_by_hand() -> None:
     """Ages 0 to 2: of two steps each none, one and one end an episode; of age 1 they cost 2, of age 2 4.
 
-    So an episode reaches the ages with probability 1, 1 and 1/2, and costs 2 + 4 / 2.
+    So an episode reaches the ages with probability 1, 1 and 1/2, costs 2 + 4 / 2 and lasts 2.5 steps.
     """
     table = LifeTable(2, 1)
     costs = np.array([[0.0, 0.0], [2.0, 2.0], [0.0, 4.0], [0.0, 4.0]])
@@ -177,9 +178,9 @@ def test_a_life_table_by_hand() -> None:
     # The first environment is at age 0 again, the second at age 2, and the next time, too.
     table.add(rollout_of(costs[2:3], age=np.array([0, 2]), ended=[[False, True]]))
     table.add(rollout_of(costs[3:], age=np.array([0, 2]), ended=[[False, False]]))
-    mean, number = table.mean_cost()
-    assert mean.tolist() == [4.0]
-    assert number == pytest.approx(2.0)
+    found = table.means()
+    assert (found.costs.tolist(), found.length) == ([4.0], 2.5)
+    assert found.number == pytest.approx(2.0)
 
 
 def test_a_life_table_of_two_costs() -> None:
@@ -187,7 +188,7 @@ def test_a_life_table_of_two_costs() -> None:
     first = rollout_of(np.array([[1.0, 3.0], [2.0, 4.0]]))
     table = LifeTable(1, 2)
     table.add(replace(first, costs=np.concatenate([first.costs, 10.0 * first.costs], axis=-1)))
-    assert table.mean_cost()[0].tolist() == [5.0, 50.0]
+    assert table.means().costs.tolist() == [5.0, 50.0]
 
 
 def test_older_steps_of_an_age_count_as_far_as_the_newest_rollout_lacks_steps() -> None:
@@ -198,16 +199,16 @@ def test_older_steps_of_an_age_count_as_far_as_the_newest_rollout_lacks_steps() 
     table = LifeTable(4, 1)
     table.add(rollout_of(np.full((1, 4), 1.0)))
     table.add(rollout_of(np.full((1, 3), 5.0)))
-    assert table.mean_cost()[0].tolist() == [4.0]
+    assert table.means().costs.tolist() == [4.0]
     table.add(rollout_of(np.full((1, 2), 9.0)))
     resumed = LifeTable(4, 1)
     resumed.load_state_dict(table.state_dict())
     for each in (table, resumed):
-        assert each.mean_cost()[0].tolist() == [6.5]
+        assert each.means().costs.tolist() == [6.5]
         each.add(rollout_of(np.full((1, 5), 7.0)))
-        mean, number = each.mean_cost()
-        assert mean.tolist() == [7.0]
-        assert number == pytest.approx(5.0)
+        found = each.means()
+        assert found.costs.tolist() == [7.0]
+        assert found.number == pytest.approx(5.0)
 
 
 def test_the_mean_is_unknown_until_an_episode_has_finished() -> None:
@@ -245,7 +246,7 @@ def test_the_life_table_is_right_whether_or_not_the_environments_are_synchronise
             ends[ended[step]] = draw(int(ended[step].sum()))
         table.add(rollout_of(costs, age=before, ended=ended))
         if update > 40:
-            found.append(table.mean_cost()[0][0])
+            found.append(table.means().costs[0])
     assert np.mean(found) == pytest.approx(np.mean(truths), rel=0.05)
     assert np.std(found) < 0.25 * np.mean(truths)
 

@@ -128,14 +128,13 @@ def test_a_separate_penalty_is_not_clipped_by_hand() -> None:
     assert found["combined"] == pytest.approx(0.0)
 
 
-def test_episodes_have_their_own_lengths_however_short_the_rollout() -> None:
-    measured = MeasuredCosts(np.zeros((1, 1, 1)), np.array([3.0]), np.array([1.0]))
-    found = Constraints.of(measured, np.array([10, 30]), np.array([1.0]))
+def test_gaps_are_measured_costs_minus_limits() -> None:
+    measured = MeasuredCosts(np.zeros((1, 1, 1)), np.array([3.0]), np.array([1.0]), 20.0)
+    found = Constraints.of(measured, np.array([1.0]))
     assert (found.episode_length, found.gaps.tolist(), found.standard_errors.tolist()) == (20.0, [2.0], [1.0])
 
 
 def test_without_an_episode_only_infinite_limits_are_known_to_be_kept() -> None:
-    unknown = MeasuredCosts(np.zeros((1, 1, 2)), np.full(2, np.nan), np.zeros(2))
-    none = np.empty(0, np.int64)
-    assert not Constraints.of(unknown, none, np.array([math.inf, 1.0])).known
-    assert Constraints.of(unknown, none, np.array([math.inf, math.inf])).known
+    unknown = MeasuredCosts(np.zeros((1, 1, 2)), np.full(2, np.nan), np.zeros(2), math.nan)
+    assert not Constraints.of(unknown, np.array([math.inf, 1.0])).known
+    assert Constraints.of(unknown, np.array([math.inf, math.inf])).known
