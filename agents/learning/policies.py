@@ -29,7 +29,8 @@ from recrl.agents.networks.tanh_stack import Scratch, TanhStack, blocks
 from recrl.agents.spaces import action_size
 from recrl.environments.cmdp import Floats
 
-# Usual initial log standard deviation of a Gaussian policy, also that of safety-starter-agents.
+# Usual initial log standard deviation of a Gaussian policy whose actions are within [-1, 1], also that of
+# safety-starter-agents. Of other actions it is relative to half their range, as ``min_std`` is.
 INITIAL_LOG_STD = -0.5
 # Noise 1 would make a tempered Gaussian infinitely wide; this bound makes it a thousand times wider.
 SMALLEST_TEMPERING = 1e-3
@@ -77,9 +78,9 @@ class StochasticPolicy:
             others=[] if self.is_categorical else [(num_outputs,)],
         )
         if isinstance(action_space, Box):
-            self.log_std.fill_(INITIAL_LOG_STD)
             half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
             self._half_ranges = np.where(np.isfinite(half), half, 1.0)
+            self.log_std.copy_(torch.as_tensor(INITIAL_LOG_STD + np.log(self._half_ranges)))
         self._min_std = min_std
         self.bound_std()
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves

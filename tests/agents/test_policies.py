@@ -1,5 +1,6 @@
 """Policies: their distributions, sampling, noise, and the trust region's metric."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -206,6 +207,12 @@ def test_an_unbounded_action_is_noised_as_if_its_half_range_were_one() -> None:
     policy.log_std.fill_(-5.0)
     policy.add_noise(1.0, random_rows().numpy(), "match-mixture")
     assert policy.log_std.exp().item() == pytest.approx(3.0**-0.5)
+
+
+def test_the_first_standard_deviations_are_the_same_fraction_of_half_of_every_range() -> None:
+    space = Box(np.array([-1.0, 0.0, -np.inf]), np.array([1.0, 0.8, np.inf]), dtype=np.float64)
+    found = policy_for(space).log_std.exp().tolist()
+    assert found == pytest.approx([math.exp(-0.5), 0.4 * math.exp(-0.5), math.exp(-0.5)])
 
 
 def test_standard_deviations_are_raised_to_a_fraction_of_half_the_range() -> None:
