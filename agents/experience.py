@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from recrl.agents.constraints.cost_measures import MeasuredCosts
-from recrl.agents.learning.advantages import reward_spread, scaled_advantages
 from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
@@ -30,7 +29,7 @@ class Constraints:
         gaps: constrained value (the mean undiscounted episode cost, or its CVaR) minus limit, [k]; -inf where
             the limit is infinite, NaN where it is finite and the value is unknown.
         standard_errors: of the mean episode costs, [k], at least 0; 0 if they are unknown.
-        episode_length: mean steps of an episode, at least 1; NaN if none has finished yet.
+        episode_length: mean steps of an episode, at least 1; NaN if unknown.
     """
 
     limits: Floats
@@ -58,25 +57,20 @@ class ActiveConstraints:
         index: their indices, [j].
         violations: c, (constrained value - limit) / mean episode length, in cost per step or another unit
             (``divided_by``), [j].
-        sizes: sqrt(d^2 + s^2) / mean episode length, s the standard error of the mean cost, likewise, [j].
     """
 
     index: npt.NDArray[np.int64]
     violations: Floats
-    sizes: Floats
 
     @classmethod
     def of(cls, constraints: Constraints) -> ActiveConstraints:
         """Return the finite constraints, in the unit of the surrogates: cost per step."""
         index = np.flatnonzero(np.isfinite(constraints.limits))
-        sizes = np.hypot(constraints.limits[index], constraints.standard_errors[index])
-        length = constraints.episode_length
-        return cls(index, constraints.gaps[index] / length, sizes / length)
+        return cls(index, constraints.gaps[index] / constraints.episode_length)
 
     def divided_by(self, units: Floats) -> ActiveConstraints:
-        """Return the constraints with ``violations`` and ``sizes`` divided by units of the k costs, [k]."""
-        own = units[self.index]
-        return ActiveConstraints(self.index, self.violations / own, self.sizes / own)
+        """Return the constraints with ``violations`` divided by units of the k costs, [k]."""
+        return ActiveConstraints(self.index, self.violations / units[self.index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,13 +136,3 @@ class Experience:
             log_probs = log_probs[batch.pair_of_sample]
         advantages[:, 0] -= coefficient * (log_probs + batch.per_sample(entropies))
         return replace(self, advantages=advantages)
-
-    def in_reward_spreads(self) -> tuple[Floats, Floats, Floats]:
-        """Return centred advantages and violations, in standard deviations of the reward's advantages.
-
-        Returns:
-            Of the reward, [N]; of the costs that have a limit, [N, j]; and their violations c, [j].
-        """
-        active = ActiveConstraints.of(self.constraints)
-        rewards, costs = scaled_advantages(self.advantages)
-        return rewards, costs[:, active.index], active.violations / reward_spread(self.advantages)

@@ -8,8 +8,8 @@ same numbers, so that b and c have one unit. So the step does not depend on the 
 Costs fall by less than the linear model predicts. So an integral of the violations is added to them, unless
 its gain is 0, as in the source (``recrl.agents.constraints.violation_integral``).
 
-If no episode finished, nothing is known about the constraints and the policy does not change. A cost whose
-limit is infinite is no constraint.
+While the constrained cost is unknown, the policy does not change. A cost whose limit is infinite is no
+constraint.
 
 Notation: N samples, k costs, P parameters, delta the trust region's size, H its metric.
 """
@@ -17,7 +17,6 @@ Notation: N samples, k costs, P parameters, delta the trust region's size, H its
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -167,7 +166,7 @@ class ConstrainedPolicyOptimisation:
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one step in the trust region; skip it if nothing is known about the constraints.
+        """Take one step in the trust region; skip it while the constrained cost is unknown.
 
         Returns:
             Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages,
@@ -184,9 +183,7 @@ class ConstrainedPolicyOptimisation:
             }
         advantages, spreads = each_by_its_spread(experience.advantages)
         model = LocalModel(policy, experience, advantages)
-        active = ActiveConstraints.of(constraints)
-        violations = integral.corrected(active.index, active.violations, active.sizes)
-        active = replace(active, violations=violations).divided_by(spreads[1:])
+        active = ActiveConstraints.of(integral.corrected(constraints)).divided_by(spreads[1:])
         metric = model.metric(config, generator)
         problem, solved = linearise(model, active, metric, config)
         solution = self._solve(problem)
@@ -200,7 +197,7 @@ class ConstrainedPolicyOptimisation:
             **metrics,
             "case": float(solution.case),
             **indexed("multiplier", multipliers),
-            **indexed("violation_integral", integral.values * constraints.episode_length),
+            **indexed("violation_integral", integral.values),
         }
 
 

@@ -23,7 +23,7 @@ a reward step ends at the limit. Before, steps go as far beyond the limit on one
 coefficient lambda is the option ``kl_penalty``, with the unit and the purpose of that of ``trpo-lag``; 0 is
 the source's.
 
-If no episode finished, nothing is known about the constraints and the policy does not change.
+While the constrained cost is unknown, the policy does not change.
 
 Notation: N samples, k costs, of which j have a finite limit.
 """
@@ -117,7 +117,7 @@ class ConstraintRectifiedPolicyOptimisation:
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one reward step or cost step; skip it if nothing is known about the constraints."""
+        """Take one reward step or cost step; skip it while the constrained cost is unknown."""
         constraints = experience.constraints
         config = self._config
         if not constraints.known:

@@ -29,7 +29,7 @@ from recrl.agents.algorithms.own_options import FOCOPSConfig
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.distributions import Distribution, mean_divergence
+from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
@@ -62,27 +62,6 @@ def projection_objective(
     return objective
 
 
-def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, radius: float) -> None:
-    """Shorten a change of the parameters until the mean KL is the radius, if it exceeds it.
-
-    theta <- theta_0 + sqrt(delta / KL) (theta - theta_0): exact if the KL is quadratic in the change.
-
-    Args:
-        policy: changed in place.
-        experience: the samples, and pi_old at their rows.
-        start: theta_0, the parameters of pi_old, [P].
-        radius: delta, nats.
-    """
-    batch = experience.batch
-    divergence = float(
-        mean_divergence(
-            experience.old, policy.distribution(batch.unique_observations), batch.observation_weights
-        )
-    )
-    if divergence > radius:
-        policy.parameters.values.lerp_(start, 1.0 - (radius / divergence) ** 0.5)
-
-
 class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
     """The rule of ``focops``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
@@ -96,7 +75,6 @@ class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
     ) -> dict[str, float]:
         """Move the multipliers, then the policy."""
         config = self._config
-        start = policy.parameters.values.clone()
         penalty = self._multipliers.update(experience)
         objective = partial(
             projection_objective,
@@ -105,10 +83,14 @@ class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
             radius=config.target_kl,
         )
         metrics = gradient_ascent(
-            policy, self._optimiser, experience, objective, config=config, generator=generator
+            policy,
+            self._optimiser,
+            experience,
+            objective,
+            config=config,
+            generator=generator,
+            keeps_radius=config.trust_region == "kept",
         )
-        if config.trust_region == "kept":
-            keep_near(policy, experience, start, config.target_kl)
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 

@@ -14,11 +14,11 @@ which its slope is kappa,
     phi(s) = log(s) / t                                if s >= 1 / (t kappa),
              kappa s - (1 + log(t kappa)) / t          otherwise,
 
-so that a violated constraint is an exact penalty with the factor kappa. All advantages and c are in standard
-deviations of the reward's advantages, so that kappa is in reward per unit of cost, as multipliers are.
+so that a violated constraint is an exact penalty with the factor kappa. Advantages and c are in the units of
+``constraints.relative_units``, so that one kappa serves tasks of any units.
 
-If no episode finished, nothing is known about the constraints and the policy does not change. Notation: N
-samples, D pairs, k costs.
+While the constrained cost is unknown, the policy does not change. Notation: N samples, D pairs, k costs, j of
+them can bind.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ import torch
 from torch import Tensor
 
 from recrl.agents.algorithms.own_options import IPOConfig
-from recrl.agents.experience import ActiveConstraints, Experience
+from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
+from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.gradient_ascent import (
     FirstOrderRule,
@@ -86,7 +87,7 @@ def barrier_surrogate_objective(
     Args:
         batch: the samples.
         rewards: centred advantages, [N].
-        costs: centred advantages of the costs that have a limit, [N, j].
+        costs: centred advantages of the costs that can bind, [N, j].
         violations: c, [j].
         config: clip, cost_surrogate, t and kappa.
     """
@@ -106,28 +107,36 @@ def barrier_surrogate_objective(
 class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
     """The rule of ``ipo``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
+    def __init__(self, config: IPOConfig, policy: StochasticPolicy, num_costs: int) -> None:
+        super().__init__(config, policy)
+        self._units = RelativeUnits(num_costs)
+        self.parts["units"] = self._units
+
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Ascend the surrogate with barriers; skip it if nothing is known about the constraints."""
-        config, constraints = self._config, experience.constraints
-        if not constraints.known:
-            return no_steps(constraints)
-        rewards, costs, violations = experience.in_reward_spreads()
+        """Ascend the surrogate with barriers; skip it while the constrained cost is unknown."""
+        config = self._config
+        if not experience.constraints.known:
+            return no_steps(experience.constraints)
+        active = RelativeConstraints.of(experience, self._units)
 
         def objective(part: Experience) -> Objective:
             return normalised_by_penalties(
-                barrier_surrogate_objective(part.batch, rewards, costs, violations, config)
+                barrier_surrogate_objective(
+                    part.batch, active.rewards, active.costs, active.violations, config
+                )
             )
 
         metrics = gradient_ascent(
             policy, self._optimiser, experience, objective, config=config, generator=generator
         )
-        multipliers = np.zeros_like(constraints.limits)
-        multipliers[ActiveConstraints.of(constraints).index] = slopes(-violations, config)
+        multipliers = active.in_reward_per_cost(slopes(-active.violations, config))
         return {**metrics, **indexed("multiplier", multipliers)}
 
 
 def make_ipo(cmdp: CMDPSpec, config: IPOConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """Make a new IPO agent."""
-    return fresh_agent(cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy))
+    return fresh_agent(
+        cmdp, config, seed, lambda policy: InteriorPointPolicyOptimisation(config, policy, cmdp.num_costs)
+    )

@@ -28,6 +28,20 @@ ClipRange = Annotated[
 EntropyBonus = Annotated[
     NonNegative, Field(description="Weight of the mean entropy, nats, in the objective (paper: none).")
 ]
+LearningRateWithinRadius = Annotated[
+    Positive,
+    Field(
+        description="Learning rate of the policy's Adam (paper). Larger steps go far "
+        "beyond the trust region before the KL is measured."
+    ),
+]
+TrustRegion = Annotated[
+    Literal["kept", "passed"],
+    Field(
+        description="Whether a step beyond target_kl is shortened to it (kept, ours), or is the last step "
+        "(passed; the algorithm's source)."
+    ),
+]
 
 
 class PPOConfig(AscentConfig):
@@ -72,32 +86,28 @@ class FOCOPSConfig(LagrangianConfig, AscentConfig):
         "trust_region": "passed",
     }
 
-    policy_learning_rate: Positive = Field(
-        default=3e-4,
-        description="Learning rate of the policy's Adam (Zhang et al. 2020). Larger steps go far "
-        "beyond the trust region before the KL is measured.",
-    )
+    policy_learning_rate: LearningRateWithinRadius = 3e-4
     focops_lambda: Positive = Field(
         default=0.5,
         description="lambda, the temperature, in standard deviations of the reward advantages per "
         "nat (ours; Zhang et al. 2020: 1.5).",
     )
-    trust_region: Literal["kept", "passed"] = Field(
-        default="kept",
-        description="Whether a step beyond target_kl is shortened to it (kept, ours), or is the "
-        "last step (Zhang et al. 2020).",
-    )
+    trust_region: TrustRegion = "kept"
 
 
 class P3OConfig(AscentConfig):
     """Settings of ``p3o``, penalised proximal policy optimisation."""
 
+    paper: ClassVar[Mapping[str, Any]] = {**AscentConfig.paper, "trust_region": "passed"}
+
+    policy_learning_rate: LearningRateWithinRadius = 3e-4
     clip: ClipRange = 0.2
     penalty_factor: Positive = Field(
         default=20.0,
-        description="kappa, reward per unit of cost; must exceed every multiplier of the task "
-        "(ours; Zhang et al. 2022 use one value for all tasks).",
+        description="kappa, in ratios of the running spreads of reward and cost advantages; must exceed "
+        "every multiplier of the task there (Zhang et al. 2022; the unit is ours).",
     )
+    trust_region: TrustRegion = "kept"
 
 
 class IPOConfig(AscentConfig):
@@ -124,8 +134,8 @@ class IPOConfig(AscentConfig):
     )
     barrier_slope: Positive = Field(
         default=20.0,
-        description="Largest slope of the barrier, used where there is no slack, reward per unit "
-        "of cost; must exceed every multiplier of the task (ours).",
+        description="Largest slope of the barrier, used where there is no slack, in ratios of the running "
+        "spreads of reward and cost advantages; must exceed every multiplier of the task there (ours).",
     )
 
 
@@ -149,7 +159,9 @@ class CPOConfig(TrustRegionConfig):
 class PCPOConfig(TrustRegionConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""
 
-    violation_integral_gain: ViolationIntegralGain = 0.0
+    paper: ClassVar[Mapping[str, Any]] = {**TrustRegionConfig.paper, "violation_integral_gain": 0.0}
+
+    violation_integral_gain: ViolationIntegralGain = 0.03
 
 
 class TRPOConfig(TrustRegionConfig):

@@ -6,11 +6,15 @@ The policy takes gradient steps on, in cost per step,
 
 with L_r the clipped surrogate of the reward. The surrogate L_i of cost i is *pessimistic*: the mean of
 max(ratio A_i, clip(ratio) A_i). The penalty is exact: if kappa exceeds every multiplier of the constrained
-problem, both have the same optimum. Nothing is adapted. All advantages and c are divided by the standard
-deviation of the reward's, so that kappa is in reward per unit of cost, as multipliers are.
+problem, both have the same optimum. Nothing is adapted. Advantages and c are, ours, in the units of
+``constraints.relative_units``, so that one kappa serves tasks of any units.
 
-If no episode finished, nothing is known about the constraints and the policy does not change. Notation: N
-samples, D pairs, k costs.
+Where a limit is kept the penalty has no gradient at first. The first steps follow the reward alone, and one
+Adam step may leave the trust region before the penalty acts. So, ours, the change is shortened until the KL
+is target_kl: ``trust_region: kept``.
+
+While the constrained cost is unknown, the policy does not change. Notation: N samples, D pairs, k costs, j of
+them can bind.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ import torch
 from torch import Tensor
 
 from recrl.agents.algorithms.own_options import P3OConfig
+from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.gradient_ascent import (
@@ -54,7 +59,7 @@ def penalised_surrogate_objective(
     Args:
         batch: the samples.
         rewards: centred advantages, [N].
-        costs: centred advantages of the costs that have a limit, [N, j].
+        costs: centred advantages of the costs that can bind, [N, j].
         violations: c, [j].
         clip: e in (0, 1).
         factor: kappa.
@@ -74,28 +79,46 @@ def penalised_surrogate_objective(
 class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
     """The rule of ``p3o``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
+    def __init__(self, config: P3OConfig, policy: StochasticPolicy, num_costs: int) -> None:
+        super().__init__(config, policy)
+        self._units = RelativeUnits(num_costs)
+        self.parts["units"] = self._units
+
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Ascend the penalised surrogate; skip it if nothing is known about the constraints."""
-        config, constraints = self._config, experience.constraints
-        if not constraints.known:
-            return no_steps(constraints)
-        rewards, costs, violations = experience.in_reward_spreads()
+        """Ascend the penalised surrogate; skip it while the constrained cost is unknown."""
+        config = self._config
+        if not experience.constraints.known:
+            return no_steps(experience.constraints)
+        active = RelativeConstraints.of(experience, self._units)
 
         def objective(part: Experience) -> Objective:
             surrogate_objective = penalised_surrogate_objective(
-                part.batch, rewards, costs, violations, clip=config.clip, factor=config.penalty_factor
+                part.batch,
+                active.rewards,
+                active.costs,
+                active.violations,
+                clip=config.clip,
+                factor=config.penalty_factor,
             )
             return normalised_by_penalties(surrogate_objective)
 
         metrics = gradient_ascent(
-            policy, self._optimiser, experience, objective, config=config, generator=generator
+            policy,
+            self._optimiser,
+            experience,
+            objective,
+            config=config,
+            generator=generator,
+            keeps_radius=config.trust_region == "kept",
         )
-        multipliers = np.where(constraints.gaps > 0.0, config.penalty_factor, 0.0)
-        return {**metrics, **indexed("multiplier", multipliers)}
+        factors = np.where(active.violations > 0.0, config.penalty_factor, 0.0)
+        return {**metrics, **indexed("multiplier", active.in_reward_per_cost(factors))}
 
 
 def make_p3o(cmdp: CMDPSpec, config: P3OConfig, seed: np.random.SeedSequence) -> ActorCritic:
     """Make a new P3O agent."""
-    return fresh_agent(cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy))
+    return fresh_agent(
+        cmdp, config, seed, lambda policy: PenalisedProximalPolicyOptimisation(config, policy, cmdp.num_costs)
+    )

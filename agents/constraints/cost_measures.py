@@ -187,7 +187,7 @@ class MeasuredCosts:
         step_costs: per step, whose sums over an episode are constrained, [T, B, k].
         values: for comparison with the limits, [k]; NaN if unknown.
         standard_errors: of the mean episode costs, [k], at least 0.
-        episode_length: mean steps of an episode, at least 1; NaN if none has finished yet.
+        episode_length: mean steps of an episode, at least 1; NaN if unknown.
     """
 
     step_costs: Floats
@@ -212,8 +212,8 @@ class MeanCost:
         """Estimate the mean cost and the mean length from what the newest policies did.
 
         If at least ``window`` episodes finished in the rollout, they are their means, else the life table's.
-        They are unknown until an episode has finished. The table's standard error is that of a mean of as
-        many episodes as it has steps of each age.
+        Until an episode has finished these are lower bounds: steps of later ages are not known. The table's
+        standard error is that of a mean of as many episodes as it has steps of each age.
 
         Args:
             rollout: the steps.
@@ -221,14 +221,12 @@ class MeanCost:
             limits: d, [k], possibly infinite; the mean does not need them.
         """
         self._table.add(rollout)
-        values, length, errors = np.full_like(limits, np.nan), math.nan, standard_errors(episodes.costs)
+        errors = standard_errors(episodes.costs)
         if episodes.finished >= self._window:
-            values, length = episodes.costs.mean(axis=0), episodes.mean_length
-        elif len(episodes.costs):
-            means = self._table.means()
-            values, length = means.costs, means.length
-            errors = errors * math.sqrt(len(episodes.costs) / means.number)
-        return MeasuredCosts(rollout.costs, values, errors, length)
+            return MeasuredCosts(rollout.costs, episodes.costs.mean(axis=0), errors, episodes.mean_length)
+        means = self._table.means()
+        errors = errors * math.sqrt(len(episodes.costs) / means.number)
+        return MeasuredCosts(rollout.costs, means.costs, errors, means.length)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the life table."""

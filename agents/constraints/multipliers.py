@@ -4,13 +4,12 @@ An update first changes the multipliers by the violations. Then it scales the ad
 to the multipliers' units: the agent ascends A_r - sum_i mu_i A_i.
 
 ``multiplier_unit: relative`` does not depend on the task's units. Violations are relative
-(``relative_gaps``). The unit of a multiplier mu_i is u_i = spread of the reward's advantages / spread of cost
-i's advantages, each a running root mean square over all updates. In reward per unit of cost, the multiplier
-of the CMDP is lambda_i = mu_i u_i. ``cost`` is the paper's: violations in episode cost, standardised reward
-advantages, raw cost advantages.
+(``relative_gaps``), and multipliers mu_i are in the units u_i of ``constraints.relative_units``. In reward
+per unit of cost, the multiplier of the CMDP is lambda_i = mu_i u_i. ``cost`` is the paper's: violations in
+episode cost, standardised reward advantages, raw cost advantages.
 
-If no episode finished, nothing is known about the constraints and the multipliers do not change. A cost with
-an infinite limit has the multiplier 0.
+While the constrained cost is unknown, the multipliers do not change. A cost with an infinite limit has the
+multiplier 0.
 
 Notation: N samples, k costs.
 """
@@ -31,9 +30,9 @@ from recrl.agents.constraints.multiplier_rules import (
     relative_gaps,
     softplus_adam,
 )
+from recrl.agents.constraints.relative_units import RelativeUnits
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import penalised_advantages, reward_spread
-from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.agents.shared_options import LagrangianConfig
 from recrl.environments.cmdp import Floats
 
@@ -75,19 +74,16 @@ class Multipliers:
         self._state: MultiplierState = STARTS[config.multiplier_rule](num_costs, config.multiplier_initial)
         self._is_relative = config.multiplier_unit == "relative"
         self._step = multiplier_step(config)
-        self._spreads = RunningScale(1 + num_costs)
+        self._units = RelativeUnits(num_costs)
 
     def update(self, experience: Experience) -> Penalty:
         """Update the multipliers, unless the violations are unknown; return the scaled advantages."""
         multipliers = self.move(experience.constraints)
+        if self._is_relative:
+            scaled = self._units.of(experience.advantages)
+            return Penalty(scaled.rewards, scaled.costs, multipliers, multipliers * scaled.exchange)
         centred = experience.advantages - experience.advantages.mean(axis=0)
-        spread = reward_spread(centred)
-        rewards, costs = centred[:, 0] / spread, centred[:, 1:]
-        if not self._is_relative:
-            return Penalty(rewards, costs, multipliers, multipliers)
-        self._spreads.add((centred**2).mean(axis=0))
-        exchange = quotient(self._spreads.values[:1], self._spreads.values[1:])
-        return Penalty(rewards, costs * (exchange / spread), multipliers, multipliers * exchange)
+        return Penalty(centred[:, 0] / reward_spread(centred), centred[:, 1:], multipliers, multipliers)
 
     def move(self, constraints: Constraints) -> Floats:
         """Update the multipliers, unless the violations are unknown; return them, mu, [k]."""
@@ -99,16 +95,16 @@ class Multipliers:
         return np.where(np.isfinite(constraints.limits), self._state["multipliers"], 0.0)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the rule's state and the advantages' spreads."""
+        """Return the rule's state and the units."""
         return {
             "multipliers": {key: values.copy() for key, values in self._state.items()},
-            "spreads": self._spreads.state_dict(),
+            "units": self._units.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         self._state = {key: np.array(values, np.float64) for key, values in state["multipliers"].items()}
-        self._spreads.load_state_dict(state["spreads"])
+        self._units.load_state_dict(state["units"])
 
 
 def multiplier_step(config: LagrangianConfig) -> MultiplierRule:

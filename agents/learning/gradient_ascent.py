@@ -78,6 +78,27 @@ def normalised_by_penalties(surrogate_objective: Callable[[Tensor], tuple[Tensor
     return objective
 
 
+def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, radius: float) -> None:
+    """Shorten a change of the parameters until the mean KL is the radius, if it exceeds it.
+
+    theta <- theta_0 + sqrt(delta / KL) (theta - theta_0): exact if the KL is quadratic in the change.
+
+    Args:
+        policy: changed in place.
+        experience: the samples, and pi_old at their rows.
+        start: theta_0, the parameters of pi_old, [P].
+        radius: delta, nats.
+    """
+    batch = experience.batch
+    divergence = float(
+        mean_divergence(
+            experience.old, policy.distribution(batch.unique_observations), batch.observation_weights
+        )
+    )
+    if divergence > radius:
+        policy.parameters.values.lerp_(start, 1.0 - (radius / divergence) ** 0.5)
+
+
 def gradient_ascent(
     policy: StochasticPolicy,
     optimiser: Adam,
@@ -86,6 +107,7 @@ def gradient_ascent(
     *,
     config: AscentConfig,
     generator: np.random.Generator,
+    keeps_radius: bool = False,
 ) -> dict[str, float]:
     """Ascend an objective from the policy that collected the samples.
 
@@ -96,6 +118,7 @@ def gradient_ascent(
         objective_of: gives the objective of a minibatch or of all samples.
         config: learning rate, steps and largest KL.
         generator: for the minibatches.
+        keeps_radius: whether the change is shortened to ``target_kl`` if it is larger.
 
     Returns:
         The number of steps taken, ``policy_steps``.
@@ -107,6 +130,7 @@ def gradient_ascent(
     steps = max(config.policy_steps, config.policy_passes * experience.batch.num_parts(size))
     largest_kl = config.stop_kl_factor * config.target_kl
     objective_on = lru_cache(maxsize=1)(objective_of)  # the whole batch is repeated without end
+    start = policy.parameters.values.clone()
     taken, divergence = 0, 0.0
     for taken, part in enumerate(islice(experience.parts(size, generator), steps + 1)):
         now = policy.evaluate(part.batch.unique_observations)
@@ -118,4 +142,6 @@ def gradient_ascent(
         now.gradient(-surrogate_objective)
         optimiser.step()
     require_finite("the KL of the policy's steps", divergence)
+    if keeps_radius:
+        keep_near(policy, experience, start, config.target_kl)
     return {"policy_steps": float(taken)}

@@ -211,8 +211,10 @@ def test_older_steps_of_an_age_count_as_far_as_the_newest_rollout_lacks_steps() 
         assert found.number == pytest.approx(5.0)
 
 
-def test_the_mean_is_unknown_until_an_episode_has_finished() -> None:
-    assert math.isnan(MeanCost(1, 1).measure(rollout_of(np.ones(3)), NONE, np.array([9.0])).values[0])
+def test_until_an_episode_has_finished_the_mean_is_that_of_its_first_steps() -> None:
+    found = MeanCost(1, 1).measure(rollout_of(np.ones(3)), NONE, np.array([9.0]))
+    assert (found.values.tolist(), found.standard_errors.tolist()) == ([3.0], [0.0])
+    assert found.episode_length == 3.0
 
 
 @pytest.mark.parametrize("lengths", ["alike", "two", "random", "full"])

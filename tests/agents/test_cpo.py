@@ -106,10 +106,8 @@ def test_violations_enter_in_cost_per_step() -> None:
     active = ActiveConstraints.of(constraints)
     assert active.index.tolist() == [0, 2]
     assert active.violations.tolist() == pytest.approx([0.05, -0.0005])
-    assert active.sizes.tolist() == pytest.approx([0.065, 0.001])
     divided = active.divided_by(np.array([2.0, 3.0, 5.0]))
     assert divided.violations.tolist() == pytest.approx([0.025, -0.0001])
-    assert divided.sizes.tolist() == pytest.approx([0.0325, 0.0002])
 
 
 def test_multipliers_are_per_unit_of_cost() -> None:

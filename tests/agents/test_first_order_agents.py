@@ -33,7 +33,7 @@ CLIP, KAPPA = 0.2, 5.0
 
 
 # Rewards standardised: mean 0, standard deviation sqrt(16 / 6); costs centred about 1.
-SPREAD = math.sqrt(16.0 / 6.0)
+SPREAD, COST_SPREAD = math.sqrt(16.0 / 6.0), math.sqrt(4.0 / 6.0)
 REWARDS, COSTS = ADVANTAGES[:, 0] / SPREAD, (ADVANTAGES[:, 1:] - 1.0) / SPREAD
 
 
@@ -142,8 +142,8 @@ def improved(name: str, gap: float, limit: float = 5.0) -> tuple[dict[str, float
     before = policy.parameters.to_numpy()
     rules: dict[str, PolicyRule] = {
         "focops": FirstOrderConstrainedOptimisation(FOCOPSConfig(), policy, 1),
-        "p3o": PenalisedProximalPolicyOptimisation(P3OConfig(), policy),
-        "ipo": InteriorPointPolicyOptimisation(IPOConfig(), policy),
+        "p3o": PenalisedProximalPolicyOptimisation(P3OConfig(), policy, 1),
+        "ipo": InteriorPointPolicyOptimisation(IPOConfig(), policy, 1),
     }
     constraints = Constraints(
         np.array([limit]), np.array([gap]), np.zeros(1), math.nan if math.isnan(gap) else 10.0
@@ -173,5 +173,5 @@ def test_without_a_finished_episode_an_agent_without_multipliers_stays(name: str
 
 def test_the_slope_of_the_barrier_is_what_ipo_reports_as_its_multiplier() -> None:
     reported = improved("ipo", -5.0)[0]["multiplier_0"]
-    expected: Floats = slopes(np.array([0.5 / SPREAD]), IPOConfig())
-    assert reported == pytest.approx(float(expected[0]))
+    expected: Floats = slopes(np.array([0.5 / COST_SPREAD]), IPOConfig())
+    assert reported == pytest.approx(float(expected[0]) * SPREAD / COST_SPREAD)

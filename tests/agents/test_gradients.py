@@ -13,6 +13,7 @@ from recrl.agents.algorithms.ipo import barrier_surrogate_objective
 from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.algorithms.p3o import penalised_surrogate_objective
 from recrl.agents.algorithms.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
+from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.distributions import Distribution
@@ -68,20 +69,24 @@ def plain(experience: Experience) -> Objective:
 def lagrangian(
     experience: Experience, gain: Callable[..., Callable[[torch.Tensor], torch.Tensor]]
 ) -> Objective:
-    rewards, costs, _ = experience.in_reward_spreads()
-    return of_ratios(gain(experience.batch, rewards, costs, np.array([2.0, 0.5]), CLIP))
+    active = RelativeConstraints.of(experience, RelativeUnits(2))
+    return of_ratios(gain(experience.batch, active.rewards, active.costs, np.array([2.0, 0.5]), CLIP))
 
 
 def p3o(experience: Experience) -> Objective:
+    active = RelativeConstraints.of(experience, RelativeUnits(2))
     gain = penalised_surrogate_objective(
-        experience.batch, *experience.in_reward_spreads(), clip=CLIP, factor=5.0
+        experience.batch, active.rewards, active.costs, active.violations, clip=CLIP, factor=5.0
     )
     return of_ratios(lambda ratios: gain(ratios)[0])
 
 
 def ipo(experience: Experience) -> Objective:
     config = IPOConfig(barrier_sharpness=10.0, clip=CLIP)
-    gain = barrier_surrogate_objective(experience.batch, *experience.in_reward_spreads(), config)
+    active = RelativeConstraints.of(experience, RelativeUnits(2))
+    gain = barrier_surrogate_objective(
+        experience.batch, active.rewards, active.costs, active.violations, config
+    )
     return of_ratios(lambda ratios: gain(ratios)[0])
 
 

@@ -17,6 +17,7 @@ from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
+PENALTIES = ("p3o", "ipo")
 LAGRANGIANS = [(agent, rule) for agent in ("ppo-lag", "trpo-lag", "focops") for rule in STARTS]
 TRUST_REGIONS = ("cpo", "pcpo", "crpo")
 LIMITS = {"two-state": 3.0, "continuous-bandit": 2.5}
@@ -61,6 +62,14 @@ def test_a_power_of_two_changes_no_bit(agent: str, rule: str, task: str) -> None
     plain = learnt(agent, task, options_of(rule))
     assert learnt(agent, task, options_of(rule), reward=1024.0).tobytes() == plain.tobytes()
     assert learnt(agent, task, options_of(rule), cost=1024.0).tobytes() == plain.tobytes()
+
+
+@pytest.mark.parametrize("task", LIMITS)
+@pytest.mark.parametrize("agent", PENALTIES)
+def test_a_power_of_two_changes_no_bit_of_a_penalty(agent: str, task: str) -> None:
+    plain = learnt(agent, task, {})
+    assert learnt(agent, task, {}, reward=1024.0).tobytes() == plain.tobytes()
+    assert learnt(agent, task, {}, cost=1024.0).tobytes() == plain.tobytes()
 
 
 @pytest.mark.parametrize("task", LIMITS)

@@ -1,60 +1,70 @@
 """The integral of the violations: its arithmetic, its anti-wind-up, and the steady error that it removes."""
 
+import math
+
 import numpy as np
 import pytest
 
 from recrl.agents.constraints.violation_integral import ViolationIntegral
+from recrl.agents.experience import Constraints
 from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, solve_dual
 
 BOTH = np.array([0, 1])
-LARGE = np.array([100.0, 100.0])
+
+
+def after(integral: ViolationIntegral, *gaps: float, limit: float = 100.0) -> list[float]:
+    """The corrected gaps after new ones; a gap of -inf is that of a cost without a limit."""
+    found = np.array(gaps)
+    limits = np.where(np.isfinite(found), limit, np.inf)
+    corrected: list[float] = integral.corrected(
+        Constraints(limits, found, np.zeros(len(found)), 10.0)
+    ).gaps.tolist()
+    return corrected
 
 
 def test_the_integral_adds_violations_and_stays_above_zero() -> None:
     integral = ViolationIntegral(0.25, 2)
-    assert integral.corrected(BOTH, np.array([0.4, -1.0]), LARGE).tolist() == [0.5, -1.0]
-    assert integral.corrected(BOTH, np.array([0.8, 2.0]), LARGE).tolist() == pytest.approx([1.1, 2.5])
-    assert integral.corrected(BOTH, np.array([-0.4, -4.0]), LARGE).tolist() == pytest.approx([-0.2, -4.0])
+    assert after(integral, 0.4, -1.0) == [0.5, -1.0]
+    assert after(integral, 0.8, 2.0) == pytest.approx([1.1, 2.5])
+    assert after(integral, -0.4, -4.0) == pytest.approx([-0.2, -4.0])
 
 
 def test_a_violation_counts_no_more_than_its_bound() -> None:
     integral = ViolationIntegral(0.5, 2)
-    corrected = integral.corrected(BOTH, np.array([7.0, 1.0]), np.array([2.0, 2.0]))
-    assert corrected.tolist() == [8.0, 1.5]
+    assert after(integral, 7.0, 1.0, limit=2.0) == [8.0, 1.5]
     assert integral.values.tolist() == [1.0, 0.5]
 
 
 def test_a_cost_without_a_limit_keeps_its_integral() -> None:
     integral = ViolationIntegral(0.5, 2)
-    integral.corrected(BOTH, np.array([1.0, 1.0]), LARGE)
-    assert integral.corrected(np.array([1]), np.array([1.0]), LARGE[1:]).tolist() == [2.0]
+    after(integral, 1.0, 1.0)
+    assert after(integral, -math.inf, 1.0) == [-math.inf, 2.0]
     assert integral.values.tolist() == [0.5, 1.0]
 
 
 def test_it_does_not_grow_after_a_step_that_did_not_meet_the_constraint() -> None:
     integral = ViolationIntegral(0.5, 2)
-    integral.corrected(BOTH, np.array([1.0, 1.0]), LARGE)
+    after(integral, 1.0, 1.0)
     integral.note_step(BOTH, np.array([True, False]))
-    assert integral.corrected(BOTH, np.array([1.0, 1.0]), LARGE).tolist() == [1.5, 2.0]
+    assert after(integral, 1.0, 1.0) == [1.5, 2.0]
     integral.note_step(BOTH, np.array([True, False]))
-    assert integral.corrected(BOTH, np.array([-0.4, 0.2]), LARGE).tolist() == pytest.approx([-0.1, 1.3])
+    assert after(integral, -0.4, 0.2) == pytest.approx([-0.1, 1.3])
 
 
 def test_a_restored_integral_goes_on_exactly() -> None:
     first, second = ViolationIntegral(0.3, 2), ViolationIntegral(0.3, 2)
-    first.corrected(BOTH, np.array([1.0, 0.1]), LARGE)
+    after(first, 1.0, 0.1)
     first.note_step(BOTH, np.array([True, False]))
     second.load_state_dict(first.state_dict())
-    new = np.array([0.7, 0.3])
-    assert first.corrected(BOTH, new, LARGE).tolist() == second.corrected(BOTH, new, LARGE).tolist()
+    assert after(first, 0.7, 0.3) == after(second, 0.7, 0.3)
 
 
 def test_a_limit_of_0_that_is_kept_forgets_old_violations() -> None:
     integral = ViolationIntegral(0.5, 1)
-    integral.corrected(BOTH[:1], np.array([2.0]), LARGE[:1])
+    after(integral, 2.0)
     assert integral.values.tolist() == [1.0]
     for expected in (0.5, 0.25):
-        assert integral.corrected(BOTH[:1], np.array([0.0]), LARGE[:1]).tolist() == [expected]
+        assert after(integral, 0.0) == [expected]
 
 
 @pytest.mark.parametrize("mixed", [-2.0, -0.2, 0.0])
@@ -79,7 +89,7 @@ def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_rea
             1.0,
             np.array([-1.0]),
             np.eye(1),
-            integral.corrected(BOTH[:1], np.array([cost - limit]), LARGE[:1]),
+            np.array(after(integral, cost - limit)),
             50.0,
         )
         solution = solve_dual(problem)

@@ -1,0 +1,102 @@
+"""Units in which the advantages of the reward and of every cost have the same spread.
+
+A weight of costs against the reward, be it a multiplier or the factor of a penalty, has the unit reward per
+cost. Counted in u_i = spread of the reward's advantages / spread of cost i's advantages, it does not depend
+on the task's units. Both spreads are running root mean squares over all updates, because the unit must not
+change with the policy.
+
+Notation: N samples, k costs, j of them have a limit and have occurred.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recrl.agents.experience import Experience
+from recrl.agents.learning.advantages import reward_spread
+from recrl.agents.learning.scales import RunningScale, quotient
+from recrl.environments.cmdp import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeAdvantages:
+    """Advantages in common units.
+
+    Attributes:
+        rewards: standardised advantages, [N].
+        costs: centred advantages of each cost times its ``factors``, [N, k].
+        factors: u_i / the spread of the reward's advantages in this rollout, [k]; 0 if the cost has not
+            occurred.
+        exchange: u, reward per unit of cost, [k]; likewise.
+    """
+
+    rewards: Floats
+    costs: Floats
+    factors: Floats
+    exchange: Floats
+
+
+class RelativeUnits:
+    """The units u of the module.
+
+    Args:
+        num_costs: k.
+    """
+
+    def __init__(self, num_costs: int) -> None:
+        self._spreads = RunningScale(1 + num_costs)
+
+    def of(self, advantages: Floats) -> RelativeAdvantages:
+        """Include a rollout's raw advantages, [N, 1 + k], in the spreads, and scale them."""
+        centred = advantages - advantages.mean(axis=0)
+        spread = reward_spread(centred)
+        self._spreads.add((centred**2).mean(axis=0))
+        exchange = quotient(self._spreads.values[:1], self._spreads.values[1:])
+        factors = exchange / spread
+        return RelativeAdvantages(centred[:, 0] / spread, centred[:, 1:] * factors, factors, exchange)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the spreads."""
+        return self._spreads.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._spreads.load_state_dict(state)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeConstraints:
+    """The constraints that can bind, in relative units.
+
+    Attributes:
+        rewards: standardised advantages, [N].
+        costs: centred advantages, [N, j].
+        violations: c, (mean episode cost - limit) / mean episode length, [j].
+        index: of the j costs, [j].
+        exchange: u of all costs, reward per unit of cost, [k].
+    """
+
+    rewards: Floats
+    costs: Floats
+    violations: Floats
+    index: npt.NDArray[np.int64]
+    exchange: Floats
+
+    @classmethod
+    def of(cls, experience: Experience, units: RelativeUnits) -> RelativeConstraints:
+        """Include the rollout's advantages in the units, and scale advantages and known gaps."""
+        scaled, constraints = units.of(experience.advantages), experience.constraints
+        index = np.flatnonzero(np.isfinite(constraints.limits) & (scaled.exchange > 0.0))
+        violations = scaled.factors[index] * constraints.gaps[index] / constraints.episode_length
+        return cls(scaled.rewards, scaled.costs[:, index], violations, index, scaled.exchange)
+
+    def in_reward_per_cost(self, weights: Floats) -> Floats:
+        """Return weights of the j costs in the task's units, 0 for the others, [j] -> [k]."""
+        all_weights = np.zeros_like(self.exchange)
+        all_weights[self.index] = weights * self.exchange[self.index]
+        return all_weights
