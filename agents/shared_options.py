@@ -23,6 +23,7 @@ STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "hidden_sizes": (256, 256),
     "initialisation": "xavier",
     "last_layer_scale": 1.0,
+    "discount": 0.99,
     "reward_trace_decay": 0.97,
     "cost_trace_decay": 0.97,
     "critic_steps": 80,
@@ -100,7 +101,11 @@ class ActorCriticConfig(BaseModel):
         "deviation: all; none (paper); or unbounded, numbers without finite bounds (ours). If the task "
         "declares its components, unbounded is none.",
     )
-    discount: Share = Field(default=0.99, description="Discount gamma of the critics, per step (paper).")
+    discount: Share = Field(
+        default=0.995,
+        description="Discount gamma of the critics, per step (ours; paper 0.99). Steps beyond the next 1 / (1 - "
+        "gamma) hardly count.",
+    )
     reward_trace_decay: Share = Field(
         default=0.9, description="GAE lambda of the reward's advantages (ours; paper 0.97)."
     )

@@ -103,9 +103,9 @@ class P3OConfig(AscentConfig):
     policy_learning_rate: LearningRateWithinRadius = 3e-4
     clip: ClipRange = 0.2
     penalty_factor: Positive = Field(
-        default=20.0,
+        default=5.0,
         description="kappa, in ratios of the running spreads of reward and cost advantages; must exceed "
-        "every multiplier of the task there (Zhang et al. 2022; the unit is ours).",
+        "every multiplier of the task there (ours; Zhang et al. 2022: 20, in another unit).",
     )
     trust_region: TrustRegion = "kept"
 

@@ -45,7 +45,7 @@ LESSONS = [
     Lesson("focops", "two-state", (3.0,), 150),
     Lesson("focops", "two-state-2", (5.0, 2.0), 150, num_envs=128),
     Lesson("p3o", "two-state", (3.0,), 200),
-    Lesson("p3o", "two-state-2", (5.0, 2.0), 200),
+    Lesson("p3o", "two-state-2", (5.0, 2.0), 200, num_envs=128),
     Lesson("ipo", "two-state", (3.0,), 200),
     Lesson("ipo", "two-state-2", (5.0, 2.0), 200, seeds=0),
     Lesson("crpo", "two-state", (3.0,), 100),

@@ -93,7 +93,7 @@ def test_every_option_is_described(capsys: pytest.CaptureFixture[str], name: str
 
 def test_options_show_type_default_and_description(capsys: pytest.CaptureFixture[str]) -> None:
     out = output(capsys, "options", "cpo")
-    assert re.search(r"^discount +number +0.99 +Discount gamma of the critics", out, re.MULTILINE)
+    assert re.search(r"^discount +number +0.995 +Discount gamma of the critics", out, re.MULTILINE)
     out = output(capsys, "options", "rivergrid")
     assert re.search(r"^generate.seed +whole number +required +Seed of the map", out, re.MULTILINE)
 
