@@ -27,7 +27,7 @@ DEFINITIONS = {
         "2e6": "steps of a trial",
         "1e7": "steps of a published run",
         "11e5894": "a commit",
-        "0.82": "a p-value, see test_the_table_of_rivergrid_is_counted",
+        "0.77": "a p-value, see test_the_table_of_rivergrid_is_counted",
     },
 }
 NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
