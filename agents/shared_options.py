@@ -103,8 +103,8 @@ class ActorCriticConfig(BaseModel):
     )
     discount: Share = Field(
         default=0.995,
-        description="Discount gamma of the critics, per step (ours; paper 0.99). Steps beyond the next 1 / (1 - "
-        "gamma) hardly count.",
+        description="Discount gamma of the critics, per step (ours; paper 0.99). Rewards later than "
+        "1 / (1 - gamma) steps hardly count.",
     )
     reward_trace_decay: Share = Field(
         default=0.9, description="GAE lambda of the reward's advantages (ours; paper 0.97)."
