@@ -215,6 +215,23 @@ class AscentConfig(ActorCriticConfig):
     )
 
 
+class RadiusConfig(AscentConfig):
+    """Settings of first-order agents that keep their trust region."""
+
+    paper: ClassVar[Mapping[str, Any]] = {**AscentConfig.paper, "trust_region": "passed"}
+
+    policy_learning_rate: Positive = Field(
+        default=3e-4,
+        description="Learning rate of the policy's Adam (paper). Larger steps go far beyond the trust region "
+        "before the KL is measured.",
+    )
+    trust_region: Literal["kept", "passed"] = Field(
+        default="kept",
+        description="Whether a step beyond target_kl is shortened to it (kept, ours), or is the last step "
+        "(passed; the algorithm's source).",
+    )
+
+
 class LagrangianConfig(BaseModel):
     """Options of Lagrange multipliers, in addition to those of an ``ActorCriticConfig``."""
 

@@ -30,7 +30,7 @@ from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.distributions import Distribution
-from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent
+from recrl.agents.learning.gradient_ascent import Objective, RadiusRule
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
 from recrl.environments.cmdp import CMDPSpec, Floats
@@ -62,7 +62,7 @@ def projection_objective(
     return objective
 
 
-class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
+class FirstOrderConstrainedOptimisation(RadiusRule[FOCOPSConfig]):
     """The rule of ``focops``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: FOCOPSConfig, policy: StochasticPolicy, num_costs: int) -> None:
@@ -82,15 +82,7 @@ class FirstOrderConstrainedOptimisation(FirstOrderRule[FOCOPSConfig]):
             focops_lambda=config.focops_lambda,
             radius=config.target_kl,
         )
-        metrics = gradient_ascent(
-            policy,
-            self._optimiser,
-            experience,
-            objective,
-            config=config,
-            generator=generator,
-            keeps_radius=config.trust_region == "kept",
-        )
+        metrics = self.ascend(policy, experience, objective, generator)
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 

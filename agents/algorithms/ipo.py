@@ -38,7 +38,6 @@ from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.gradient_ascent import (
     FirstOrderRule,
     Objective,
-    gradient_ascent,
     normalised_by_penalties,
 )
 from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
@@ -128,9 +127,7 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
                 )
             )
 
-        metrics = gradient_ascent(
-            policy, self._optimiser, experience, objective, config=config, generator=generator
-        )
+        metrics = self.ascend(policy, experience, objective, generator)
         multipliers = active.in_reward_per_cost(slopes(-active.violations, config))
         return {**metrics, **indexed("multiplier", multipliers)}
 

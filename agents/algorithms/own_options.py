@@ -19,6 +19,7 @@ from recrl.agents.shared_options import (
     LagrangianConfig,
     NonNegative,
     Positive,
+    RadiusConfig,
     TrustRegionConfig,
 )
 
@@ -27,20 +28,6 @@ ClipRange = Annotated[
 ]
 EntropyBonus = Annotated[
     NonNegative, Field(description="Weight of the mean entropy, nats, in the objective (paper: none).")
-]
-LearningRateWithinRadius = Annotated[
-    Positive,
-    Field(
-        description="Learning rate of the policy's Adam (paper). Larger steps go far "
-        "beyond the trust region before the KL is measured."
-    ),
-]
-TrustRegion = Annotated[
-    Literal["kept", "passed"],
-    Field(
-        description="Whether a step beyond target_kl is shortened to it (kept, ours), or is the last step "
-        "(passed; the algorithm's source)."
-    ),
 ]
 
 
@@ -70,12 +57,11 @@ class PPOLagConfig(LagrangianConfig, AscentConfig):
     )
 
 
-class FOCOPSConfig(LagrangianConfig, AscentConfig):
+class FOCOPSConfig(LagrangianConfig, RadiusConfig):
     """Settings of ``focops``, first-order constrained optimisation in policy space."""
 
     paper: ClassVar[Mapping[str, Any]] = {
-        **STARTER_AGENTS_SETTING,
-        **STARTER_AGENTS_ASCENT,
+        **RadiusConfig.paper,
         "target_kl": 0.02,
         "stop_kl_factor": 1.0,
         "multiplier_rule": "projected",
@@ -83,31 +69,26 @@ class FOCOPSConfig(LagrangianConfig, AscentConfig):
         "multiplier_step": 0.01,
         "multiplier_maximum": 2.0,
         "focops_lambda": 1.5,
-        "trust_region": "passed",
     }
 
-    policy_learning_rate: LearningRateWithinRadius = 3e-4
     focops_lambda: Positive = Field(
         default=0.5,
         description="lambda, the temperature, in standard deviations of the reward advantages per "
         "nat (ours; Zhang et al. 2020: 1.5).",
     )
-    trust_region: TrustRegion = "kept"
 
 
-class P3OConfig(AscentConfig):
+class P3OConfig(RadiusConfig):
     """Settings of ``p3o``, penalised proximal policy optimisation."""
 
-    paper: ClassVar[Mapping[str, Any]] = {**AscentConfig.paper, "trust_region": "passed"}
+    paper: ClassVar[Mapping[str, Any]] = {**RadiusConfig.paper, "penalty_factor": 20.0}
 
-    policy_learning_rate: LearningRateWithinRadius = 3e-4
     clip: ClipRange = 0.2
     penalty_factor: Positive = Field(
         default=5.0,
         description="kappa, in ratios of the running spreads of reward and cost advantages; must exceed "
         "every multiplier of the task there (ours; Zhang et al. 2022: 20, in another unit).",
     )
-    trust_region: TrustRegion = "kept"
 
 
 class IPOConfig(AscentConfig):

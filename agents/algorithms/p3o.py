@@ -30,9 +30,8 @@ from recrl.agents.constraints.relative_units import RelativeConstraints, Relativ
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.gradient_ascent import (
-    FirstOrderRule,
     Objective,
-    gradient_ascent,
+    RadiusRule,
     normalised_by_penalties,
 )
 from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
@@ -76,7 +75,7 @@ def penalised_surrogate_objective(
     return surrogate_objective
 
 
-class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
+class PenalisedProximalPolicyOptimisation(RadiusRule[P3OConfig]):
     """The rule of ``p3o``; a ``recrl.agents.learning.policy_rule.PolicyRule``."""
 
     def __init__(self, config: P3OConfig, policy: StochasticPolicy, num_costs: int) -> None:
@@ -104,15 +103,7 @@ class PenalisedProximalPolicyOptimisation(FirstOrderRule[P3OConfig]):
             )
             return normalised_by_penalties(surrogate_objective)
 
-        metrics = gradient_ascent(
-            policy,
-            self._optimiser,
-            experience,
-            objective,
-            config=config,
-            generator=generator,
-            keeps_radius=config.trust_region == "kept",
-        )
+        metrics = self.ascend(policy, experience, objective, generator)
         factors = np.where(active.violations > 0.0, config.penalty_factor, 0.0)
         return {**metrics, **indexed("multiplier", active.in_reward_per_cost(factors))}
 

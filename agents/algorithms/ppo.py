@@ -14,7 +14,7 @@ from recrl.agents.algorithms.own_options import PPOConfig
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import scaled_advantages
-from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, with_entropy
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate
@@ -36,9 +36,7 @@ class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
             surrogate_objective = partial(clipped_surrogate, advantages=signed, clip=config.clip)
             return with_entropy(surrogate_objective, part.batch, config.entropy_bonus)
 
-        metrics = gradient_ascent(
-            policy, self._optimiser, experience, objective, config=config, generator=generator
-        )
+        metrics = self.ascend(policy, experience, objective, generator)
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 
 

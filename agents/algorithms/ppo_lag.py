@@ -22,7 +22,7 @@ from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
 from recrl.agents.learning.advantages import penalised_advantages
-from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, gradient_ascent, with_entropy
+from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, with_entropy
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
@@ -85,9 +85,7 @@ class PPOLagrangian(FirstOrderRule[PPOLagConfig]):
             )
             return with_entropy(surrogate_objective, part.batch, config.entropy_bonus)
 
-        metrics = gradient_ascent(
-            policy, self._optimiser, experience, objective, config=config, generator=generator
-        )
+        metrics = self.ascend(policy, experience, objective, generator)
         return {**metrics, **indexed("multiplier", penalty.task_multipliers)}
 
 

@@ -81,7 +81,7 @@ class Multipliers:
         multipliers = self.move(experience.constraints)
         if self._is_relative:
             scaled = self._units.of(experience.advantages)
-            return Penalty(scaled.rewards, scaled.costs, multipliers, multipliers * scaled.exchange)
+            return Penalty(scaled.rewards, scaled.costs, multipliers, multipliers * scaled.exchange_rates)
         centred = experience.advantages - experience.advantages.mean(axis=0)
         return Penalty(centred[:, 0] / reward_spread(centred), centred[:, 1:], multipliers, multipliers)
 

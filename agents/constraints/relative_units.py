@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recrl.agents.experience import Experience
+from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.advantages import reward_spread
 from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.environments.cmdp import Floats
@@ -32,13 +32,13 @@ class RelativeAdvantages:
         costs: centred advantages of each cost times its ``factors``, [N, k].
         factors: u_i / the spread of the reward's advantages in this rollout, [k]; 0 if the cost has not
             occurred.
-        exchange: u, reward per unit of cost, [k]; likewise.
+        exchange_rates: u, reward per unit of cost, [k]; likewise.
     """
 
     rewards: Floats
     costs: Floats
     factors: Floats
-    exchange: Floats
+    exchange_rates: Floats
 
 
 class RelativeUnits:
@@ -56,9 +56,9 @@ class RelativeUnits:
         centred = advantages - advantages.mean(axis=0)
         spread = reward_spread(centred)
         self._spreads.add((centred**2).mean(axis=0))
-        exchange = quotient(self._spreads.values[:1], self._spreads.values[1:])
-        factors = exchange / spread
-        return RelativeAdvantages(centred[:, 0] / spread, centred[:, 1:] * factors, factors, exchange)
+        exchange_rates = quotient(self._spreads.values[:1], self._spreads.values[1:])
+        factors = exchange_rates / spread
+        return RelativeAdvantages(centred[:, 0] / spread, centred[:, 1:] * factors, factors, exchange_rates)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the spreads."""
@@ -78,25 +78,26 @@ class RelativeConstraints:
         costs: centred advantages, [N, j].
         violations: c, (mean episode cost - limit) / mean episode length, [j].
         index: of the j costs, [j].
-        exchange: u of all costs, reward per unit of cost, [k].
+        exchange_rates: u of all costs, reward per unit of cost, [k].
     """
 
     rewards: Floats
     costs: Floats
     violations: Floats
     index: npt.NDArray[np.int64]
-    exchange: Floats
+    exchange_rates: Floats
 
     @classmethod
     def of(cls, experience: Experience, units: RelativeUnits) -> RelativeConstraints:
         """Include the rollout's advantages in the units, and scale advantages and known gaps."""
-        scaled, constraints = units.of(experience.advantages), experience.constraints
-        index = np.flatnonzero(np.isfinite(constraints.limits) & (scaled.exchange > 0.0))
-        violations = scaled.factors[index] * constraints.gaps[index] / constraints.episode_length
-        return cls(scaled.rewards, scaled.costs[:, index], violations, index, scaled.exchange)
+        scaled, active = units.of(experience.advantages), ActiveConstraints.of(experience.constraints)
+        occurred = scaled.exchange_rates[active.index] > 0.0
+        index = active.index[occurred]
+        violations = scaled.factors[index] * active.violations[occurred]
+        return cls(scaled.rewards, scaled.costs[:, index], violations, index, scaled.exchange_rates)
 
     def in_reward_per_cost(self, weights: Floats) -> Floats:
         """Return weights of the j costs in the task's units, 0 for the others, [j] -> [k]."""
-        all_weights = np.zeros_like(self.exchange)
-        all_weights[self.index] = weights * self.exchange[self.index]
+        all_weights = np.zeros_like(self.exchange_rates)
+        all_weights[self.index] = weights * self.exchange_rates[self.index]
         return all_weights

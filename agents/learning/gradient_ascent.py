@@ -25,7 +25,7 @@ from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful
 from recrl.agents.networks.flat_parameters import Adam
-from recrl.agents.shared_options import AscentConfig
+from recrl.agents.shared_options import AscentConfig, RadiusConfig
 
 # An objective: a differentiable scalar of the policy's distributions at the rows of some samples, and of the
 # probability ratios pi(a | s) / pi_old(a | s) of their pairs, [D].
@@ -33,10 +33,11 @@ Objective = Callable[[Distribution, Tensor], Tensor]
 
 
 AnyAscentConfig = TypeVar("AnyAscentConfig", bound=AscentConfig)
+AnyRadiusConfig = TypeVar("AnyRadiusConfig", bound=RadiusConfig)
 
 
 class FirstOrderRule(Generic[AnyAscentConfig]):
-    """Common part of first-order rules: the settings and the optimiser.
+    """Common part of first-order rules: the settings, the optimiser, and the ascent.
 
     Args:
         config: the agent's settings.
@@ -47,6 +48,36 @@ class FirstOrderRule(Generic[AnyAscentConfig]):
         self._config = config
         self._optimiser = Adam(policy.parameters, config.policy_learning_rate)
         self.parts: dict[str, Stateful] = {"optimiser": self._optimiser}
+
+    def ascend(
+        self,
+        policy: StochasticPolicy,
+        experience: Experience,
+        objective_of: Callable[[Experience], Objective],
+        generator: np.random.Generator,
+    ) -> dict[str, float]:
+        """Change the policy by ``gradient_ascent`` and return its metrics."""
+        return gradient_ascent(
+            policy, self._optimiser, experience, objective_of, config=self._config, generator=generator
+        )
+
+
+class RadiusRule(FirstOrderRule[AnyRadiusConfig]):
+    """Common part of first-order rules that keep their trust region, unless it is ``passed``."""
+
+    def ascend(
+        self,
+        policy: StochasticPolicy,
+        experience: Experience,
+        objective_of: Callable[[Experience], Objective],
+        generator: np.random.Generator,
+    ) -> dict[str, float]:
+        """Change the policy by ``gradient_ascent``; shorten the change to ``target_kl`` if it is larger."""
+        start = policy.parameters.values.clone()
+        metrics = super().ascend(policy, experience, objective_of, generator)
+        if self._config.trust_region == "kept":
+            keep_near(policy, experience, start, self._config.target_kl)
+        return metrics
 
 
 def with_entropy(
@@ -107,7 +138,6 @@ def gradient_ascent(
     *,
     config: AscentConfig,
     generator: np.random.Generator,
-    keeps_radius: bool = False,
 ) -> dict[str, float]:
     """Ascend an objective from the policy that collected the samples.
 
@@ -118,7 +148,6 @@ def gradient_ascent(
         objective_of: gives the objective of a minibatch or of all samples.
         config: learning rate, steps and largest KL.
         generator: for the minibatches.
-        keeps_radius: whether the change is shortened to ``target_kl`` if it is larger.
 
     Returns:
         The number of steps taken, ``policy_steps``.
@@ -130,7 +159,6 @@ def gradient_ascent(
     steps = max(config.policy_steps, config.policy_passes * experience.batch.num_parts(size))
     largest_kl = config.stop_kl_factor * config.target_kl
     objective_on = lru_cache(maxsize=1)(objective_of)  # the whole batch is repeated without end
-    start = policy.parameters.values.clone()
     taken, divergence = 0, 0.0
     for taken, part in enumerate(islice(experience.parts(size, generator), steps + 1)):
         now = policy.evaluate(part.batch.unique_observations)
@@ -142,6 +170,4 @@ def gradient_ascent(
         now.gradient(-surrogate_objective)
         optimiser.step()
     require_finite("the KL of the policy's steps", divergence)
-    if keeps_radius:
-        keep_near(policy, experience, start, config.target_kl)
     return {"policy_steps": float(taken)}

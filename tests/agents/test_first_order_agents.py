@@ -120,7 +120,8 @@ def test_focops_weighs_what_is_gained_against_how_far_the_policy_moves() -> None
     assert float(objective(now, ratios)) == pytest.approx(expected, rel=1e-5)
 
 
-def test_focops_keeps_its_trust_region_however_long_a_step_is() -> None:
+@pytest.mark.parametrize("agent", ["focops", "p3o"])
+def test_the_trust_region_is_kept_however_long_a_step_is(agent: str) -> None:
     found = {}
     for name in ("kept", "passed"):
         policy = StochasticPolicy(
@@ -128,8 +129,12 @@ def test_focops_keeps_its_trust_region_however_long_a_step_is() -> None:
         )
         constraints = Constraints(np.array([math.inf]), np.array([-math.inf]), np.zeros(1), 10.0)
         experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
-        config = FOCOPSConfig(target_kl=0.01, policy_learning_rate=0.1, trust_region=name)
-        rule = FirstOrderConstrainedOptimisation(config, policy, 1)
+        options = {"target_kl": 0.01, "policy_learning_rate": 0.1, "trust_region": name}
+        rule: PolicyRule = (
+            FirstOrderConstrainedOptimisation(FOCOPSConfig(**options), policy, 1)
+            if agent == "focops"
+            else PenalisedProximalPolicyOptimisation(P3OConfig(**options), policy, 1)
+        )
         found[name] = improve_and_measure(rule, policy, experience, np.random.default_rng(0))["kl"]
     assert found["passed"] > 0.05
     assert found["kept"] == pytest.approx(0.01, rel=0.2)

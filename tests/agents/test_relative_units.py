@@ -1,0 +1,56 @@
+"""Units in which the advantages of the reward and of every cost have the same spread, by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Discrete
+
+from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
+from recrl.agents.experience import Constraints, Experience
+from recrl.agents.learning.learning_batch import LearningBatch
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.environments.cmdp import Floats
+
+# Spreads of the reward and of two costs: 4, 2 and 0; the third never occurred.
+ADVANTAGES = np.array([[5.0, 7.0, 0.0, 1.0], [-3.0, 3.0, 0.0, 3.0]])
+
+
+def test_two_rollouts_by_hand() -> None:
+    """The spreads are root mean squares over both rollouts: of the reward sqrt((16 + 1) / 2), of cost 0 2."""
+    units = RelativeUnits(3)
+    first = units.of(ADVANTAGES)
+    assert first.rewards.tolist() == [1.0, -1.0]
+    assert first.exchange_rates.tolist() == [2.0, 0.0, 4.0]
+    assert first.costs[:, 0].tolist() == [1.0, -1.0]
+    assert first.costs[:, 1].tolist() == [0.0, 0.0]
+    resumed = RelativeUnits(3)
+    resumed.load_state_dict(units.state_dict())
+    second = np.array([[2.0, 7.0, 0.0, 1.0], [0.0, 3.0, 0.0, 3.0]])
+    for each in (units, resumed):
+        found = each.of(second)
+        assert found.rewards.tolist() == [1.0, -1.0]
+        assert found.exchange_rates[0] == pytest.approx(math.sqrt(8.5) / 2.0)
+        # The reward's spread in this rollout is 1.
+        assert found.factors[0] == pytest.approx(math.sqrt(8.5) / 2.0)
+        assert found.costs[:, 0].tolist() == pytest.approx([math.sqrt(8.5), -math.sqrt(8.5)])
+
+
+def constraints_of(limits: Floats, gaps: Floats) -> RelativeConstraints:
+    policy = StochasticPolicy(1, Discrete(2), NetworkForm((2,), orthogonal), 1.0, torch.Generator())
+    batch = LearningBatch.deduplicate(np.zeros((2, 1), np.float32), np.array([0, 1]), compact=False)
+    constraints = Constraints(limits, gaps, np.zeros(3), 10.0)
+    return RelativeConstraints.of(Experience.of(policy, batch, ADVANTAGES, constraints), RelativeUnits(3))
+
+
+def test_a_cost_can_bind_if_it_has_a_limit_and_has_occurred() -> None:
+    """Gap 30 over 10 steps is 3 a step; cost 0 counts 2 / 4 of its unit, cost 2 4 / 4."""
+    found = constraints_of(np.array([5.0, 5.0, 9.0]), np.array([30.0, -5.0, -2.0]))
+    assert found.index.tolist() == [0, 2]
+    assert found.violations.tolist() == pytest.approx([1.5, -0.2])
+    assert found.costs.tolist() == [[1.0, -1.0], [-1.0, 1.0]]
+    assert found.in_reward_per_cost(np.array([3.0, 5.0])).tolist() == [6.0, 0.0, 20.0]
+    without_limit = constraints_of(np.array([math.inf, 5.0, 9.0]), np.array([-math.inf, -5.0, -2.0]))
+    assert without_limit.index.tolist() == [2]
