@@ -71,12 +71,12 @@ class RelativeUnits:
 
 @dataclass(frozen=True, eq=False)
 class RelativeConstraints:
-    """The constraints that can bind, in relative units.
+    """The constraints that can bind, in the units of ``RelativeAdvantages``.
 
     Attributes:
         rewards: standardised advantages, [N].
-        costs: centred advantages, [N, j].
-        violations: c, (mean episode cost - limit) / mean episode length, [j].
+        costs: centred advantages of these costs times their factors, [N, j].
+        violations: (mean episode cost - limit) / mean episode length, times the factors, [j].
         index: of the j costs, [j].
         exchange_rates: u of all costs, reward per unit of cost, [k].
     """
