@@ -103,8 +103,8 @@ class ActorCriticConfig(BaseModel):
     )
     discount: Share = Field(
         default=0.995,
-        description="Discount gamma of the critics, per step (ours; paper 0.99). Rewards later than "
-        "1 / (1 - gamma) steps hardly count.",
+        description="Discount gamma of the critics, per step (ours; paper 0.99). After 1 / (1 - gamma) steps "
+        "the weight of a reward has fallen to 37%.",
     )
     reward_trace_decay: Share = Field(
         default=0.9, description="GAE lambda of the reward's advantages (ours; paper 0.97)."
@@ -227,8 +227,8 @@ class RadiusConfig(AscentConfig):
     )
     trust_region: Literal["kept", "passed"] = Field(
         default="kept",
-        description="Whether a step beyond target_kl is shortened to it (kept, ours), or is the last step "
-        "(passed; the algorithm's source).",
+        description="If the mean KL of an update exceeds target_kl: whether the change of the policy is "
+        "scaled back to it (kept, ours) or left (passed; the algorithm's source).",
     )
 
 

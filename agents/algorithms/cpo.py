@@ -169,8 +169,8 @@ class ConstrainedPolicyOptimisation:
         """Take one step in the trust region; skip it while the constrained cost is unknown.
 
         Returns:
-            Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages,
-            ``violation_integral_i`` in episode cost.
+            Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages per
+            unit of cost, ``violation_integral_i`` in episode cost.
         """
         config, integral, constraints = self._config, self._integral, experience.constraints
         multipliers = np.full_like(constraints.limits, NAN)

@@ -12,7 +12,7 @@ projected ascent up to 2. As in ``ppo-lag``, the penalised advantage is divided 
 large multiplier does not make the policy jump. If no constraint binds, lam keeps its meaning.
 
 The source stops once the mean KL exceeds delta, but keeps the last step, and one Adam step may double the KL.
-So, ours, the step is shortened until the KL is delta: ``trust_region: kept``.
+So, ours, the change of the policy in an update is scaled back to the KL delta: ``trust_region: kept``.
 
 Notation: N samples, U rows, D unique pairs, k costs, P parameters.
 """

@@ -7,7 +7,8 @@ The policy takes gradient steps on, in cost per step,
 with L_r the clipped surrogate of the reward, L_i that of cost i, and phi(s) = log(s) / t. L_i is, ours, the
 *pessimistic* surrogate of ``p3o``. The source's plain surrogate extrapolates a decrease of cost that holds
 only locally. So a violated constraint moves the policy too far in one update (on a RiverGrid, to one goal
-permanently). The optimum loses 1 / t of reward a step for each binding constraint. The paper does not define
+permanently). At the optimum each binding constraint costs 1 / t
+standard deviations of the reward's advantages a step. The paper does not define
 phi without slack. Here it continues along its tangent (Kervadec et al. 2022), from the slack 1 / (t kappa) at
 which its slope is kappa,
 

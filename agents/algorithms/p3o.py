@@ -10,8 +10,8 @@ problem, both have the same optimum. Nothing is adapted. Advantages and c are, o
 ``constraints.relative_units``, so that one kappa serves tasks of any units.
 
 Where a limit is kept the penalty has no gradient at first. The first steps follow the reward alone, and one
-Adam step may leave the trust region before the penalty acts. So, ours, the change is shortened until the KL
-is target_kl: ``trust_region: kept``.
+Adam step may leave the trust region before the penalty acts. So, ours, the change is scaled back to the KL
+target_kl: ``trust_region: kept``.
 
 While the constrained cost is unknown, the policy does not change. Notation: N samples, D pairs, k costs, j of
 them can bind.

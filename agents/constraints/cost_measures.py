@@ -200,7 +200,8 @@ class MeanCost:
     """Constraint on the mean episode cost.
 
     Args:
-        window: the least number of episodes for an estimate; fewer are used only at the start.
+        window: the least number of episodes finished in a rollout for their plain mean, and of steps that
+            an age counts in the life table.
         num_costs: k.
     """
 
@@ -211,9 +212,9 @@ class MeanCost:
     def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
         """Estimate the mean cost and the mean length from what the newest policies did.
 
-        If at least ``window`` episodes finished in the rollout, they are their means, else the life table's.
-        Until an episode has finished these are lower bounds: steps of later ages are not known. The table's
-        standard error is that of a mean of as many episodes as it has steps of each age.
+        If at least ``window`` episodes finished in the rollout, return their means, otherwise those of the
+        life table. Until an episode has finished these are lower bounds: steps of later ages are not known.
+        The table's standard error is that of a mean of as many episodes as it has steps of each age.
 
         Args:
             rollout: the steps.

@@ -72,7 +72,7 @@ class RadiusRule(FirstOrderRule[AnyRadiusConfig]):
         objective_of: Callable[[Experience], Objective],
         generator: np.random.Generator,
     ) -> dict[str, float]:
-        """Change the policy by ``gradient_ascent``; shorten the change to ``target_kl`` if it is larger."""
+        """Change the policy by ``gradient_ascent``; scale a larger change back to ``target_kl``."""
         start = policy.parameters.values.clone()
         metrics = super().ascend(policy, experience, objective_of, generator)
         if self._config.trust_region == "kept":
@@ -110,7 +110,7 @@ def normalised_by_penalties(surrogate_objective: Callable[[Tensor], tuple[Tensor
 
 
 def keep_near(policy: StochasticPolicy, experience: Experience, start: Tensor, radius: float) -> None:
-    """Shorten a change of the parameters until the mean KL is the radius, if it exceeds it.
+    """Scale a change of the parameters back to a mean KL of about the radius, if it exceeds it.
 
     theta <- theta_0 + sqrt(delta / KL) (theta - theta_0): exact if the KL is quadratic in the change.
 
@@ -146,7 +146,7 @@ def gradient_ascent(
         optimiser: of its parameters.
         experience: the samples.
         objective_of: gives the objective of a minibatch or of all samples.
-        config: learning rate, steps and largest KL.
+        config: minibatch size, steps and epochs, and largest KL.
         generator: for the minibatches.
 
     Returns:
