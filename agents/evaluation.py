@@ -72,7 +72,7 @@ def evaluate(
         ``num_episodes`` episodes, environment by environment.
 
     Raises:
-        RuntimeError: the episodes do not end.
+        RuntimeError: no episode ends in ``MAX_STEPS`` steps of each environment.
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
@@ -86,7 +86,7 @@ def evaluate(
         if steps >= MAX_STEPS:
             raise RuntimeError(f"evaluation: no episode ended within {MAX_STEPS} steps")
         _, finished = collector.collect(_Actor(actor, policy), generator)
-        steps += CHUNK_STEPS
+        steps = 0 if finished else steps + CHUNK_STEPS
         for episode in finished:
             if len(done[episode.environment]) < shares[episode.environment]:
                 done[episode.environment].append(episode)

@@ -235,10 +235,10 @@ class RadiusConfig(AscentConfig):
 class LagrangianConfig(BaseModel):
     """Options of Lagrange multipliers, in addition to those of an ``ActorCriticConfig``."""
 
-    multiplier_rule: Literal["projected", "softplus-adam", "pid"] = Field(
-        default="pid",
-        description="Update rule of the multipliers: PID, a damped dual ascent (Stooke et al. "
-        "2020; ours), plain projected dual ascent, or softplus with Adam (paper).",
+    multiplier_rule: Literal["projected", "softplus-adam", "proportional-integral"] = Field(
+        default="proportional-integral",
+        description="Update rule of the multipliers: proportional-integral, a damped dual ascent (Stooke "
+        "et al. 2020; ours), plain projected dual ascent, or softplus with Adam (paper).",
     )
     multiplier_initial: NonNegative = Field(
         default=0.0, description="Initial value of every multiplier (ours; paper 1)."
@@ -255,11 +255,12 @@ class LagrangianConfig(BaseModel):
         default=0.1,
         description="Step of the dual ascent, K_I, or Adam's learning rate, without unit (ours; paper 0.05).",
     )
-    multiplier_proportional: NonNegative = Field(default=1.0, description="K_P of the PID rule (ours).")
-    multiplier_derivative: NonNegative = Field(default=0.0, description="K_D of the PID rule (ours).")
+    multiplier_proportional: NonNegative = Field(
+        default=1.0, description="K_P of the rule proportional-integral (ours)."
+    )
     multiplier_maximum: Positive = Field(
         default=1000.0,
-        description="Largest multiplier of projected ascent and PID (ours; anti-wind-up).",
+        description="Largest multiplier, but for softplus-adam (ours; anti-wind-up).",
     )
 
     @model_validator(mode="after")

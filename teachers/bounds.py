@@ -66,11 +66,13 @@ def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
     Args:
         kl: delta, at least 0.
         advantage: eps, of the discounted costs, at least 0.
-        discount: gamma, in [0, 1).
+        discount: gamma, in [0, 1]; the bound is infinite for 1.
 
     >>> discounted_excess(0.02, 5.0, discount=0.5)
     2.0
     """
+    if discount == 1.0:
+        return math.inf
     return math.sqrt(2 * kl) * discount * advantage / (1 - discount) ** 2
 
 

@@ -8,7 +8,7 @@ proportion to the coefficient, and both reach their final values together.
 
     h = max(0, 1 - p / cooled)      annealing factor: 1 at first, 0 from the fraction ``cooled`` of B on
     d = min(d_t, d_d (1 + relaxation h))
-    tau = temperature h             reward per nat, in the next update
+    tau = temperature h             reward per nat, in the next update; 0 in the first one
 
 If learning has converged at a coefficient tau, log pi(a | s) is the advantage over tau, up to a constant; see
 ``Experience.with_entropy``. The agent's multiplier must be able to grow until no violation pays. ``ppo-lag``

@@ -37,17 +37,19 @@ from recrl.environments.cmdp import CMDPSpec
 def projected_step(problem: StepProblem) -> DualSolution:
     """Return the reward's step, projected and scaled back into the trust region.
 
-    If the constraints contradict one another, it projects on the most violated one only.
+    If the constraints contradict one another, it projects on one only: the most violated
+    of those that the policy can influence.
     """
     squared = problem.squared_gradient
     reach = float(np.sqrt(2.0 * problem.radius / squared)) if squared > NO_INFLUENCE else 0.0
     excesses = problem.violations - reach * problem.mixed
     weights = projection_weights(problem.gram, excesses)
     if weights is None:
-        spreads = np.sqrt(np.maximum(np.diag(problem.gram), NO_INFLUENCE))
-        worst = int(np.argmax(excesses / spreads))
+        squares = np.diag(problem.gram)
+        usable = np.flatnonzero(squares > NO_INFLUENCE)
+        worst = usable[np.argmax(excesses[usable] / np.sqrt(squares[usable]))]
         weights = np.zeros_like(excesses)
-        weights[worst] = excesses[worst] / spreads[worst] ** 2
+        weights[worst] = excesses[worst] / squares[worst]
     length = (
         reach**2 * squared
         + 2.0 * reach * float(weights @ problem.mixed)

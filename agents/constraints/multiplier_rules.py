@@ -9,8 +9,9 @@ A state is a dict of float64 arrays [k], which a checkpoint stores directly; eac
 Notation: k costs.
 
 Which to use: ``projected_ascent`` is an integrator, so the cost oscillates about the limit; the proportional
-term of ``pid`` damps this. Neither winds down below 0 nor accumulates old violations, so both respond
-immediately to a changed limit. ``softplus_adam`` does both; it is here because the paper's agents use it.
+term of ``proportional_integral`` damps this. Neither winds down below 0 nor accumulates old violations, so
+both respond immediately to a changed limit. ``softplus_adam`` does both; it is here because the paper's
+agents use it.
 """
 
 from __future__ import annotations
@@ -96,31 +97,29 @@ def softplus_adam(state: MultiplierState, gaps: Floats, *, learning_rate: float)
     }
 
 
-def start_pid(num_costs: int, initial: float) -> dict[str, Floats]:
-    """Return the initial state: all multipliers and integrals at ``initial``, at least 0; no gap yet."""
+def start_proportional_integral(num_costs: int, initial: float) -> dict[str, Floats]:
+    """Return the initial state: all multipliers and integrals at ``initial``, at least 0."""
     return {
         "multipliers": np.full(num_costs, initial),
         "integral": np.full(num_costs, initial),
-        "last_gap": np.full(num_costs, np.nan),
     }
 
 
-def pid(
+def proportional_integral(
     state: MultiplierState,
     gaps: Floats,
     *,
     largest: float | Floats,
     proportional: float | Floats,
     integral: float | Floats,
-    derivative: float | Floats,
     maximum: float,
 ) -> dict[str, Floats]:
-    """Take a step of a PID controller of the multiplier (Stooke et al. 2020, algorithm 2), with anti-wind-up.
+    """Take a step of a PI controller of the multiplier, with anti-wind-up (Stooke et al. 2020, algorithm 2).
 
     I <- clip(I + K_I min(gap, largest), 0, maximum);
-    lambda = clip(K_P min(gap, largest) + I + K_D max(0, gap - last gap), 0, maximum).
+    lambda = clip(K_P min(gap, largest) + I, 0, maximum).
 
-    The derivative acts only on growing violations, as in the source. The integral is clipped to the
+    The source also has a derivative term, K_D = 0 here. The integral is clipped to the
     multiplier's range, so that neither a long satisfied nor a long infeasible constraint winds it up. It
     includes the gain K_I, so that changing K_I does not make lambda jump.
 
@@ -130,25 +129,21 @@ def pid(
     rewards until the limit is nearly kept. So a violation counts no more than the largest possible slack.
 
     Args:
-        state: ``multipliers``, ``integral``, ``last_gap``.
+        state: ``multipliers``, ``integral``.
         gaps: J - d in any unit, [k]; -inf where there is no constraint.
         largest: the largest violation that counts, in that unit, one number or [k].
-        proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k]; likewise the
-            next two.
-        integral: K_I.
-        derivative: K_D.
+        proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k].
+        integral: K_I, likewise.
         maximum: the largest multiplier, possibly infinite.
     """
     active = np.isfinite(gaps)
     gap = np.where(active, gaps, 0.0)
-    rise = np.where(np.isnan(state["last_gap"]), 0.0, np.maximum(gap - state["last_gap"], 0.0))
     bounded = np.minimum(gap, largest)
     summed = np.clip(state["integral"] + integral * bounded, 0.0, maximum)
-    output = np.clip(proportional * bounded + summed + derivative * rise, 0.0, maximum)
+    output = np.clip(proportional * bounded + summed, 0.0, maximum)
     return {
         "multipliers": np.where(active, output, 0.0),
         "integral": np.where(active, summed, state["integral"]),
-        "last_gap": np.where(active, gap, np.nan),
     }
 
 
@@ -177,5 +172,5 @@ def relative_gaps(gaps: Floats, limits: Floats, standard_errors: Floats) -> Floa
 STARTS: dict[str, Callable[[int, float], dict[str, Floats]]] = {
     "projected": start_projected_ascent,
     "softplus-adam": start_softplus_adam,
-    "pid": start_pid,
+    "proportional-integral": start_proportional_integral,
 }

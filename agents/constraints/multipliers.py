@@ -25,8 +25,8 @@ import numpy as np
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
     MultiplierState,
-    pid,
     projected_ascent,
+    proportional_integral,
     relative_gaps,
     softplus_adam,
 )
@@ -114,12 +114,11 @@ def multiplier_step(config: LagrangianConfig) -> MultiplierRule:
         return lambda state, gaps: softplus_adam(state, gaps, learning_rate=step)
     if config.multiplier_rule == "projected":
         return lambda state, gaps: projected_ascent(state, gaps, step_size=step, maximum=maximum)
-    return lambda state, gaps: pid(
+    return lambda state, gaps: proportional_integral(
         state,
         gaps,
         largest=1.0 if config.multiplier_unit == "relative" else np.inf,
         proportional=config.multiplier_proportional,
         integral=step,
-        derivative=config.multiplier_derivative,
         maximum=maximum,
     )

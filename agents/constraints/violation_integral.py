@@ -12,7 +12,7 @@ c is computed from g + I in place of g. e = sqrt(d^2 + s^2), d the limit and s t
 bounds what a gap adds. An episode costs at least 0, so g is at least -d, but an untrained policy may exceed
 the limit by any amount. Without the bound a few such updates would add more than hundreds of later ones could
 subtract. An agent that has long kept the limit would still avoid all cost. The multipliers' integral is
-bounded likewise (``multiplier_rules.pid``).
+bounded likewise (``multiplier_rules.proportional_integral``).
 
 If the last step could not meet its constraint, a larger I would change nothing, and would delay the return to
 the reward. Then I does not grow (anti-wind-up). Under a limit of 0 g is never negative: there I falls only by

@@ -4,7 +4,8 @@ Critics learn targets divided by their running root mean square. The unit of mul
 running spreads of reward and cost advantages. If a task's rewards, or its costs and limits, are multiplied by
 1,000, the policies are the same (van Hasselt et al. 2016; Stooke et al. 2020).
 
-Every update has the same weight: with a moving average the unit would change as long as the policy does.
+Every update has the same weight: with a moving average the unit would change as long as the policy does. Only
+the first one counts twice in the scale of the targets, because critics need a scale before they learn.
 Notation: m quantities.
 """
 

@@ -124,7 +124,7 @@ def _advantages(updates: pd.DataFrame, cost: int, sizes: TaskSizes | None, disco
 
     It is the largest possible value, infinite if unknown, or the agent's measured one if smaller.
     """
-    largest = math.inf if sizes is None else sizes.largest_cost / (1.0 - discount)
+    largest = math.inf if sizes is None or discount == 1.0 else sizes.largest_cost / (1.0 - discount)
     name = f"cost_advantage_max_{cost}"
     seen = updates[name].to_numpy(np.float64) if name in updates else np.full(len(updates), math.inf)
     return np.asarray(np.fmin(seen, largest))

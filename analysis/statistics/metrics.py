@@ -226,11 +226,17 @@ def _frozen(sweep: Sweep, costs: list[str]) -> pd.DataFrame:
 
 
 def _with_exact(sampled: pd.DataFrame, exact: pd.DataFrame) -> pd.DataFrame:
-    """Replace sampled means by exact values if known; their standard errors are 0."""
+    """Replace sampled means by exact values if known, and add those of policies that were not sampled.
+
+    The standard errors of exact values are 0; policies that were not sampled have 0 episodes.
+    """
     if not len(exact):
         return sampled
     key = [*KEY, "measure"]
-    rows = sampled[key].merge(exact.rename(columns={"policy": "measure"}), on=key, how="left")
+    exact = exact.rename(columns={"policy": "measure"}).astype({name: sampled[name].dtype for name in key})
+    sampled = sampled.merge(exact[key], on=key, how="outer")
+    sampled["episodes"] = sampled["episodes"].fillna(0).astype(np.int64)
+    rows = sampled[key].merge(exact, on=key, how="left")
     known = rows["episode_return"].notna().to_numpy()
     sampled = sampled.assign(exact=known)
     for name in (str(column) for column in rows if column not in key):

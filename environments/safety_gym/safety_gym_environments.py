@@ -51,11 +51,6 @@ class SafetyGymOptions(BaseModel):
     horizon: int = Field(
         default=HORIZON, ge=1, le=HORIZON, description="Steps in an episode (Safety Gym: 1,000)."
     )
-    out_of_range: Literal["error", "clip"] = Field(
-        default="error",
-        description="Raise an error for actions outside [-1, 1], or clip them as Safety Gym does; "
-        "agents clip theirs.",
-    )
     num_threads: int = Field(
         default=1, ge=1, le=256, description="Threads for the physics (ours); results do not depend on it."
     )
@@ -113,7 +108,6 @@ def _make(task: SafetyTask, number: int, options: SafetyGymOptions) -> tuple[Des
         observed=task.observation_size,
         action_size=2,
         action_bound=1.0,
-        out_of_range=options.out_of_range,
         cost_names=cost_names(task, options),
         horizon=options.horizon,
         frames_per_second=frames_per_second(task),

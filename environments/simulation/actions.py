@@ -1,8 +1,8 @@
-"""Check continuous actions; clip those outside their bounds or raise an error."""
+"""Check continuous actions; clip those outside their bounds, as Safety Gym does."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +22,8 @@ def give_actions(
     *,
     shape: tuple[int, ...],
     bound: float,
-    out_of_range: Literal["error", "clip"],
 ) -> None:
-    """Set the actions of the next step.
+    """Set the actions of the next step, clipped to their bounds.
 
     Args:
         name: the task's, for errors.
@@ -32,7 +31,6 @@ def give_actions(
         actions: one for each environment, or for the only one.
         shape: required shape of the actions.
         bound: actions are within plus or minus this.
-        out_of_range: treatment of finite actions outside the bounds.
 
     Raises:
         ValueError: the actions are invalid; the message says why.
@@ -46,9 +44,4 @@ def give_actions(
         return
     if not np.isfinite(actions).all():
         raise ValueError(f"{name}: actions must be finite, got {actions.tolist()}")
-    if out_of_range == "error":
-        raise ValueError(
-            f"{name}: actions must be in [{-bound:g}, {bound:g}], got {actions.tolist()} "
-            "(option out_of_range: clip clips them)"
-        )
     batch.set_actions(np.clip(actions, -bound, bound))

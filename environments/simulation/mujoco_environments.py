@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 import gymnasium
 import numpy as np
@@ -37,8 +37,7 @@ class Description:
         name: of the task.
         observed: n.
         action_size: m.
-        action_bound: actions are within plus or minus this.
-        out_of_range: treatment of other finite actions.
+        action_bound: actions are clipped to plus or minus this.
         cost_names: of the k costs.
         horizon: steps in an episode, at most.
         frames_per_second: environment steps per second of simulated time.
@@ -51,7 +50,6 @@ class Description:
     observed: int
     action_size: int
     action_bound: float
-    out_of_range: Literal["error", "clip"]
     cost_names: tuple[str, ...]
     horizon: int
     frames_per_second: int
@@ -81,8 +79,7 @@ class Description:
         """
         if not batch.generators:
             raise ValueError(f"{self.name}: call reset before the first step")
-        bound, out_of_range = self.action_bound, self.out_of_range
-        give_actions(self.name, batch, actions, shape=shape, bound=bound, out_of_range=out_of_range)
+        give_actions(self.name, batch, actions, shape=shape, bound=self.action_bound)
 
 
 @dataclass(frozen=True)

@@ -174,15 +174,18 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
         return seen
 
     def _own_state(self) -> dict[str, Any]:
-        """State of physics, measured positions, and counters."""
+        """State of physics, the fields of the bodies, measured positions, and counters."""
         return {
             "physics": self.simulations.save(),
+            "bodies": {name: values.copy() for name, values in self.bodies.items()},
             "places": self.places.copy(),
             "steps": self.steps.copy(),
         }
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
         self.simulations.load(state["physics"])
+        for name, values in self.bodies.items():
+            values[...] = state["bodies"][name]
         self.places = np.array(state["places"], np.float64)
         self.steps[...] = state["steps"]
 

@@ -12,7 +12,7 @@ threshold, m/s), and ``cost_exception`` if the physics diverged.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -39,10 +39,6 @@ class VelocityOptions(BaseModel):
 
     horizon: int = Field(
         default=HORIZON, ge=1, le=HORIZON, description="Steps in an episode (safety-gymnasium: 1,000)."
-    )
-    out_of_range: Literal["error", "clip"] = Field(
-        default="error",
-        description="Raise an error for actions outside their bounds, or clip them; agents clip theirs.",
     )
     num_threads: int = Field(
         default=1, ge=1, le=256, description="Threads for the physics (ours); results do not depend on it."
@@ -72,7 +68,6 @@ def _make(task: VelocityTask, number: int, options: VelocityOptions) -> tuple[De
         observed=batch.observed,
         action_size=batch.model.nu,
         action_bound=batch.bound,
-        out_of_range=options.out_of_range,
         cost_names=COST_NAMES,
         horizon=options.horizon,
         frames_per_second=round(1.0 / batch.seconds),

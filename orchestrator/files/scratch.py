@@ -34,13 +34,19 @@ def scratch_folder(
         before_removal: called with each folder of a dead process before it is removed.
     """
     remove_dead(parent, prefix=prefix, before_removal=before_removal)
-    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
-    with (folder / LOCK).open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        try:
-            yield folder
-        finally:
-            _remove(folder)
+    held = False
+    while not held:
+        folder = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
+        with (folder / LOCK).open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            held = (
+                os.fstat(lock.fileno()).st_nlink > 0
+            )  # else another process removed it before it was locked
+            if held:
+                try:
+                    yield folder
+                finally:
+                    _remove(folder)
 
 
 def remove_dead(

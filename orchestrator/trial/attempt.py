@@ -7,12 +7,11 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from io import TextIOWrapper
 
 import torch
 
-from recrl.environments.registry import make_vector
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
     LostLeaseError,
@@ -27,7 +26,7 @@ from recrl.orchestrator.provenance.versions import collect as collect_provenance
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.heartbeat import Heartbeat
-from recrl.orchestrator.trial.trial import Trial
+from recrl.orchestrator.trial.trial import Trial, open_environments
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Teacher
 
@@ -65,8 +64,8 @@ def run_trial(
     """
     life = _SignsOfLife(writer)
     heartbeat = Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS)
-    with heartbeat.beating():  # preparation may take minutes
-        trial = life.of(Trial(spec, writer, teacher))
+    with heartbeat.beating(), ExitStack() as at_end:  # preparation may take minutes
+        trial = life.of(at_end.enter_context(closing(Trial(spec, writer, teacher))))
         committed = time.monotonic()
         while not trial.learned and not should_stop():
             with _located(f"in update {trial.update + 1}", writer):
@@ -193,11 +192,10 @@ def _cost_names(spec: TrialSpec) -> dict[str, list[str]]:
     if len(spec.deploy_limits) == 1:
         return {}
     try:
-        environments = make_vector(spec.task.name, 1, options=spec.task.options)
-        environments.close()
+        with open_environments(spec, 1) as environments:
+            return {"cost_names": list(environments.cmdp.cost_names)}
     except USERS_ERRORS:  # the trial itself will say so
         return {}
-    return {"cost_names": list(environments.cmdp.cost_names)}
 
 
 def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:

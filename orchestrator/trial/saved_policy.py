@@ -24,12 +24,12 @@ from recrl.agents.evaluation import FrozenPolicy, Shot, film
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.plugins import UntrustedNameError
-from recrl.environments.registry import NotDrawnError, make_drawn, make_vector
+from recrl.environments.registry import NotDrawnError, make_drawn
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.files.row_files import write_rows
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows
+from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows, open_environments
 from recrl.orchestrator.trial.videos import VideoFormat, captioned, stride, write_video
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
@@ -73,7 +73,8 @@ class SavedTrial:
             raise NoCheckpointError(f"{spec.title}: has no intact checkpoint yet")
         try:
             tree = checkpoint["trial"]
-            cmdp = make_vector(spec.task.name, 1, options=spec.task.options).cmdp
+            with open_environments(spec, 1) as environments:
+                cmdp = environments.cmdp
             seed = TrialSeeds.of(spec).agent
             agent = make_agent(spec.agent.name, cmdp, spec.agent.options, seed)
             agent.load_state_dict(tree["agent"])
@@ -141,8 +142,10 @@ class SavedTrial:
         try:
             frames = (captioned(shot.frame, self._caption(shot)) for shot in shots)
             write_video(path, frames, frames_per_second=speed / every)
-        except RuntimeError as error:  # no graphics library
-            raise RecrlError(f"{self.spec.title}: cannot be drawn: {error}") from error
+        except RecrlError:
+            raise
+        except USERS_ERRORS as error:  # the user's task, or a missing graphics library
+            raise RecrlError(f"{self.spec.title}: cannot be filmed: {described(error)}") from error
         finally:
             environment.close()
         return path

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from contextlib import closing
 from pathlib import Path
 
 import torch
@@ -35,8 +36,8 @@ def measured_speed(spec: TrialSpec, *, seconds: float = MEASURED_SECONDS) -> flo
     try:
         with tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
             store = TrialStore(Path(scratch) / spec.folder_name)
-            trial = Trial(spec, store.begin(spec), make_teacher(spec.teacher))
-            return _speed(trial, seconds)
+            with closing(Trial(spec, store.begin(spec), make_teacher(spec.teacher))) as trial:
+                return _speed(trial, seconds)
     except RecrlError:
         raise
     except USERS_ERRORS as error:

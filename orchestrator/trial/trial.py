@@ -16,7 +16,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -30,7 +31,7 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Fl
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.orchestrator.errors import RowError
+from recrl.orchestrator.errors import USERS_ERRORS, RowError, described
 from recrl.orchestrator.files.curriculum_warnings import HARD_LANDING
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
@@ -148,6 +149,10 @@ class Trial:
         if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
             logger.info("%s", self._log_line(row))
         self._next_step(episodes, rollout.observations)
+
+    def close(self) -> None:
+        """Close the environments."""
+        close(self._environments)
 
     def save(self) -> None:
         """Commit everything up to the last update, with a checkpoint."""
@@ -297,6 +302,24 @@ class Trial:
         self._generator.bit_generator.state = tree["generator"]
 
 
+@contextmanager
+def open_environments(spec: TrialSpec, num_envs: int) -> Iterator[CMDPVectorEnv]:
+    """Make environments of a trial's task; close them at the end."""
+    environments = make_vector(spec.task.name, num_envs, options=spec.task.options)
+    try:
+        yield environments
+    finally:
+        close(environments)
+
+
+def close(environments: CMDPVectorEnv) -> None:
+    """Close environments; an error is logged, because all results are there already."""
+    try:
+        environments.close()
+    except USERS_ERRORS as error:
+        logger.warning("the environments raised an error when they were closed: %s", described(error))
+
+
 def evaluation_rows(
     actor: FinalPolicy,
     spec: TrialSpec,
@@ -316,8 +339,8 @@ def evaluation_rows(
     """
     rows = []
     for policy in policies:
-        environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
-        episodes = evaluate(actor, environments, policy, num_episodes=num_episodes, seed=seed)
+        with open_environments(spec, spec.num_envs) as environments:
+            episodes = evaluate(actor, environments, policy, num_episodes=num_episodes, seed=seed)
         rows += [
             {
                 "policy": policy,

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
+from recrl.agents.evaluation import MAX_FILMED_STEPS
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.atomic_files import write_atomically
 
@@ -45,7 +46,7 @@ def stride(video_format: VideoFormat, *, frames_per_second: float, longest: int 
     Args:
         video_format: GIFs are kept short.
         frames_per_second: with one frame per step, above 0.
-        longest: largest number of steps, or None.
+        longest: largest number of steps; None if unknown, then ``MAX_FILMED_STEPS``.
 
     >>> stride(VideoFormat.MP4, frames_per_second=50.0, longest=1000)
     2
@@ -53,7 +54,7 @@ def stride(video_format: VideoFormat, *, frames_per_second: float, longest: int 
     1
     """
     for_speed = -(-frames_per_second // MOST_FRAMES_PER_SECOND)
-    for_size = -(-(longest or 1) // MOST_GIF_FRAMES) if video_format is VideoFormat.GIF else 1
+    for_size = -(-(longest or MAX_FILMED_STEPS) // MOST_GIF_FRAMES) if video_format is VideoFormat.GIF else 1
     return int(max(1, for_speed, for_size))
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_in
 from recrl.orchestrator.errors import GridError, RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
 SOURCE = "grid"
+NOT_FINITE_OR_TEXT = re.compile(r'"(?:[^"\\]|\\.)*"|Infinity|NaN')
 LINE_SECONDS = 60.0  # at most between two lines of progress
 
 
@@ -91,6 +93,7 @@ def launch(
     Raises:
         GridError: the grid is wrong; nothing was started.
         RecrlError: another process runs the sweep, or Ray, MLflow or the disk cannot be used.
+        KeyboardInterrupt: Ctrl-C or SIGTERM stopped it before its end; the same call continues.
     """
     # of the command line only what prints is used
     from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
@@ -111,9 +114,11 @@ def launch(
         checked = _checked(grid)
         if progress:
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
-            launch_and_print(checked, options, TextConsole(), given=given)
+            stopped = launch_and_print(checked, options, TextConsole(), given=given) is ExitCode.STOPPED
         else:
-            launch_grid(checked, options)
+            stopped = launch_grid(checked, options).result.stopped
+        if stopped:
+            raise KeyboardInterrupt
         return load_sweep(Path(root) / checked.name, trust=True)
 
 
@@ -156,6 +161,7 @@ def train(
     Raises:
         GridError: an argument is wrong; one sentence for each mistake.
         RecrlError: the trial failed; its traceback is a note of the error.
+        KeyboardInterrupt: Ctrl-C or SIGTERM stopped it; with a ``folder`` the same call continues.
 
     Example:
         >>> import recrl
@@ -185,8 +191,8 @@ def train(
         (spec,) = store.specs()
         trial = store.trial(spec)
         record = trial.record()
-        if record.status in (TrialState.FAILED, TrialState.DAMAGED):
-            failed = RecrlError(f"{spec.title}: {record.error}")
+        if record.status is not TrialState.COMPLETE:
+            failed = RecrlError(f"{spec.title}: {record.error or 'is not complete'}")
             if trial.error_path.exists():
                 failed.add_note(trial.error_path.read_text())
             raise failed
@@ -234,7 +240,7 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     if isinstance(grid, str | Path):
         return read_grid(Path(grid), build=build)
     try:
-        data = json.dumps(dict(grid)).replace("Infinity", ".inf").replace("NaN", ".nan").encode()
+        data = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid))).encode()
     except (TypeError, ValueError) as error:
         raise GridError([f"{SOURCE}: must hold plain values only: {error}"]) from error
     try:
@@ -242,6 +248,11 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     except GridError as error:
         problems = [re.sub(rf"^{SOURCE}:\d+: ", "", problem) for problem in error.problems]
         raise GridError(problems) from error
+
+
+def _in_yaml(token: re.Match[str]) -> str:
+    """Return a number of JSON that is not finite as YAML writes it, and a string as it is."""
+    return {"Infinity": ".inf", "NaN": ".nan"}.get(token[0], token[0])
 
 
 @contextmanager

@@ -9,12 +9,12 @@ import torch
 
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
-    pid,
     projected_ascent,
+    proportional_integral,
     relative_gaps,
     softplus_adam,
-    start_pid,
     start_projected_ascent,
+    start_proportional_integral,
     start_softplus_adam,
 )
 
@@ -54,39 +54,39 @@ def test_softplus_adam_equals_pytorch() -> None:
     np.testing.assert_allclose(state["multipliers"], expected, rtol=1e-10)
 
 
-def test_pid_adds_its_three_terms() -> None:
-    gains: dict[str, Any] = {"proportional": 0.1, "integral": 0.01, "derivative": 1.0, "maximum": 100.0}
+def test_proportional_integral_adds_its_two_terms() -> None:
+    gains: dict[str, Any] = {"proportional": 0.1, "integral": 0.01, "maximum": 100.0}
     gains["largest"] = 20.0
-    state = pid(start_pid(1, 0.0), np.array([10.0]), **gains)
-    assert state["multipliers"] == pytest.approx([1.1])  # 0.1 * 10 + 0.01 * 10; nothing to differ from yet
-    state = pid(state, np.array([12.0]), **gains)
-    assert state["multipliers"] == pytest.approx([1.2 + 0.22 + 2.0])
-    state = pid(state, np.array([11.0]), **gains)
-    assert state["multipliers"] == pytest.approx([1.1 + 0.33])  # a falling gap is not differentiated
+    state = proportional_integral(start_proportional_integral(1, 0.0), np.array([10.0]), **gains)
+    assert state["multipliers"] == pytest.approx([1.1])  # 0.1 * 10 + 0.01 * 10
+    state = proportional_integral(state, np.array([12.0]), **gains)
+    assert state["multipliers"] == pytest.approx([1.2 + 0.22])
 
 
-def test_pid_does_not_wind_up() -> None:
-    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 2.0}
-    state, gains["largest"] = start_pid(2, 0.0), 10.0
+def test_proportional_integral_does_not_wind_up() -> None:
+    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "maximum": 2.0}
+    state, gains["largest"] = start_proportional_integral(2, 0.0), 10.0
     for _ in range(1000):
-        state = pid(state, np.array([10.0, -10.0]), **gains)
+        state = proportional_integral(state, np.array([10.0, -10.0]), **gains)
     assert state["integral"].tolist() == [2.0, 0.0]
-    state = pid(state, np.array([-10.0, 10.0]), **gains)
+    state = proportional_integral(state, np.array([-10.0, 10.0]), **gains)
     assert state["multipliers"].tolist() == [1.0, 1.0]
 
 
 def test_what_a_violation_winds_up_satisfaction_can_wind_down_in_as_many_updates() -> None:
-    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
-    state, gains["largest"] = start_pid(2, 1.0), np.array([5.0, 2.0])
-    state = pid(state, np.array([60.0, 1.0]), **gains)
+    gains: dict[str, Any] = {"proportional": 0.0, "integral": 0.1, "maximum": 100.0}
+    state, gains["largest"] = start_proportional_integral(2, 1.0), np.array([5.0, 2.0])
+    state = proportional_integral(state, np.array([60.0, 1.0]), **gains)
     assert state["integral"].tolist() == pytest.approx([1.5, 1.1])
-    state = pid(state, np.array([-5.0, -2.0]), **gains)
+    state = proportional_integral(state, np.array([-5.0, -2.0]), **gains)
     assert state["integral"].tolist() == pytest.approx([1.0, 0.9])
 
 
 def test_a_large_violation_counts_no_more_than_the_largest_in_both_terms() -> None:
-    gains: dict[str, Any] = {"proportional": 0.5, "integral": 0.1, "derivative": 0.0, "maximum": 100.0}
-    state = pid(start_pid(2, 0.0), np.array([60.0, 3.0]), largest=5.0, **gains)
+    gains: dict[str, Any] = {"proportional": 0.5, "integral": 0.1, "maximum": 100.0}
+    state = proportional_integral(
+        start_proportional_integral(2, 0.0), np.array([60.0, 3.0]), largest=5.0, **gains
+    )
     assert state["multipliers"].tolist() == pytest.approx([0.5 * 5.0 + 0.1 * 5.0, 0.5 * 3.0 + 0.1 * 3.0])
 
 
@@ -110,13 +110,12 @@ def test_no_limit_means_no_multiplier_and_leaves_no_trace(rule: str) -> None:
     steps = {
         "projected": lambda state, gaps: projected_ascent(state, gaps, step_size=0.1, maximum=10.0),
         "softplus-adam": lambda state, gaps: softplus_adam(state, gaps, learning_rate=0.1),
-        "pid": lambda state, gaps: pid(
+        "proportional-integral": lambda state, gaps: proportional_integral(
             state,
             gaps,
             largest=2.0,
             proportional=0.1,
             integral=0.1,
-            derivative=0.1,
             maximum=10.0,
         ),
     }
@@ -124,5 +123,5 @@ def test_no_limit_means_no_multiplier_and_leaves_no_trace(rule: str) -> None:
     state = steps[rule](start, np.array([UNLIMITED, 2.0]))
     assert state["multipliers"][0] == 0.0
     assert state["multipliers"][1] > 1.0
-    for key in set(state) - {"multipliers", "last_gap"}:
+    for key in set(state) - {"multipliers"}:
         assert state[key][0] == start[key][0]

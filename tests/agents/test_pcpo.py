@@ -72,6 +72,14 @@ def test_constraints_that_contradict_one_another_mend_the_worst() -> None:
     assert float(np.linalg.norm(found)) == pytest.approx(1.0)
 
 
+def test_of_contradicting_constraints_one_without_influence_is_not_the_worst() -> None:
+    gram = np.array([[1e-14, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 1.0]])
+    problem = StepProblem(1.0, np.zeros(3), gram, np.array([5.0, 0.1, 0.4]), radius=0.5)
+    found = projected_step(problem).constraint_weights
+    assert found[:2].tolist() == [0.0, 0.0]
+    assert found[2] == pytest.approx(0.4 / np.sqrt(1.16))  # of length sqrt(1 + 0.4^2), scaled back to 1
+
+
 def test_a_cost_that_no_step_can_change_is_left_out() -> None:
     assert step(-EAST, np.zeros((1, 2)), [3.0]) == pytest.approx(EAST)
     assert step(np.zeros(2), np.zeros((1, 2)), [3.0]) == pytest.approx([0.0, 0.0])

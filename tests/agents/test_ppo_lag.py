@@ -51,11 +51,11 @@ def test_the_multiplier_answers_before_the_policy_moves() -> None:
     assert found["multiplier_0"] == 0.2
 
 
-@pytest.mark.parametrize("rule", ["projected", "pid"])
+@pytest.mark.parametrize("rule", ["projected", "proportional-integral"])
 def test_equal_shares_of_the_limit_have_equal_multipliers_whatever_the_limit(rule: str) -> None:
     options = {"multiplier_rule": rule, "multiplier_step": 0.02, "multiplier_proportional": 0.0}
     found = [improved(share * 2.0, share, **options)["multiplier_0"] for share in (1.0, 5.0, 25.0)]
-    # Twice the limit too much; PID sums up one limit at most.
+    # Twice the limit too much; the integral sums up one limit at most.
     assert found == pytest.approx([0.04 * EXCHANGE if rule == "projected" else 0.02 * EXCHANGE] * 3)
 
 
@@ -69,7 +69,7 @@ def test_without_a_finished_episode_the_multiplier_stays() -> None:
     assert improvement(rule, policy, batch, unknown)["multiplier_0"] == pytest.approx(0.7 * EXCHANGE)
 
 
-@pytest.mark.parametrize("rule", ["projected", "softplus-adam", "pid"])
+@pytest.mark.parametrize("rule", ["projected", "softplus-adam", "proportional-integral"])
 def test_no_limit_is_no_penalty(rule: str) -> None:
     metrics = improved(-math.inf, math.inf, multiplier_rule=rule, multiplier_initial=2.0)
     assert metrics["multiplier_0"] == 0.0

@@ -147,6 +147,14 @@ def test_measured_advantages_make_the_discounted_bound_tighter(finished: Sweep) 
     assert own["discounted_bound"] == pytest.approx(21.0 + excess)
 
 
+def test_a_discount_of_1_leaves_only_the_trivial_bound(finished: Sweep) -> None:
+    sweep = with_discount(three_policies(finished), 1.0)
+    updates = sweep.updates.assign(kl=[1e-8, 1e-8, 0.0], limit_0=[6.0, 5.0, 5.0])
+    (row,) = cumulative_cost.cumulative_costs(dataclasses.replace(sweep, updates=updates)).to_dict("records")
+    assert row["discounted_bound"] == row["ceiling_sum"]
+    assert math.isnan(row["discounted_excess_sum"])
+
+
 def test_without_horizon_the_first_policy_counts_with_its_cost(finished: Sweep) -> None:
     updates = three_policies(finished).updates.assign(
         cost_advantage_max_0=1.0, limit_0=[20.0, 10.0, 5.0], kl=0.0

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from recrl.analysis.data import sweep_data
+from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_formats
 from recrl.analysis.statistics import metrics, verdicts
@@ -26,6 +27,20 @@ def test_a_trial_has_three_outcomes_under_three_names(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     assert len(rows) == 3 * len(finished.trials)
     assert rows["measure"].tolist()[:3] == ["deployment", "stochastic", "deterministic"]
+
+
+def test_exact_values_need_no_sampled_episodes(finished: Sweep) -> None:
+    whole = metrics.outcomes(finished)
+    sweep = dataclasses.replace(finished)
+    sweep.__dict__["evaluations"] = finished.evaluations.iloc[:0]
+    exact = finished.evaluations.groupby([*KEY, "policy"], observed=True)[["episode_return", "cost_0"]].mean()
+    sweep.__dict__["exact"] = exact.reset_index().astype({name: str for name in KEY[:3]})
+    rows = metrics.outcomes(sweep)
+    assert rows[["task", "measure"]].equals(whole[["task", "measure"]])
+    final = rows[rows["measure"] != "deployment"]
+    assert final["exact"].all()
+    assert set(final["episodes"]) == {0}
+    assert set(final["episode_return_se"]) == {0.0}
 
 
 def test_the_gap_is_the_optimum_minus_the_return(finished: Sweep) -> None:

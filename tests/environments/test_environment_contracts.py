@@ -178,6 +178,18 @@ def test_a_restored_environment_continues_with_equal_bytes(name: str) -> None:
     assert [as_bytes(step) for step in run(again, actions[5:])] == uninterrupted
 
 
+def test_a_restart_after_resuming_is_that_of_the_uninterrupted_environment(name: str) -> None:
+    environment, resumed = build(name), build(name)
+    environment.reset(seed=7)
+    for _ in run(environment, random_actions(environment, 5)):
+        pass
+    resumed.load_state_dict(environment.state_dict())
+    some = np.array([0], np.intp)
+    assert resumed.restart(some).tobytes() == environment.restart(some).tobytes()
+    for action in random_actions(environment, 3):
+        assert as_bytes(resumed.step(action)) == as_bytes(environment.step(action))
+
+
 def test_a_state_of_another_number_of_environments_is_refused(name: str) -> None:
     environment, other = build(name), build(name, NUM_ENVS + 1)
     environment.reset(seed=0)

@@ -13,13 +13,14 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import IO
 
 import pytest
 
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.errors import LostLeaseError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.scratch import EMPTY_SECONDS, LOCK, scratch_folder
+from recrl.orchestrator.files.scratch import EMPTY_SECONDS, LOCK, remove_dead, scratch_folder
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
@@ -297,6 +298,22 @@ def test_a_folder_with_a_prefix_of_its_own_is_removed_only_with_its_processes(tm
     with scratch_folder(str(tmp_path), prefix="recrl-ray-", before_removal=ended.append):
         assert not dead.exists()
     assert ended == [dead]
+
+
+def test_a_scratch_folder_that_another_process_removes_before_it_is_locked_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = fcntl.flock
+
+    def late(descriptor: IO[str], operation: int) -> None:
+        monkeypatch.setattr(fcntl, "flock", lock)
+        remove_dead(str(tmp_path))  # its lock is free
+        lock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with scratch_folder(str(tmp_path)) as folder:
+        (folder / "file").touch()
+        assert list(tmp_path.iterdir()) == [folder]
 
 
 @pytest.mark.parametrize("moment", ["before its lock was there", "while it was removed"])

@@ -13,6 +13,7 @@ from PIL import Image
 from recrl.agents.evaluation import FrozenPolicy, evaluate, film
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS, make_drawn, make_vector
+from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -179,6 +180,14 @@ def test_a_task_without_rendering_is_a_sentence(complete: TrialStore) -> None:
         RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state cannot be rendered"
     ):
         SavedTrial.load(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+
+
+def test_a_task_that_fails_to_render_is_a_sentence(
+    crossing: TrialStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RiverGridEnv, "render", lambda _: None)
+    with pytest.raises(RecrlError, match="cannot be filmed: ValueError: a frame must be uint8"):
+        SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
 @pytest.mark.parametrize("name", ["rivergrid-1b", "rivergrid", "gymnasium"])

@@ -18,6 +18,8 @@ import pytest
 
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
+from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
@@ -310,6 +312,23 @@ def test_a_finished_trial_has_nothing_left_to_do(undisturbed: TrialStore, tmp_pa
     before = store.episodes_path.read_bytes()
     assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
     assert store.episodes_path.read_bytes() == before
+
+
+@pytest.mark.parametrize("failing", [False, True])
+def test_environments_are_closed_and_an_error_of_that_fails_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: bool
+) -> None:
+    closed = []
+
+    def close(environments: CMDPVectorEnv, **_: object) -> None:
+        closed.append(environments)
+        if failing:
+            raise OSError("the simulator is gone")
+
+    monkeypatch.setattr(FiniteVectorEnv, "close_extras", close)
+    store = SweepStore(tmp_path, "small").trial(SPEC)
+    assert run_recorded(SPEC, store, should_stop=lambda: False) is TrialState.COMPLETE
+    assert len(closed) == 3  # of the training, and of two evaluations
 
 
 def test_a_trial_that_raises_is_failed_with_its_traceback(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ def plain(colour: tuple[int, int, int]) -> Frame:
     [
         (VideoFormat.GIF, 10.0, 200, 1),
         (VideoFormat.GIF, 25.0, 1000, 4),
-        (VideoFormat.GIF, 50.0, None, 2),
+        (VideoFormat.GIF, 50.0, None, 40),  # a film has 10,000 steps at most
         (VideoFormat.MP4, 50.0, 1000, 2),
         (VideoFormat.MP4, 25.0, 1000, 1),
     ],

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import math
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,6 +19,7 @@ from recrl.analysis.data import export
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.trial.trial import Trial
 
 RUN = {"total_steps": 160, "deploy_fraction": 0.5, "num_envs": 4, "rollout_steps": 10}
 GRID = {
@@ -156,6 +159,36 @@ def test_a_trial_that_fails_raises_with_its_traceback(folder: Path, monkeypatch:
     with pytest.raises(recrl.RecrlError, match="ZeroDivisionError") as error:
         train(task="broken_room:make")
     assert "Traceback" in error.value.__notes__[0]
+
+
+@pytest.mark.parametrize("progress", [False, True])
+def test_ctrl_c_ends_a_loop_over_trainings_and_the_same_call_continues(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, progress: bool
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(Trial, "advance", interrupting(Trial.advance))
+        with pytest.raises(KeyboardInterrupt):
+            train(folder=folder / "kept", progress=progress)
+        with pytest.raises(KeyboardInterrupt):
+            recrl.launch(GRID, executor="inline", mlflow=False, figures=False, progress=progress)
+    assert len(train(folder=folder / "kept").updates) == 4
+
+
+def interrupting(advance: Callable[[Trial], None]) -> Callable[[Trial], None]:
+    """Press Ctrl-C after an update."""
+
+    def pressed(trial: Trial) -> None:
+        advance(trial)
+        signal.raise_signal(signal.SIGINT)
+
+    return pressed
+
+
+def test_text_that_looks_like_a_number_stays_text(folder: Path) -> None:
+    grid = {**GRID, "tasks": [{"name": "two-state", "label": "InfinityNaN"}], "deploy_limits": 2}
+    *_, trial = recrl.validate(grid | {"train_limits": math.inf}).trials()
+    assert trial.task.label == "InfinityNaN"
+    assert list(trial.train_limits) == [math.inf]
 
 
 def test_sweeps_are_loaded_from_a_folder_and_an_export(finished_sweep: SweepStore, tmp_path: Path) -> None:

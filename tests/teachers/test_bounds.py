@@ -31,6 +31,10 @@ def test_lemma_1_by_hand() -> None:
     assert 25.0 + discounted_excess(0.02, 3.0, discount=0.5) == pytest.approx(26.2)
 
 
+def test_lemma_1_says_nothing_without_a_discount() -> None:
+    assert discounted_excess(0.02, 5.0, discount=1.0) == math.inf
+
+
 def test_an_update_that_changes_nothing_exceeds_nothing() -> None:
     assert discounted_excess(0.0, 3.0, discount=0.99) == 0.0
     assert undiscounted_excess(0.0, 3.0, horizon=200) == 0.0
