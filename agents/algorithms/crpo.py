@@ -133,7 +133,7 @@ class ConstraintRectifiedPolicyOptimisation:
             solution = reward_step(problem, config)
         else:
             solution = cost_step(problem, int(np.searchsorted(active.index, corrected)), config)
-            multipliers[corrected] = np.inf  # as if this were the only constraint
+            multipliers[corrected] = np.inf  # as if this were the only constraint; recorded as NaN
         is_acceptable = improvement(model, corrected, config.target_kl)
         metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
         return {**metrics, **indexed("multiplier", multipliers)}

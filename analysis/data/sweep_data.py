@@ -48,13 +48,13 @@ import pandas as pd
 from recrl.analysis.data.exact_values import exact_values, finite_model
 from recrl.analysis.data.labels import DOUBLES, KEY, TRIAL, keys_of
 from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
+from recrl.analysis.data.phase_totals import phase_totals
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec, TrialState
-from recrl.orchestrator.trial.phase_totals import phase_totals
 from recrl.orchestrator.untrusted import checked_name
 
 TRIAL_COLUMNS = (
@@ -82,7 +82,7 @@ ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the data fr
 # The agents' metrics in figures and tables; MLflow and the export file have no others.
 DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
 
-logger = logging.getLogger("recrl.frames")
+logger = logging.getLogger("recrl.sweep_data")
 
 
 @dataclass(frozen=True)

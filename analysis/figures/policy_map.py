@@ -22,10 +22,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from recrl.analysis.data.labels import occurring
+from recrl.analysis.data.number_texts import number
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.styles import TEXT_WIDTH
-from recrl.analysis.report.table_formats import number
 from recrl.environments.cmdp import Floats
 from recrl.environments.finite.exact_solver import evaluate_policy
 from recrl.environments.registry import task_options

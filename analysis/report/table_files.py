@@ -14,9 +14,10 @@ from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import table_formats
+from recrl.analysis.report.text_tables import bound_table, claims_table
 from recrl.analysis.report.verdict_texts import tolerance_sentence
 from recrl.analysis.statistics import claims, metrics
-from recrl.analysis.statistics.cumulative_cost import bound_table, cumulative_costs
+from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import count_verdicts
@@ -99,7 +100,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     averaged = metrics.summary(rows)
     robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
     compared = metrics.comparisons(rows, generator)
-    weighed = claims.weigh(rows, totals)
+    weighed = claims.count_claims(rows, totals)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
     judged = count_verdicts(rows, compared, curriculum_flags(sweep), cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
@@ -109,7 +110,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     if len(weighed):
         written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
         note = COMPARED_CLAIMS_NOTE if weighed["difference"].notna().any() else ""
-        shown.append(ShownTable("What the paper says of these tasks", claims.claims_table(weighed), note))
+        shown.append(ShownTable("What the paper says of these tasks", claims_table(weighed), note))
     for i, costs in enumerate(bounds):
         which = f" (cost{suffixes[i]})" if suffixes[i] else ""
         if len(costs):

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_suffix
+from recrl.analysis.data.number_texts import DASH, number, with_error
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report.table_formats import DASH, number, with_error, with_interval
+from recrl.analysis.report.table_formats import with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 from recrl.environments.registry import TASKS
 

@@ -26,7 +26,6 @@ import pandas as pd
 from recrl.analysis.statistics.intervals import (
     Interval,
     mean_interval,
-    share_text,
     wilson_interval,
 )
 from recrl.analysis.statistics.metrics import Measure
@@ -140,7 +139,7 @@ CLAIMS = (
 )
 
 
-def weigh(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
+def count_claims(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
     """Count the trials or seeds in which each claim holds, one row per claim and agent.
 
     Args:
@@ -230,36 +229,3 @@ def _numbers(values: pd.Series[float]) -> Floats:
 def _ends(interval: Interval) -> dict[str, float]:
     ends = (interval.estimate, interval.low, interval.high)
     return dict(zip(("difference", "difference_low", "difference_high"), ends, strict=True))
-
-
-def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
-    """Format the result of ``weigh``: "mixed", "4 of 5 (38–96%)", "+1.2 (+0.3 to +2.1)", "+40%"."""
-    shares = zip(weighed["held"], weighed["trials"], weighed["share_low"], weighed["share_high"], strict=True)
-    beside = zip(weighed["deployment_held"], weighed["deployment_trials"], strict=True)
-    columns = {
-        "section": weighed["section"],
-        "claim": weighed["claim"],
-        "agent": weighed["agent"],
-        "holds here": [
-            "yes" if held == trials else "mixed" if held else "no"
-            for held, trials in zip(weighed["held"], weighed["trials"], strict=True)
-        ],
-        "holds in": [share_text(*share) for share in shares],
-        "deployment phase (learning goes on)": [
-            f"{held} of {trials}" if trials else "" for held, trials in beside
-        ],
-    }
-    if weighed["difference"].notna().any():
-        columns["difference"] = [_difference_text(row) for _, row in weighed.iterrows()]
-        relative = weighed["relative_difference"]
-        columns["relative"] = [f"{value:+.0%}" if math.isfinite(value) else "" for value in relative]
-        columns["paper, over its three tasks"] = weighed["paper"]
-    return pd.DataFrame(columns)
-
-
-def _difference_text(row: pd.Series) -> str:
-    if not math.isfinite(row["difference"]):
-        return ""
-    if not math.isfinite(row["difference_low"]):
-        return f"{row['difference']:+.2f}"
-    return f"{row['difference']:+.2f} ({row['difference_low']:+.2f} to {row['difference_high']:+.2f})"

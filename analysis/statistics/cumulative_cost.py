@@ -48,7 +48,6 @@ import pandas as pd
 from recrl.analysis.data.exact_values import finite_model
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report.table_formats import number
 from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
@@ -204,41 +203,6 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
             | {"used_train_limit": float(runs["train_limit"].max())}
             | {"measured_violation": float((runs["violation_sum"] * runs["episodes_per_policy"]).max())}
             | {"largest_train_limit": limit}
-        )
-    return pd.DataFrame(lines)
-
-
-def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """Format the sums of ``cumulative_costs``: one row per GROUP, means over its runs."""
-    lines = []
-    for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
-        line = dict(zip(("task", "agent", "curriculum"), map(str, group), strict=True))
-        line |= {"n": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
-        for title, name in (
-            ("cost", "cost_sum"),
-            ("limits in force", "limit_sum"),
-            ("above limits in force", "overshoot_sum"),
-            ("above the limit", "violation_sum"),
-            ("bound", "bound"),
-            ("discounted bound", "discounted_bound"),
-            ("trivial bound", "ceiling_sum"),
-        ):
-            line[title] = number(float(runs[name].mean()))
-        lines.append(line)
-    return pd.DataFrame(lines)
-
-
-def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """Format the limits of ``admissible_limits``."""
-    lines = []
-    for _, row in rows.iterrows():
-        limit = float(row["largest_train_limit"])
-        lines.append(
-            dict(zip(("task", "agent", "curriculum"), (str(row[name]) for name in GROUP), strict=True))
-            | {"overshoot per policy": number(row["overshoot"])}
-            | {"violation of the worst run": number(row["measured_violation"])}
-            | {"d_t of the runs": number(row["used_train_limit"])}
-            | {"largest d_t": "any" if math.isinf(limit) else "none" if math.isnan(limit) else number(limit)}
         )
     return pd.DataFrame(lines)
 

@@ -11,13 +11,12 @@ curriculum's window or tolerance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.report.table_formats import number
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -82,33 +81,6 @@ def progress_reports(trial: TrialStore, updates: pd.DataFrame) -> Iterator[Progr
         yield ProgressReport(update=int(update), env_steps=int(end_step), episodes=batch)
 
 
-def replay_summary(trial: TrialStore, rows: pd.DataFrame) -> pd.DataFrame:
-    """Summarise the differences between replay and record: one row per cost, as text.
-
-    Args:
-        trial: the run.
-        rows: of ``replay``.
-    """
-    training = rows[rows["phase"] == Phase.TRAINING.value]
-    lines = []
-    for i, deploy in enumerate(trial.spec.deploy_limits):
-        own = training[f"limit_{i}"].to_numpy(np.float64)
-        other = training[f"replayed_limit_{i}"].to_numpy(np.float64)
-        differ = own != other
-        lines.append(
-            {"trial": trial.spec.title, "cost": str(i), "updates": str(len(training))}
-            | {"other limit": str(int(differ.sum()))}
-            | {"mean limit": _mean(own), "replayed": _mean(other)}
-            | {"reaches d_d": _reached(training, own, deploy)}
-            | {"replayed reaches d_d": _reached(training, other, deploy)}
-            | {
-                "noise": str(_times(training["noise"])),
-                "replayed noise": str(_times(training["replayed_noise"])),
-            }
-        )
-    return pd.DataFrame(lines)
-
-
 def _episode(row: dict[Any, Any], num_costs: int) -> EpisodeStats:
     return EpisodeStats(
         index=row["index"],
@@ -120,19 +92,3 @@ def _episode(row: dict[Any, Any], num_costs: int) -> EpisodeStats:
         limits=CostLimits(tuple(row[f"limit_{i}"] for i in range(num_costs))),
         noise=row["noise"],
     )
-
-
-def _mean(limits: Sequence[float] | np.ndarray) -> str:
-    """Return the mean of the finite limits."""
-    finite = np.asarray(limits)[np.isfinite(limits)]
-    return number(float(finite.mean())) if len(finite) else "∞"
-
-
-def _reached(training: pd.DataFrame, limits: np.ndarray, deploy: float) -> str:
-    """Return when a limit first equals d_d, as a percentage of the training phase."""
-    steps = training.loc[limits <= deploy, "end_step"]
-    return f"{steps.iloc[0] / training['end_step'].iloc[-1]:.0%}" if len(steps) else "at its end"
-
-
-def _times(noise: pd.Series) -> str:
-    return str(int((noise > 0.0).sum()))

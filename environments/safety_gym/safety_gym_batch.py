@@ -179,14 +179,16 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         """State of physics, layout, goals and counters."""
         return {
             "physics": self.simulations.save(),
-            "worlds": {name: self._memory.environments[name].copy() for name in ENVIRONMENT.names or ()},
+            "environments": {
+                name: self._memory.environments[name].copy() for name in ENVIRONMENT.names or ()
+            },
             "observations": self.observations(),
         }
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
         self.simulations.load(state["physics"])
         for name in ENVIRONMENT.names or ():
-            self._memory.environments[name] = state["worlds"][name]
+            self._memory.environments[name] = state["environments"][name]
         self._memory.observations[...] = state["observations"]
 
     def _view_records(self) -> None:

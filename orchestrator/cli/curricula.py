@@ -26,7 +26,8 @@ from recrl.teachers.registry import find_teacher, teacher_config
 def run_bound(request: BoundRequest, console: Console) -> ExitCode:
     """Compare the cost of training with its bounds; find the largest d_t within a budget."""
     from recrl.analysis.data.cost_names import indices_of_cost  # noqa: PLC0415
-    from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415  (imports pandas and SciPy)
+    from recrl.analysis.report import text_tables  # noqa: PLC0415  (imports pandas and SciPy)
+    from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415
 
     sweep, _ = source(request)
     say_warnings(sweep, console)
@@ -37,7 +38,7 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
     rows = cumulative_cost.cumulative_costs(sweep, cost=indices)
     if not len(rows):
         raise RecrlError(f"{sweep.name}: no trial has finished its training phase yet")
-    show(cumulative_cost.bound_table(rows), console)
+    show(text_tables.bound_table(rows), console)
     which = f"Cost {request.cost}, summed" if sweep.num_costs > 1 else "Summed"
     say(
         console,
@@ -51,7 +52,7 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
             f"\nThe largest training limit d_t within {request.budget:g} of cost above the deployment limit "
             "d_d over all episodes:",
         )
-        show(cumulative_cost.admissible_table(allowed), console)
+        show(text_tables.admissible_table(allowed), console)
     return ExitCode.OK
 
 
@@ -62,7 +63,8 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     from recrl.analysis.figures import styles  # noqa: PLC0415
     from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits  # noqa: PLC0415
     from recrl.analysis.report.table_formats import write_csv  # noqa: PLC0415
-    from recrl.analysis.statistics.curriculum_replay import replay, replay_summary  # noqa: PLC0415
+    from recrl.analysis.report.text_tables import replay_summary  # noqa: PLC0415
+    from recrl.analysis.statistics.curriculum_replay import replay  # noqa: PLC0415
 
     store = open_store(request)
     specs = select(store.specs(), parse_only(request.only))

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_names, cost_suffix
+from recrl.analysis.data.number_texts import number, with_error
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
-from recrl.analysis.report.table_formats import names_of, number, with_error
+from recrl.analysis.report.table_formats import names_of
 from recrl.analysis.report.verdict_texts import measured_how, tolerance_sentence, verdict_text
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import count_verdicts

@@ -9,7 +9,7 @@
         storage.json            of a local copy: the address of the object store
         figures/                output of ``recrl-sweep figures``
         mlflow.db, mlartifacts/ the default MLflow store
-        mirror/                 how far each MLflow store is up to date
+        mlflow-sync/            how far each MLflow store is up to date
         trials/<task>__<agent>__<method>__s<seed>__<id>/
             spec.json           the TrialSpec
             state.json          the TrialRecord: status, progress, lease, committed lengths and digests
@@ -95,7 +95,7 @@ class SweepStore:
     figures_folder = Below("figures")
     mlflow_database = Below("mlflow.db")
     mlflow_artifacts = Below("mlartifacts")
-    sync_folder = Below("mirror")
+    sync_folder = Below("mlflow-sync")
     stop_request_path = Below("stop.request")
     storage_path = Below("storage.json")
 
@@ -286,7 +286,7 @@ class SweepStore:
         if self.trials_folder.exists() and not self.trials_folder.is_dir():
             move_aside(self.trials_folder, self.folder / "aside")
         with open_lock(self.folder / "lock") as file:
-            if not _is_taken(file):
+            if not _try_lock(file):
                 file.seek(0)
                 holder = file.read().strip() or "another process"
                 raise SweepBusyError(
@@ -298,7 +298,7 @@ class SweepStore:
             yield
 
 
-def _is_taken(file: IO[str]) -> bool:
+def _try_lock(file: IO[str]) -> bool:
     """Try to take the exclusive lock of a file; return whether it succeeded.
 
     ``SweepStore.is_locked`` holds a shared lock for a moment, so it tries again for some time.

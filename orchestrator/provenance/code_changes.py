@@ -30,9 +30,9 @@ from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
 
 OURS = "recrl"
-FOLDERS = ("agents", "environments", "teachers")
+FOLDERS = ("agents", "environments", "teachers")  # top-level parts that affect results
 MODULES = ("trial/trial.py", "trial/attempt.py", "spec.py")  # of the orchestrator
-SUFFIXES = (".py", ".xml", ".txt")  # top-level parts that affect results
+SUFFIXES = (".py", ".xml", ".txt")
 MOST_FILES = 1000  # of the user's project, for one plug-in
 PROJECT_FILES = ("pyproject.toml", "setup.py", "setup.cfg", ".git")  # in the folder of a project
 INSTALLED = ("site-packages", "dist-packages")

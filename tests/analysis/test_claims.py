@@ -6,14 +6,14 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from recrl.analysis.report.text_tables import claims_table
 from recrl.analysis.statistics import claims
-from recrl.analysis.statistics.claims import claims_table
 
 NO_TRAINING = pd.DataFrame(columns=["task", "agent", "method", "seed", "episodes", "cost_0_total"])
 
 
-def weigh(rows: pd.DataFrame, training: pd.DataFrame = NO_TRAINING) -> pd.DataFrame:
-    return claims.weigh(rows, training)
+def counted(rows: pd.DataFrame, training: pd.DataFrame = NO_TRAINING) -> pd.DataFrame:
+    return claims.count_claims(rows, training)
 
 
 def outcome(task: str, method: str, episode_return: float, cost: float) -> dict[str, object]:
@@ -32,7 +32,7 @@ def outcome(task: str, method: str, episode_return: float, cost: float) -> dict[
 
 
 def held(*outcomes: dict[str, object]) -> dict[str, tuple[int, int]]:
-    weighed = weigh(pd.DataFrame(outcomes))
+    weighed = counted(pd.DataFrame(outcomes))
     counts = zip(weighed["held"].astype(int), weighed["trials"].astype(int), strict=True)
     return dict(zip(weighed["claim"].astype(str), counts, strict=True))
 
@@ -64,7 +64,7 @@ def test_crossing_on_1b_violates_and_is_not_the_optimum_though_its_return_is_hig
 
 
 def test_the_share_has_wilsons_interval() -> None:
-    weighed = weigh(pd.DataFrame([outcome("rivergrid-1a", "linear", 9.5, 5.0)] * 5))
+    weighed = counted(pd.DataFrame([outcome("rivergrid-1a", "linear", 9.5, 5.0)] * 5))
     assert weighed["share_low"].item() == pytest.approx(0.5655, abs=1e-4)  # 1 / (1 + 1.96^2 / 5)
     assert claims_table(weighed)["holds in"].item() == "5 of 5 (57–100%)"
     table = claims_table(pd.concat([weighed, weighed.assign(held=3), weighed.assign(held=0)]))
@@ -74,7 +74,7 @@ def test_the_share_has_wilsons_interval() -> None:
 def test_the_deployment_phase_is_counted_beside_and_apart() -> None:
     final = outcome("rivergrid-1a", "linear", -20.0, 0.0)
     deployed = {**outcome("rivergrid-1a", "linear", 9.5, 5.0), "measure": "deployment"}
-    weighed = weigh(pd.DataFrame([final, deployed]))
+    weighed = counted(pd.DataFrame([final, deployed]))
     assert (weighed["held"].item(), weighed["deployment_held"].item()) == (0, 1)
     assert claims_table(weighed)["deployment phase (learning goes on)"].item() == "1 of 1"
 
@@ -82,7 +82,7 @@ def test_the_deployment_phase_is_counted_beside_and_apart() -> None:
 def test_other_tasks_and_other_measures_are_not_counted() -> None:
     other = outcome("PointGoal2", "linear", 9.5, 5.0)
     greedy = {**outcome("rivergrid-1a", "linear", 9.5, 5.0), "measure": "deterministic"}
-    assert weigh(pd.DataFrame([other, greedy])).empty
+    assert counted(pd.DataFrame([other, greedy])).empty
 
 
 def trial(method: str, seed: int, episode_return: float, cost: float = 20.0, **others: Any) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def test_a_comparison_counts_seeds_with_their_paired_difference_and_the_papers_r
         *(trial("linear", seed, 0.0, measure="deployment") for seed in range(3)),
         *(trial("none", seed, 1.0 - seed, measure="deployment") for seed in range(3)),
     ]
-    weighed = weigh(pd.DataFrame(rows))
+    weighed = counted(pd.DataFrame(rows))
     line = weighed[weighed["claim"] == "linear returns more than none on CarGoal2"].iloc[0]
     assert (line["held"], line["trials"], line["deployment_held"]) == (2, 3, 1)
     assert line["difference"] == pytest.approx(1.0)
@@ -118,7 +118,7 @@ def test_dynamic_is_compared_with_each_static_curriculum_of_its_agent() -> None:
     rows += [trial("linear", 0, 4.0), trial("linear", 1, 6.0), trial("cosine", 0, 4.0)]
     rows += [trial("dynamic", 0, 1.0, agent="cpo"), trial("linear", 0, 2.0, agent="cpo")]
     rows += [trial("dynamic", 0, 1.0, agent="min-std"), trial("linear", 0, 2.0, agent="min-std")]
-    weighed = weigh(pd.DataFrame(rows)).set_index(["claim", "agent"])
+    weighed = counted(pd.DataFrame(rows)).set_index(["claim", "agent"])
     linear = weighed.loc["dynamic returns more than linear on CarGoal2"]
     assert linear["held"].to_dict() == {"ppo-lag": 1, "cpo": 0}  # no claim is about another label
     assert linear["trials"].to_dict() == {"ppo-lag": 2, "cpo": 1}
@@ -131,7 +131,7 @@ def test_dynamic_is_compared_with_each_static_curriculum_of_its_agent() -> None:
 def test_each_agent_and_curriculum_has_the_papers_own_range() -> None:
     agents = ("ppo-lag", "cpo")
     rows = [trial(method, 0, 1.0, agent=agent) for agent in agents for method in ("none", *claims.CURRICULA)]
-    weighed = weigh(pd.DataFrame(rows)).set_index(["agent", "claim"])["paper"]
+    weighed = counted(pd.DataFrame(rows)).set_index(["agent", "claim"])["paper"]
     own = {
         agent: [weighed[agent, f"{method} returns more than none on CarGoal2"] for method in claims.CURRICULA]
         for agent in agents
@@ -146,14 +146,14 @@ def test_each_agent_and_curriculum_has_the_papers_own_range() -> None:
 def test_a_relative_gain_needs_a_base_above_zero_beyond_its_interval(base: tuple[float, ...]) -> None:
     rows = [trial("none", seed, value) for seed, value in enumerate(base)]
     rows += [trial("linear", seed, 5.0) for seed in range(len(base))]
-    weighed = weigh(pd.DataFrame(rows)).set_index("claim")["relative_difference"]
+    weighed = counted(pd.DataFrame(rows)).set_index("claim")["relative_difference"]
     assert math.isnan(float(weighed["linear returns more than none on CarGoal2"]))
 
 
 def test_the_limit_is_a_claim_of_each_agent() -> None:
     rows = [trial("none", seed, 1.0, cost) for seed, cost in enumerate((20.0, 30.0))]
     rows += [trial("dynamic", 0, 1.0, 60.0, agent="cpo"), trial("dynamic", 0, 1.0, 60.0, agent="min-std")]
-    weighed = weigh(pd.DataFrame(rows)).set_index("claim")
+    weighed = counted(pd.DataFrame(rows)).set_index("claim")
     assert tuple(weighed.loc["ppo-lag keeps d_d on CarGoal2", ["held", "trials"]]) == (1, 2)
     assert tuple(weighed.loc["cpo violates d_d on CarGoal2", ["held", "trials"]]) == (1, 1)
     assert len(weighed) == 2
@@ -171,7 +171,7 @@ def totals(**others: float) -> pd.DataFrame:
 
 
 def test_costs_of_training_are_compared_per_episode() -> None:
-    weighed = weigh(pd.DataFrame([trial("linear", 0, 1.0)]), totals()).set_index("claim")
+    weighed = counted(pd.DataFrame([trial("linear", 0, 1.0)]), totals()).set_index("claim")
     found = weighed["difference"].dropna().to_dict()
     assert found == {
         "linear costs more in training than exponential on CarGoal2": pytest.approx(10.0),
@@ -184,5 +184,5 @@ def test_costs_of_training_are_compared_per_episode() -> None:
 
 
 def test_costs_of_training_are_not_compared_by_one_of_several_costs() -> None:
-    weighed = weigh(pd.DataFrame([trial("linear", 0, 1.0)]), totals(cost_1_total=1.0))
+    weighed = counted(pd.DataFrame([trial("linear", 0, 1.0)]), totals(cost_1_total=1.0))
     assert weighed["difference"].isna().all()

@@ -10,6 +10,7 @@ import pytest
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
+from recrl.analysis.report.text_tables import admissible_table
 from recrl.analysis.statistics import cumulative_cost
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.main import main
@@ -94,7 +95,7 @@ def test_a_budget_is_spent_by_the_limit_it_allows(finished: Sweep) -> None:
     assert row["measured_violation"] == 104.0
     (row,) = cumulative_cost.admissible_limits(rows, sweep, budget=39.0).to_dict("records")
     assert math.isnan(row["largest_train_limit"])
-    table = cumulative_cost.admissible_table(pd.DataFrame([row]))
+    table = admissible_table(pd.DataFrame([row]))
     assert table["largest d_t"].tolist() == ["none"]
 
 

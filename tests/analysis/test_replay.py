@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits
-from recrl.analysis.statistics.curriculum_replay import progress_reports, replay, replay_summary
+from recrl.analysis.report.text_tables import replay_summary
+from recrl.analysis.statistics.curriculum_replay import progress_reports, replay
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError

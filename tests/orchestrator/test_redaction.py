@@ -96,9 +96,9 @@ def test_no_secret_is_in_a_sweeps_folder_or_in_any_output(
     shown = capfd.readouterr()
     assert CANARY not in shown.out + shown.err
     assert CANARY.encode() not in everything(tmp_path)
-    [log] = tmp_path.rglob("mirror/*/log.txt")
+    [log] = tmp_path.rglob("mlflow-sync/*/log.txt")
     assert log.stat().st_mode & 0o077 == 0
-    assert sorted(tmp_path.rglob("mirror/*/report.json"))
+    assert sorted(tmp_path.rglob("mlflow-sync/*/report.json"))
 
 
 def test_an_address_reaches_a_child_in_its_environment_and_not_on_its_command_line(tmp_path: Path) -> None:

@@ -25,7 +25,6 @@ ALLOWED = {
         "recrl.orchestrator.redaction",
         "recrl.orchestrator.spec",
         "recrl.orchestrator.tracking.export_download",
-        "recrl.orchestrator.trial.phase_totals",
         "recrl.orchestrator.untrusted",
         "recrl.orchestrator.validation_sentences",
         "recrl.teachers",
@@ -156,6 +155,16 @@ def test_the_orchestrator_has_layers() -> None:
             parts = name.split(".")
             if parts[:2] == ["recrl", "orchestrator"] and len(parts) > 2 and own != "__init__":
                 assert height[parts[2]] <= height[own], f"{dotted(path)} imports {name}"
+
+
+def test_the_analysis_has_layers() -> None:
+    layers = ("data", "statistics", "figures", "report")
+    for path in (ROOT / "analysis").rglob("*.py"):
+        own = path.parent.name
+        for name in imports(parsed(path), at_run_time=True):
+            parts = name.split(".")
+            if parts[:2] == ["recrl", "analysis"] and len(parts) > 2 and own != "analysis":
+                assert layers.index(parts[2]) <= layers.index(own), f"{dotted(path)} imports {name}"
 
 
 @pytest.mark.parametrize("path", API_FILES, ids=lambda path: path.stem)

@@ -1,0 +1,40 @@
+"""Numbers as text, for tables and captions."""
+
+from __future__ import annotations
+
+import math
+
+DASH = "–"
+
+
+def number(value: float) -> str:
+    """Format a value with suitable digits; a dash for NaN.
+
+    >>> [number(value) for value in (9.5, 128.44, 0.0312, 0.0, float("nan"))]
+    ['9.50', '128.4', '0.031', '0.00', '–']
+    """
+    if math.isnan(value):
+        return DASH
+    size = abs(value)
+    digits = 1 if size >= 100.0 else 3 if 0.0 < size < 0.1 else 2
+    return f"{value:.{digits}f}"
+
+
+def with_error(mean: float, error: float, *, digits: int = 2) -> str:
+    """Format mean ± standard error, without the error for a single seed.
+
+    Args:
+        mean: NaN becomes a dash.
+        error: of the mean, or NaN.
+        digits: after the point; one is enough from 100 on.
+
+    >>> with_error(9.41, 0.05), with_error(9.41, float("nan")), with_error(-20.0, 0.0)
+    ('9.41 ± 0.05', '9.41', '-20.00 ± 0.00')
+    >>> with_error(5.002, 0.001, digits=3), with_error(-0.001, 0.012)
+    ('5.002 ± 0.001', '0.00 ± 0.01')
+    """
+    if math.isnan(mean):
+        return DASH
+    shown = 1 if abs(mean) >= 100.0 else digits
+    value = round(mean, shown) + 0.0  # no -0.00
+    return f"{value:.{shown}f}" if math.isnan(error) else f"{value:.{shown}f} ± {error:.{shown}f}"
