@@ -37,9 +37,7 @@ from recrl.environments.rivergrid.maps import (
     RIVER,
     STEPS,
     WALL,
-    MapGenerator,
     RiverMap,
-    generate_map,
     parse_map,
     read_map,
 )
@@ -82,38 +80,21 @@ class RiverGridOptions(BaseModel):
 
 
 class RiverGridMapOptions(RiverGridOptions):
-    """Options of ``rivergrid``: a map of your own, or a random one."""
+    """Options of ``rivergrid``: a map of your own."""
 
-    map: str | None = Field(
-        default=None,
-        description="The map as text, or the path of a text file with it; the map itself is stored.",
+    map: str = Field(
+        description="The map as text, or the path of a text file with it; the map itself is stored."
     )
-    generate: MapGenerator | None = Field(default=None, description="Settings of a random map.")
 
     @field_validator("map")
     @classmethod
-    def _drawn(cls, text: str | None) -> str | None:
-        if text is None:
-            return None
+    def _drawn(cls, text: str) -> str:
         # A trial depends on the map and not on its path, so the options store the map.
         return str(parse_map(text) if "\n" in text else read_map(Path(text)))
 
-    @field_validator("generate")
-    @classmethod
-    def _possible(cls, settings: MapGenerator | None) -> MapGenerator | None:
-        if settings is not None:
-            generate_map(settings)
-        return settings
-
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
-        if (self.map is None) == (self.generate is None):
-            raise ValueError("rivergrid needs either map or generate (or use rivergrid-1a, rivergrid-1b)")
-        return self
-
     def river_map(self) -> RiverMap:
         """The map of these settings."""
-        return generate_map(self.generate) if self.generate is not None else parse_map(self.map or "")
+        return parse_map(self.map)
 
 
 class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):

@@ -31,7 +31,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from recrl.environments.rivergrid.maps import (
     DRY,
-    GENERATION_ATTEMPTS,
     GOAL,
     RIVER,
     STARTS,
@@ -42,6 +41,7 @@ from recrl.environments.rivergrid.maps import (
     enclosed,
 )
 
+GENERATION_ATTEMPTS = 2_000
 LEAST_DETOUR = 5  # steps that a safe path takes more than the shortest path; on 1b 11 against 6
 LIMIT_PARTS = 5  # with a safe path, d_d allows one crossing in this number of episodes; on 1b 1 of 5
 
@@ -64,7 +64,7 @@ class InstanceSettings(BaseModel):
     wall_share: float = Field(
         default=0.1, ge=0.0, le=0.5, description="Probability that a tile is an inner wall (ours)."
     )
-    dry_route: bool | None = Field(
+    safe_path: bool | None = Field(
         default=None,
         description="Whether a safe path around the river exists, as on 1b, or not, as on 1a; "
         "null draws it at random.",
@@ -137,13 +137,13 @@ def _shortest(river_map: RiverMap, *, step: tuple[int, int], wet: tuple[int, int
     return None
 
 
-def is_instance(river_map: RiverMap, settings: InstanceSettings, *, dry_route: bool) -> bool:
+def is_instance(river_map: RiverMap, settings: InstanceSettings, *, safe_path: bool) -> bool:
     """Whether a map has the properties of the paper's two.
 
     - The goal can be reached.
     - The shortest path leads through the river and costs at least the river's least width, so the
       unconstrained optimum enters the river.
-    - With ``dry_route`` there is a safe path with at least ``LEAST_DETOUR`` more steps, so that it loses at
+    - With ``safe_path`` there is a safe path with at least ``LEAST_DETOUR`` more steps, so that it loses at
       least 0.5 of return. Without it no zero-cost path exists.
 
     The constraint binds at ``suggested_limit``. With a safe path, J*(d_d) < J*(inf). Without one, under no
@@ -152,7 +152,7 @@ def is_instance(river_map: RiverMap, settings: InstanceSettings, *, dry_route: b
     quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
     if quickest is None or cheapest is None or quickest.cost < settings.river_width[0]:
         return False
-    if not dry_route:
+    if not safe_path:
         return cheapest.cost > 0
     return cheapest.cost == 0 and cheapest.steps >= quickest.steps + LEAST_DETOUR
 
@@ -180,14 +180,14 @@ def draw_instance(settings: InstanceSettings) -> RiverMap:
         MapError: no instance was found in ``GENERATION_ATTEMPTS`` attempts.
     """
     draws = _Draws(settings.map_seed)
-    dry_route = bool(draws.below(2)) if settings.dry_route is None else settings.dry_route
+    safe_path = bool(draws.below(2)) if settings.safe_path is None else settings.safe_path
     for _ in range(GENERATION_ATTEMPTS):
-        river_map = _attempt(draws, settings, dry_route)
-        if river_map is not None and is_instance(river_map, settings, dry_route=dry_route):
+        river_map = _attempt(draws, settings, safe_path)
+        if river_map is not None and is_instance(river_map, settings, safe_path=safe_path):
             return river_map
     raise MapError(
         f"no instance in {GENERATION_ATTEMPTS} attempts met {InstanceSettings.model_dump_json(settings)}, "
-        f"change the size, river_width, wall_share or dry_route"
+        f"change the size, river_width, wall_share or safe_path"
     )
 
 
@@ -205,14 +205,14 @@ class _Draws:
         return int(self._bits.random_raw()) < probability * 2.0**64
 
 
-def _attempt(draws: _Draws, settings: InstanceSettings, dry_route: bool) -> RiverMap | None:
+def _attempt(draws: _Draws, settings: InstanceSettings, safe_path: bool) -> RiverMap | None:
     """Draw one map by the module's rules; None if a bank has no room for a start or a goal."""
     across, along = settings.width - 2, settings.height - 2
     eastward = draws.below(2) == 1
     if eastward:  # drawn as running south, then reflected
         across, along = along, across
     course = _course(draws, across, along, settings.river_width)
-    ford = draws.below(along) if dry_route else None
+    ford = draws.below(along) if safe_path else None
     tiles = [
         [RIVER if first <= x < first + width and y != ford else DRY for x in range(across)]
         for y, (first, width) in enumerate(course)

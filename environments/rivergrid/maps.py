@@ -16,9 +16,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
-
 Cell = tuple[int, int]
 
 WALL, DRY, RIVER, MUD, GOAL = "#", ".", "~", "%", "G"
@@ -27,7 +24,6 @@ STARTS = ">v<^"  # in the order of MiniGrid's headings: 0 east, 1 south, 2 west,
 TILES = WALL + GROUND + GOAL + STARTS
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # step forward by heading; y grows downwards
 
-GENERATION_ATTEMPTS = 2_000
 
 # The paper's figure 1: the river is crossed at a cost of 5 (1a), or also bypassed at a cost of 0 (1b).
 MAPS = {
@@ -181,61 +177,6 @@ def _check_drawing(rows: tuple[str, ...], source: str, first_line: int) -> None:
         raise MapError(f"{source}: needs a start, one of {' '.join(STARTS)}")
     if not any(GOAL in row for row in rows):
         raise MapError(f"{source}: needs a goal {GOAL!r}")
-
-
-class MapGenerator(BaseModel):
-    """Settings of a random map: every tile is drawn independently, until the map meets the conditions."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    seed: int = Field(ge=0, description="Seed of the map; equal settings give equal maps (ours).")
-    width: int = Field(default=9, ge=4, le=64, description="Columns, walls included (9 in the paper's maps).")
-    height: int = Field(default=9, ge=4, le=64, description="Rows, walls included (9 in the paper's maps).")
-    river_share: float = Field(
-        default=0.4, ge=0.0, le=1.0, description="Probability that a tile is river (ours)."
-    )
-    wall_share: float = Field(
-        default=0.1, ge=0.0, le=1.0, description="Probability that a tile is an inner wall (ours)."
-    )
-    dry_route: bool | None = Field(
-        default=None,
-        description="Whether a path around the river must (true), must not (false) or may (null) "
-        "exist (ours).",
-    )
-
-
-def generate_map(settings: MapGenerator) -> RiverMap:
-    """Generate a random solvable map whose shortest path leads through the river, so the constraint matters.
-
-    Start, heading and goal are drawn uniformly.
-
-    Raises:
-        MapError: no such map was found in ``GENERATION_ATTEMPTS`` attempts.
-    """
-    generator = np.random.default_rng(settings.seed)
-    shares = [settings.wall_share, settings.river_share, 1.0 - settings.wall_share - settings.river_share]
-    if shares[-1] < -1e-12:
-        raise MapError(
-            f"map generator: river_share and wall_share must sum to at most 1, got "
-            f"{settings.river_share} and {settings.wall_share}"
-        )
-    inner = (settings.height - 2, settings.width - 2)
-    for _ in range(GENERATION_ATTEMPTS):
-        tiles = generator.choice([WALL, RIVER, DRY], size=inner, p=np.clip(shares, 0.0, 1.0))
-        start, goal = generator.choice(tiles.size, size=2, replace=False)
-        tiles.flat[start] = STARTS[int(generator.integers(len(STARTS)))]
-        tiles.flat[goal] = GOAL
-        river_map = enclosed("".join(row) for row in tiles)
-        dry = river_map.shortest_route(through=DRY)
-        if settings.dry_route is not None and settings.dry_route != (dry is not None):
-            continue
-        quickest = river_map.shortest_route(through=DRY + RIVER)
-        if quickest is not None and (dry is None or quickest < dry):
-            return river_map
-    raise MapError(
-        f"map generator: no map in {GENERATION_ATTEMPTS} attempts met {settings.model_dump_json()}, "
-        f"change river_share, wall_share or dry_route"
-    )
 
 
 def enclosed(rows: Iterable[str]) -> RiverMap:

@@ -14,7 +14,8 @@ from recrl.environments.finite.exact_solver import evaluate_policy, solve_by_lag
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError
 from recrl.environments.registry import make_vector, optimal_return
 from recrl.environments.rivergrid.grid_world import river_cmdp
-from recrl.environments.rivergrid.maps import MAPS, MapGenerator, generate_map, parse_map
+from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance
+from recrl.environments.rivergrid.maps import MAPS, parse_map
 from tests.environments.linear_program import solve_by_linear_program
 
 
@@ -88,7 +89,9 @@ def test_both_solvers_agree_on_rivergrid_with_two_constraints_of_which_both_bind
 
 def test_both_solvers_agree_on_random_maps() -> None:
     for seed in range(3):
-        river_map = generate_map(MapGenerator(seed=seed, width=6, height=6))
+        river_map = draw_instance(
+            InstanceSettings(map_seed=seed, width=6, height=6, river_width=(1, 2), safe_path=False)
+        )
         model = river_cmdp(river_map, costs=("river",), horizon=12)
         limits = CostLimits((0.7,))
         assert solve_by_lagrangian(model, limits).episode_return == pytest.approx(
@@ -98,8 +101,10 @@ def test_both_solvers_agree_on_random_maps() -> None:
 
 def test_on_generated_maps_the_constraint_matters() -> None:
     for seed in range(10):
-        options = {"generate": {"seed": seed, "width": 7, "height": 7}, "horizon": 60}
-        free, dry = (optimal_return("rivergrid", options, CostLimits((limit,))) for limit in (math.inf, 0.0))
+        options = {"map_seed": seed, "safe_path": True, "horizon": 60}
+        free, dry = (
+            optimal_return("rivergrid-generated", options, CostLimits((limit,))) for limit in (math.inf, 0.0)
+        )
         assert free is not None
         assert dry is not None
         assert free > dry + 0.05

@@ -58,11 +58,8 @@ def test_all_mistakes_in_options_are_reported_at_once() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "rivergrid needs either map or generate"),
-        ({"map": MAPS["1a"], "generate": {"seed": 1}}, "rivergrid needs either map or generate"),
         ({"map": "####\n#>.#\n####"}, "map: needs a goal 'G'"),
         ({"map": "no/such/map.txt"}, "no/such/map.txt: cannot be read as a map"),
-        ({"generate": {"seed": 1, "river_share": 1.0}}, "must sum to at most 1"),
         ({"map": MAPS["1a"], "costs": ["river", "river"]}, "must differ, got river, river"),
     ],
 )

@@ -26,7 +26,8 @@ from recrl.environments.rivergrid.grid_world import (
     RiverGridVectorEnv,
     state_index,
 )
-from recrl.environments.rivergrid.maps import MAPS, MapGenerator, generate_map, parse_map
+from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance
+from recrl.environments.rivergrid.maps import MAPS, parse_map
 from recrl.environments.rivergrid.minigrid_drawing import render_frame
 from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
 
@@ -132,7 +133,7 @@ def test_the_joint_state_is_one_hot_as_a_whole() -> None:
         MAPS["1a"],
         MAPS["1b"],
         "######\n#.%~G#\n#>~%.#\n#.%~.#\n######",
-        *(str(generate_map(MapGenerator(seed=seed, width=7, height=6))) for seed in range(4)),
+        *(str(draw_instance(InstanceSettings(map_seed=seed))) for seed in range(4)),
     ],
     ids=["1a", "1b", "mud", "random-0", "random-1", "random-2", "random-3"],
 )

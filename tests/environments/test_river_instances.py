@@ -81,16 +81,16 @@ def test_of_equally_quick_ways_the_cheapest_counts_and_of_equally_cheap_ones_the
 
 def test_the_papers_maps_are_instances_and_the_rule_gives_their_limits() -> None:
     anything = InstanceSettings(map_seed=0)
-    assert is_instance(PAPERS["1a"], anything, dry_route=False)
-    assert is_instance(PAPERS["1b"], anything, dry_route=True)
+    assert is_instance(PAPERS["1a"], anything, safe_path=False)
+    assert is_instance(PAPERS["1b"], anything, safe_path=True)
     assert suggested_limit(PAPERS["1a"]) == 5.0
     assert suggested_limit(PAPERS["1b"]) == 1.0
 
 
 def test_a_map_on_which_the_river_does_not_matter_is_no_instance_and_has_no_limit() -> None:
     river_map = parse_map("#####\n#>.G#\n#~~~#\n#####")
-    for dry_route in (True, False):
-        assert not is_instance(river_map, InstanceSettings(map_seed=0), dry_route=dry_route)
+    for safe_path in (True, False):
+        assert not is_instance(river_map, InstanceSettings(map_seed=0), safe_path=safe_path)
     with pytest.raises(MapError, match="the shortest path does not cross the river"):
         suggested_limit(river_map)
 
@@ -100,20 +100,20 @@ def test_a_map_on_which_the_river_does_not_matter_is_no_instance_and_has_no_limi
     map_seed=st.integers(0, 2**64),
     width=st.integers(6, 12),
     height=st.integers(6, 12),
-    dry_route=st.sampled_from([None, True, False]),
+    safe_path=st.sampled_from([None, True, False]),
 )
 def test_instances_are_valid_repeatable_and_as_asked_for(
-    map_seed: int, width: int, height: int, dry_route: bool | None
+    map_seed: int, width: int, height: int, safe_path: bool | None
 ) -> None:
     wanted = InstanceSettings(
-        map_seed=map_seed, width=width, height=height, river_width=(1, 2), dry_route=dry_route
+        map_seed=map_seed, width=width, height=height, river_width=(1, 2), safe_path=safe_path
     )
     river_map = draw_instance(wanted)
     assert parse_map(str(river_map)) == river_map
     assert draw_instance(wanted) == river_map
     assert (river_map.width, river_map.height) == (width, height)
     dry, quickest = river_map.shortest_route(through=DRY), river_map.shortest_route(through=DRY + RIVER)
-    assert dry_route is None or (dry is not None) == dry_route
+    assert safe_path is None or (dry is not None) == safe_path
     assert quickest is not None
     assert dry is None or dry >= quickest + LEAST_DETOUR
 
@@ -124,11 +124,11 @@ def test_other_seeds_give_other_maps_of_both_kinds() -> None:
     assert {river_map.shortest_route(through=DRY) is not None for river_map in drawn} == {True, False}
 
 
-@pytest.mark.parametrize("dry_route", [True, False])
+@pytest.mark.parametrize("safe_path", [True, False])
 @pytest.mark.parametrize("map_seed", range(3))
-def test_the_limit_binds_at_the_exact_optimum(map_seed: int, dry_route: bool) -> None:
-    options = {"map_seed": map_seed, "dry_route": dry_route, "horizon": 40}
-    river_map = draw_instance(InstanceSettings(map_seed=map_seed, dry_route=dry_route))
+def test_the_limit_binds_at_the_exact_optimum(map_seed: int, safe_path: bool) -> None:
+    options = {"map_seed": map_seed, "safe_path": safe_path, "horizon": 40}
+    river_map = draw_instance(InstanceSettings(map_seed=map_seed, safe_path=safe_path))
     quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
     assert quickest is not None and cheapest is not None
 
@@ -139,7 +139,7 @@ def test_the_limit_binds_at_the_exact_optimum(map_seed: int, dry_route: bool) ->
 
     limit = suggested_limit(river_map)
     assert optimum(math.inf) == pytest.approx(10.0 - 0.1 * (quickest.steps - 1))
-    if dry_route:
+    if safe_path:
         assert optimum(0.0) == pytest.approx(10.0 - 0.1 * (cheapest.steps - 1))
         assert optimum(0.0) <= optimum(math.inf) - 0.5 + 1e-9
         mixture = 0.8 * optimum(0.0) + 0.2 * optimum(math.inf)  # a third way may be better

@@ -5,16 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from recrl.environments.rivergrid.maps import (
     DRY,
     MAPS,
     RIVER,
     MapError,
-    MapGenerator,
-    generate_map,
     parse_map,
     read_map,
 )
@@ -102,37 +98,3 @@ def test_a_map_file_is_named_in_its_errors(tmp_path: Path) -> None:
         read_map(path)
     path.write_text(MAPS["1a"])
     assert read_map(path) == parse_map(MAPS["1a"])
-
-
-@settings(max_examples=40, deadline=None)  # a loaded machine is no failure
-@given(
-    seed=st.integers(0, 2**32),
-    width=st.integers(5, 12),
-    height=st.integers(5, 12),
-    dry_route=st.sampled_from([None, True, False]),
-)
-def test_generated_maps_are_valid_repeatable_and_as_asked_for(
-    seed: int, width: int, height: int, dry_route: bool | None
-) -> None:
-    wanted = MapGenerator(seed=seed, width=width, height=height, dry_route=dry_route)
-    river_map = generate_map(wanted)
-    assert parse_map(str(river_map)) == river_map
-    assert generate_map(wanted) == river_map
-    assert (river_map.width, river_map.height) == (width, height)
-    dry, quickest = river_map.shortest_route(through=DRY), river_map.shortest_route(through=DRY + RIVER)
-    assert dry_route is None or (dry is not None) == dry_route
-    assert quickest is not None
-    assert dry is None or quickest < dry
-
-
-def test_other_seeds_give_other_maps() -> None:
-    assert len({generate_map(MapGenerator(seed=seed)) for seed in range(20)}) == 20
-
-
-def test_a_map_that_cannot_be_generated_is_one_sentence() -> None:
-    with pytest.raises(MapError, match=r"no map in 2000 attempts met .*river_share"):
-        generate_map(MapGenerator(seed=0, width=4, height=4, river_share=0.0))
-    with pytest.raises(
-        MapError, match=r"river_share and wall_share must sum to at most 1, got 0\.9 and 0\.5"
-    ):
-        generate_map(MapGenerator(seed=0, river_share=0.9, wall_share=0.5))

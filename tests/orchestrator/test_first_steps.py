@@ -95,7 +95,7 @@ def test_options_show_type_default_and_description(capsys: pytest.CaptureFixture
     out = output(capsys, "options", "cpo")
     assert re.search(r"^discount +number +0.995 +Discount gamma of the critics", out, re.MULTILINE)
     out = output(capsys, "options", "rivergrid")
-    assert re.search(r"^generate.seed +whole number +required +Seed of the map", out, re.MULTILINE)
+    assert re.search(r"^map +text +required +The map as text", out, re.MULTILINE)
 
 
 def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
