@@ -11,7 +11,7 @@ Notation: B environments, k costs, n observation components.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -27,8 +27,12 @@ from recrl.environments.cmdp import Floats
 from recrl.environments.vector import CMDPVectorEnv
 
 CHUNK_STEPS = 100
-MAX_STEPS = 10_000_000
+MAX_STEPS = 100_000
 MAX_FILMED_STEPS = 10_000
+
+
+class StoppedError(Exception):
+    """An evaluation was stopped before its end."""
 
 
 class FrozenPolicy(StrEnum):
@@ -58,6 +62,7 @@ def evaluate(
     *,
     num_episodes: int,
     seed: np.random.SeedSequence,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[FinishedEpisode, ...]:
     """Run a policy without learning for a number of whole episodes.
 
@@ -67,12 +72,14 @@ def evaluate(
         policy: stochastic or deterministic.
         num_episodes: at least 0; divided equally among the environments, the first ones run one more.
         seed: of the environments and of the policy's randomness.
+        should_stop: called every ``CHUNK_STEPS`` steps; once true, ``StoppedError`` is raised.
 
     Returns:
         ``num_episodes`` episodes, environment by environment.
 
     Raises:
         RuntimeError: no episode ends in ``MAX_STEPS`` steps of each environment.
+        StoppedError: see ``should_stop``.
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
@@ -83,8 +90,13 @@ def evaluate(
     done: list[list[FinishedEpisode]] = [[] for _ in shares]
     steps = 0
     while any(len(episodes) < share for episodes, share in zip(done, shares, strict=True)):
+        if should_stop():
+            raise StoppedError
         if steps >= MAX_STEPS:
-            raise RuntimeError(f"evaluation: no episode ended within {MAX_STEPS} steps")
+            raise RuntimeError(
+                f"evaluation: no episode ended in {MAX_STEPS:,} steps of each environment; the task must "
+                "return terminated or truncated at some time (gymnasium.wrappers.TimeLimit does)"
+            )
         _, finished = collector.collect(_Actor(actor, policy), generator)
         steps = 0 if finished else steps + CHUNK_STEPS
         for episode in finished:

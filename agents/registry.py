@@ -109,7 +109,10 @@ def find_agent(name: str) -> AgentEntry:
     """
     found = resolve(name, kind="agent", group="recrl.agents", ours=AGENTS)
     if not isinstance(found, AgentEntry):
-        raise ValueError(f"agent {name!r} must be an AgentEntry, got {type(found).__name__}")
+        raise ValueError(
+            f"agent {name!r} must be an AgentEntry, got {type(found).__name__}; write MINE = "
+            "recrl.agents.registry.AgentEntry('one sentence', Options, make_mine) and name MINE"
+        )
     return found
 
 

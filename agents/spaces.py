@@ -80,6 +80,10 @@ def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) 
         shifted: npt.NDArray[np.int64] = actions + space.start
         return shifted
     assert isinstance(space, Box)
+    if actions.shape[1:] != (math.prod(space.shape),):
+        raise ValueError(
+            f"an agent's actions must have shape (B, {math.prod(space.shape)}), got {actions.shape}"
+        )
     shaped = actions.reshape(len(actions), *space.shape)
     clipped: npt.NDArray[Any] = np.clip(shaped, space.low, space.high).astype(space.dtype)
     return clipped

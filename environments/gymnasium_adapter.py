@@ -72,7 +72,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             cost_names = (
                 first.get_wrapper_attr("cost_names") if first.has_wrapper_attr("cost_names") else ("cost",)
             )
-        if isinstance(cost_names, str) or not all(isinstance(each, str) for each in cost_names):
+        if not isinstance(cost_names, list | tuple) or not all(isinstance(each, str) for each in cost_names):
             raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(cost_names)}")
         horizon = first.spec.max_episode_steps if first.spec is not None else None
         self.cmdp = CMDPSpec(
@@ -263,7 +263,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if costs.shape != (self.cmdp.num_costs,) or not np.isfinite(costs).all():
             raise ValueError(
                 f"{self.cmdp.name}: info['cost'] must be a finite number for each of "
-                f"{', '.join(self.cmdp.cost_names)}, got {info['cost']}"
+                f"{', '.join(self.cmdp.cost_names)} (the environment's cost_names), got {info['cost']}"
             )
         if costs.min() < 0.0:
             raise ValueError(f"{self.cmdp.name}: info['cost'] must be at least 0, got {info['cost']}")
@@ -274,7 +274,14 @@ def _declared_components(environment: Environment) -> tuple[ObservationComponent
     """Return the declared slices of an environment's flattened observation, or none."""
     if not environment.has_wrapper_attr("observation_components"):
         return ()
-    return tuple(environment.get_wrapper_attr("observation_components"))
+    components = tuple(environment.get_wrapper_attr("observation_components"))
+    for component in components:
+        if not isinstance(component, ObservationComponent):
+            raise ValueError(
+                "observation_components must hold recrl.environments.cmdp.ObservationComponent, got "
+                f"{_brief(component)}"
+            )
+    return components
 
 
 def _made(name: str, factory: Callable[[], Environment]) -> Environment:

@@ -62,6 +62,16 @@ def make_gymnasium(name: str, num_envs: int, options: GymnasiumOptions) -> SyncC
     )
 
 
+def keywords_of(factory: Callable[..., Environment]) -> str:
+    """Return the names of the keyword arguments of a user's callable, as text."""
+    try:
+        parameters = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError):  # builtins have none
+        return "unknown"
+    named = [it.name for it in parameters if it.kind not in (it.VAR_POSITIONAL, it.POSITIONAL_ONLY)]
+    return ", ".join(named) or "none"
+
+
 def make_from_callable(
     factory: Callable[..., Environment], name: str, num_envs: int, options: BaseModel
 ) -> SyncCMDPVectorEnv:

@@ -154,6 +154,8 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
     if IMPORT_PATH.fullmatch(name):
         require_trust(name)
         return load_attribute(name)
+    if IMPORT_PATH.fullmatch(with_colon := ":".join(name.rsplit(".", 1))):
+        raise UnknownNameError(f"no {kind} is called {name!r}; an import path has a colon, {with_colon!r}")
     known = sorted({*ours, *plugged})
     raise UnknownNameError(
         f"no {kind} is called {name!r}{nearest(name, known)} "

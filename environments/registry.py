@@ -161,11 +161,12 @@ def find_task(name: str) -> Task:
         raise ValueError(f"task {name!r} must be a Task or return an environment, got {type(found).__name__}")
     from recrl.environments.gymnasium_tasks import (  # noqa: PLC0415  # only if a task needs it
         draw_from_callable,
+        keywords_of,
         make_from_callable,
     )
 
     return Task(
-        summary=f"The environment that {name} returns.",
+        summary=f"The environment that {name} returns. Keyword arguments: {keywords_of(found)}.",
         options=KeywordOptions,
         make=functools.partial(make_from_callable, found),
         drawn=functools.partial(draw_from_callable, found),

@@ -84,7 +84,7 @@ def described(error: BaseException) -> str:
     """Return an error as one line: ``KeyError: 'window'``; for SystemExit, its exit code."""
     if isinstance(error, SystemExit):
         return f"it ended the process (exit code {error.code})"
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
 
 
 def missing(path: Path) -> str:

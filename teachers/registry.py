@@ -79,7 +79,10 @@ def find_teacher(name: str) -> TeacherKind:
     """
     kind = resolve(name, kind="curriculum", group="recrl.teachers", ours=TEACHERS)
     if not isinstance(kind, TeacherKind):
-        raise TypeError(f"teacher {name!r} must be a recrl.teachers.registry.TeacherKind, got {kind!r}")
+        raise TypeError(
+            f"curriculum {name!r} must be a TeacherKind, got {type(kind).__name__}; write MINE = "
+            "recrl.teachers.registry.TeacherKind('one sentence', Options, MyCurriculum) and name MINE"
+        )
     return kind
 
 

@@ -66,14 +66,24 @@ def hold(p: float, train_limit: float, deploy_limit: float) -> float:
 def limit_at(p: float, train_limit: float, deploy_limit: float, decay: Decay) -> float:
     """Return the limit of one dimension at progress p; d_t may be infinite.
 
-    It is d_d from p = 1 on, and infinite before if d_t is. Else it is the decay, at least d_d despite
-    rounding.
+    It is d_d from p = 1 on, and infinite before if d_t is. Else it is the decay, whose rounding beyond d_t or
+    d_d is corrected.
+
+    Raises:
+        ValueError: the decay is not within d_d and d_t.
     """
     if p >= 1.0 or train_limit == deploy_limit:
         return deploy_limit
     if math.isinf(train_limit):
         return math.inf
-    return max(deploy_limit, decay(p, train_limit, deploy_limit))
+    limit = decay(p, train_limit, deploy_limit)
+    within = min(max(limit, deploy_limit), train_limit)
+    if not math.isclose(limit, within, rel_tol=1e-9, abs_tol=1e-9):
+        raise ValueError(
+            f"the decay must be between d_d = {deploy_limit:g} and d_t = {train_limit:g}, got {limit:g} at "
+            f"progress {p:g}"
+        )
+    return within
 
 
 class StaticTeacher:
@@ -85,10 +95,11 @@ class StaticTeacher:
     Args:
         spec: d_t, d_d and B.
         decay: the limit as a function of progress.
-        start_fraction: fraction of B for measuring an infinite d_t; 0 to keep it infinite.
+        start_fraction: fraction of B for measuring an infinite d_t, as with ``train_limits: auto``; 0 to keep
+            it infinite until B.
     """
 
-    def __init__(self, spec: TeacherSpec, *, decay: Decay, start_fraction: float = 0.0) -> None:
+    def __init__(self, spec: TeacherSpec, *, decay: Decay, start_fraction: float = START_FRACTION) -> None:
         self.spec = spec
         self.decay = decay
         self.measurement = StartMeasurement(spec, start_fraction)
@@ -111,7 +122,7 @@ class StaticTeacher:
         p = progress(report.env_steps, self.spec.train_steps)
         limits = CostLimits(
             tuple(
-                min(limit, limit_at(p, train, deploy, self.decay))
+                _fallen(limit, limit_at(p, train, deploy, self.decay))
                 for limit, train, deploy in zip(
                     CostLimits.from_json(state["limits"]),
                     self.measurement.limits(start),
@@ -122,6 +133,11 @@ class StaticTeacher:
         )
         next_state = {"update": report.update, "limits": limits.to_json(), "policy_noise": 0.0, **start}
         return CurriculumStep.from_json(next_state), next_state
+
+
+def _fallen(before: float, after: float) -> float:
+    """Return the next limit: the limit before it, if it has risen by rounding only."""
+    return min(before, after) if math.isclose(before, after, rel_tol=1e-9, abs_tol=1e-9) else after
 
 
 class NoConfig(BaseModel):
@@ -154,12 +170,12 @@ def decay_teacher(spec: TeacherSpec, *, decay: Decay) -> StaticTeacher:
 
 def none_teacher(spec: TeacherSpec) -> StaticTeacher:
     """No curriculum: d_d from the start."""
-    return StaticTeacher(replace(spec, train_limits=spec.deploy_limits), decay=hold)
+    return StaticTeacher(replace(spec, train_limits=spec.deploy_limits), decay=hold, start_fraction=0.0)
 
 
 def step_teacher(spec: TeacherSpec) -> StaticTeacher:
     """A control: d_t until B, then d_d at once."""
-    return StaticTeacher(spec, decay=hold)
+    return StaticTeacher(spec, decay=hold, start_fraction=0.0)
 
 
 def unconstrained_teacher(spec: TeacherSpec) -> StaticTeacher:
@@ -169,4 +185,4 @@ def unconstrained_teacher(spec: TeacherSpec) -> StaticTeacher:
     shows return and cost of the unconstrained agent.
     """
     unlimited = CostLimits.unlimited(len(spec.train_limits))
-    return StaticTeacher(replace(spec, train_limits=unlimited), decay=hold)
+    return StaticTeacher(replace(spec, train_limits=unlimited), decay=hold, start_fraction=0.0)

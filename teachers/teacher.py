@@ -168,11 +168,12 @@ def check_limits_fall(
     before: CostLimits | None,
     train_limits: CostLimits,
     *,
+    deploy_limits: CostLimits,
     curriculum: str,
     cost_names: Sequence[str],
     update: int,
 ) -> None:
-    """Check that no limit of a step has risen, and that no finite limit is above d_t.
+    """Check that no limit of a step has risen, and that each is at least d_d, and at most d_t if finite.
 
     An infinite limit may start above a finite d_t: it constrains nothing, as in the control
     ``unconstrained``. Differences by rounding are allowed.
@@ -181,12 +182,13 @@ def check_limits_fall(
         step: the step to be checked.
         before: the limits before it, [k]; None for the first step.
         train_limits: d_t, [k].
+        deploy_limits: d_d, [k].
         curriculum: its label, for the error.
         cost_names: of the task, [k].
         update: the last policy update before the step; 0 for the first step.
 
     Raises:
-        ValueError: a limit has risen, or is above d_t.
+        ValueError: a limit has risen, or is above d_t or below d_d.
     """
     when = f"after update {update}" if update else "at the start"
     for i, (name, limit, highest) in enumerate(zip(cost_names, step.limits, train_limits, strict=True)):
@@ -199,6 +201,11 @@ def check_limits_fall(
             raise ValueError(
                 f"curriculum {curriculum}: the limit of {name} is {limit:g} {when}, above its train_limits "
                 f"of {highest:g}; limits may only fall"
+            )
+        if _exceeds(deploy_limits[i], limit):
+            raise ValueError(
+                f"curriculum {curriculum}: the limit of {name} is {limit:g} {when}, below its deploy_limits "
+                f"of {deploy_limits[i]:g}; limits may only fall to that"
             )
 
 

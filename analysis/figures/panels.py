@@ -107,7 +107,8 @@ def phase_boundary(axes: Axes, step: int, total: int) -> None:
 
 def step_axis(axes: Axes, first: float, last: float) -> None:
     """Set ticks like 0.5M, short enough for small panels."""
-    axes.set_xlim(first, last)
+    if first < last:
+        axes.set_xlim(first, last)
     axes.xaxis.set_major_locator(MaxNLocator(4 if first == 0.0 else 2, steps=[1, 2, 2.5, 5, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_steps(value)))
 

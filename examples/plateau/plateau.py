@@ -21,7 +21,7 @@ def plateau_teacher(spec: TeacherSpec) -> Teacher:
         gone = max(0.0, p - hold) / (1.0 - hold)
         return gone * deploy_limit + (1.0 - gone) * train_limit
 
-    return StaticTeacher(spec, decay=decay, start_fraction=0.01)
+    return StaticTeacher(spec, decay=decay)
 
 
 PLATEAU = TeacherKind("d_t for a while, then a straight line to d_d.", PlateauConfig, plateau_teacher)

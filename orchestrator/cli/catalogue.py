@@ -54,7 +54,8 @@ def _print_options(model: type[BaseModel], console: Console) -> None:
         columns = ("option", "type", "default", "description")
         console.print(display.folded_table(columns, rows, width=console.width))
     else:
-        say(console, "It has no options that recrl knows of.")
+        takes_any = model.model_config.get("extra") == "allow"
+        say(console, "Its options are these keyword arguments." if takes_any else "It has no options.")
 
 
 def _kinds(name: str) -> list[Kind]:

@@ -82,6 +82,12 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
             except DamagedError as error:
                 damaged.append(str(error))
                 continue
+            except RecrlError:
+                raise
+            except USERS_ERRORS as error:
+                raise RecrlError(
+                    f"{method.label}: cannot be replayed on {trial.title}: {described(error)}"
+                ) from error
             write_csv(rows, folder / f"{trial.folder.name}__{called}.csv")
             runs.append(Replayed(trial.spec, rows))
             summaries.append(replay_summary(trial, rows))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import print_table, say, short
+from recrl.orchestrator.cli.output import number_of_trials, print_table, say, short
 from recrl.orchestrator.cli.requests import PlanRequest, ValidateRequest
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -33,7 +33,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
     product = " x ".join(str(size) for size in sizes)
     say(
         console,
-        f"{request.grid}: {grid.name} is right: {len(grid.trials())} trials, from "
+        f"{request.grid}: {grid.name} is right: {number_of_trials(len(grid.trials()))}, from "
         f"tasks x agents x methods x seeds = {product}",
     )
     return ExitCode.OK

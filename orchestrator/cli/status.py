@@ -9,7 +9,7 @@ import time
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import print_table, say, short
+from recrl.orchestrator.cli.output import number_of_trials, print_table, say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
 from recrl.orchestrator.cli.sweeps import open_store
@@ -89,7 +89,7 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
     trials = len(listed | {trial.folder.name for trial in orphans})
     say(
         console,
-        f"{store.name}: {trials} trials checked, {len(problems) or 'no'} wrong "
+        f"{store.name}: {number_of_trials(trials)} checked, {len(problems) or 'no'} wrong "
         f"file{'' if len(problems) == 1 else 's'}",
     )
     if problems:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.registry import make_vector
+from recrl.environments.registry import TASKS, make_vector
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.problem_list import TASK_MARK
@@ -17,6 +18,8 @@ from recrl.orchestrator.located_yaml import Place
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import check_limits_fall, checked_answer
+
+PLAIN_AGENT, NO_CURRICULUM = Choice("ppo-lag"), Choice("none")
 
 
 class BuildError(Exception):
@@ -46,37 +49,77 @@ def cmdp_of(task: Choice) -> CMDPSpec:
 
 
 def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[Place, str, str]]:
-    """Build the user's own agents, networks and curricula once on each task that they meet.
+    """Build the user's own agents, networks and curricula on each task that they meet, and rehearse them.
+
+    The user's own tasks are rehearsed with ``ppo-lag`` without a curriculum, agents without a curriculum, and
+    curricula with ``ppo-lag``; see ``recrl.orchestrator.trial.rehearsal``.
 
     Args:
         grid: the grid.
         cmdps: of its tasks, by label.
 
     Yields:
-        Of each that cannot be built: its place, a sentence with ``TASK_MARK``, and the task's label.
+        Of each that fails: its place, a sentence with ``TASK_MARK``, and the task's label.
     """
     trials = grid.trials()
+    tasks = {it.task.label: it for it in trials if _is_own_task(it.task)}
     agents = {(it.task.label, it.agent.label): it for it in trials if _is_own_agent(it.agent)}
     methods = {(it.task.label, it.method.label): it for it in trials if it.method.name not in TEACHERS}
+    failed = set()
+    for task, spec in tasks.items():
+        place = ("tasks", [cell.task.label for cell in grid.tasks].index(task))
+        for sentence in _mistakes(replace(spec, agent=PLAIN_AGENT, method=NO_CURRICULUM)):
+            failed.add(task)
+            yield place, f"{TASK_MARK} {sentence}", task
     for (task, label), spec in agents.items():
         place = ("agents", [agent.label for agent in grid.agents].index(label))
         try:
             make_agent(spec.agent.name, cmdps[task], spec.agent.options, np.random.SeedSequence(0))
         except USERS_ERRORS as error:
             yield place, f"{label} cannot be built on {TASK_MARK}: {described(error)}", task
+            continue
+        for sentence in _mistakes(replace(spec, method=NO_CURRICULUM)) if task not in failed else ():
+            yield place, f"{label} on {TASK_MARK} {sentence}", task
     for (task, label), spec in methods.items():
         place = ("methods", [method.label for method in grid.methods].index(label))
         try:
             _check_start(spec, cmdps[task])
         except USERS_ERRORS as error:
             yield place, f"{label} cannot be started on {TASK_MARK}: {described(error)}", task
+            continue
+        for sentence in _mistakes(replace(spec, agent=PLAIN_AGENT)) if task not in failed else ():
+            yield place, f"{label} on {TASK_MARK} {sentence}", task
+
+
+def _mistakes(spec: TrialSpec) -> Iterator[str]:
+    """Rehearse a trial; yield what is wrong, if anything."""
+    from recrl.orchestrator.trial.rehearsal import RestartError, rehearse  # noqa: PLC0415  (imports torch)
+
+    try:
+        rehearse(spec)
+    except RestartError as error:
+        yield f"does not continue exactly after a restart from a checkpoint: {error}"
+    except USERS_ERRORS as error:
+        yield f"fails in its first updates: {described(error)}"
 
 
 def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
     """Check the first step of a trial's curriculum, and its state."""
     label = spec.method.label
     step, _ = checked_answer(make_teacher(spec.teacher).start(), label, cmdp.num_costs)
-    check_limits_fall(step, None, spec.train_limits, curriculum=label, cost_names=cmdp.cost_names, update=0)
+    check_limits_fall(
+        step,
+        None,
+        spec.train_limits,
+        deploy_limits=spec.deploy_limits,
+        curriculum=label,
+        cost_names=cmdp.cost_names,
+        update=0,
+    )
+
+
+def _is_own_task(task: Choice) -> bool:
+    return task.name not in TASKS or task.name == "gymnasium"
 
 
 def _is_own_agent(agent: Choice) -> bool:

@@ -12,6 +12,7 @@ from io import TextIOWrapper
 
 import torch
 
+from recrl.agents.evaluation import StoppedError
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
     LostLeaseError,
@@ -50,7 +51,8 @@ def run_trial(
         spec: the trial.
         writer: the lease on its folder (``TrialStore.begin``).
         teacher: sets the limits; inline, or a proxy of a remote teacher.
-        should_stop: called after every update; once true, the trial is saved and left waiting.
+        should_stop: called after every update and during the evaluation; once true, the trial is saved and
+            left waiting.
         commit_seconds: wall seconds between checkpoints; has no influence on results.
 
     Returns:
@@ -62,7 +64,7 @@ def run_trial(
         Exception: raised by the task, the agent or the teacher, with a note on the update; the last commit is
             intact.
     """
-    life = _SignsOfLife(writer)
+    life, evaluated = _SignsOfLife(writer), False
     heartbeat = Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS)
     with heartbeat.beating(), ExitStack() as at_end:  # preparation may take minutes
         trial = life.of(at_end.enter_context(closing(Trial(spec, writer, teacher))))
@@ -74,11 +76,13 @@ def run_trial(
             if time.monotonic() - committed >= commit_seconds:
                 trial.save()
                 committed = time.monotonic()
-        if trial.learned:
-            with _located("in the evaluation", writer):
-                trial.evaluate()
         trial.save()
-    if not trial.learned:
+        if trial.learned:
+            with _located("in the evaluation", writer), suppress(StoppedError):
+                trial.evaluate(should_stop)
+                trial.save()
+                evaluated = True
+    if not evaluated:
         writer.close(TrialState.WAITING)
         logger.info("stopped after update %d; it can be resumed", trial.update)
         return TrialState.WAITING
@@ -180,6 +184,8 @@ def run_recorded(
             logger.error("%s", error)
             return _close(writer, TrialState.WAITING, error=str(error))
         except USERS_ERRORS as error:
+            if isinstance(error, SystemExit) and should_stop():  # a second signal to a stopping worker
+                return _close(writer, TrialState.WAITING)
             logger.exception("failed; its files end at update %d", writer.record.update)
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")

@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
@@ -163,19 +163,24 @@ class Trial:
             start_limits=self._step.to_json()["start_limits"],
         )
 
-    def evaluate(self) -> None:
+    def evaluate(self, should_stop: Callable[[], bool]) -> None:
         """Evaluate the final policy, stochastic and deterministic; write the results and its table.
 
         Environments and generators are new and seeded from the trial's seed. The state of training does not
         change, and all methods of a seed are evaluated on the same environment stream.
+
+        Args:
+            should_stop: called between steps; once true, nothing is written and ``StoppedError`` is raised.
         """
         spec, policy = self.spec, final_policy(self._agent)
+        logger.info("evaluation of the final policy: %d episodes of each kind", spec.evaluation_episodes)
         rows = evaluation_rows(
             policy,
             spec,
             tuple(FrozenPolicy),
             num_episodes=spec.evaluation_episodes,
             seed=self._evaluation_seed,
+            should_stop=should_stop,
         )
         if rows:
             self._writer.write_evaluation(rows)
@@ -236,6 +241,7 @@ class Trial:
             before,
             self.spec.train_limits,
             curriculum=label,
+            deploy_limits=self.spec.deploy_limits,
             cost_names=self._cmdp.cost_names,
             update=self.update,
         )
@@ -263,10 +269,20 @@ class Trial:
         return f"{head} return {row['episode_return']:.2f}, {', '.join(costs)}"
 
     def _own_metrics(self, metrics: Mapping[str, float], row: Mapping[str, Any]) -> Mapping[str, float]:
-        """Return the agent's metrics; their names must differ from the columns of all trials."""
+        """Check and return the agent's metrics; their names must differ from the columns of all trials."""
+        agent = f"agent {self.spec.agent.label}"
+        if not isinstance(metrics, Mapping):
+            raise RowError(f"{agent}: update must return a mapping of metrics, got {metrics!r}")
+        for name, value in metrics.items():
+            if not (isinstance(name, str) and name.isidentifier()):
+                raise RowError(
+                    f"{agent}: the name of a metric must consist of letters, digits and _, got {name!r}"
+                )
+            if not isinstance(value, int | float | np.number) or math.isinf(value):
+                raise RowError(f"{agent}: metric {name} must be a finite number or NaN, got {value!r}")
         if taken := sorted(metrics.keys() & row.keys()):
             raise RowError(
-                f"agent {self.spec.agent.label}: its metrics must have other names than the columns that "
+                f"{agent}: its metrics must have other names than the columns that "
                 f"every trial has, got {', '.join(taken)}"
             )
         return metrics
@@ -327,6 +343,7 @@ def evaluation_rows(
     *,
     num_episodes: int,
     seed: np.random.SeedSequence,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> list[dict[str, Any]]:
     """Evaluate a policy on new environments of a trial; return one row of ``evaluation.csv`` per episode.
 
@@ -336,11 +353,19 @@ def evaluation_rows(
         policies: stochastic, deterministic or both, each evaluated on the same environment stream.
         num_episodes: of each, at least 0.
         seed: of the environments and of the policy's randomness.
+        should_stop: called between steps; once true, ``StoppedError`` is raised.
     """
     rows = []
     for policy in policies:
         with open_environments(spec, spec.num_envs) as environments:
-            episodes = evaluate(actor, environments, policy, num_episodes=num_episodes, seed=seed)
+            episodes = evaluate(
+                actor,
+                environments,
+                policy,
+                num_episodes=num_episodes,
+                seed=seed,
+                should_stop=should_stop,
+            )
         rows += [
             {
                 "policy": policy,

@@ -14,6 +14,8 @@ import numpy.typing as npt
 from recrl.environments.plugins import refuse_import_paths
 from recrl.orchestrator.errors import RecrlError
 
+NO_POLICIES = "an export and MLflow hold no policies; load the sweep from the folder it ran in"
+
 if TYPE_CHECKING:
     import torch
 
@@ -92,6 +94,8 @@ def load_policy(
 
     if not isinstance(source, str | Path):
         folder = _folder_of(source, trial_id)
+    elif str(source).endswith(".zip"):
+        raise RecrlError(f"{source}: {NO_POLICIES}")
     elif trial_id is None:
         folder = Path(source)
     else:
@@ -108,9 +112,9 @@ def load_policy(
 def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
     """The folder of a sweep's trial."""
     if sweep.folder is None:
-        raise RecrlError(
-            f"{sweep.name}: an export and MLflow hold no policies; load the sweep from the folder it ran in"
-        )
+        raise RecrlError(f"{sweep.name}: {NO_POLICIES}")
+    if trial_id is None:
+        raise RecrlError(f"{sweep.name}: give a trial_id; sweep.trials has them")
     spec = next((it.spec for it in sweep.facts if it.spec.trial_id == trial_id), None)
     if spec is None:
         raise RecrlError(f"{sweep.name}: has no trial {trial_id!r}; sweep.trials has the column trial_id")
@@ -189,7 +193,7 @@ class Policy:
             bounds). For one observation, an int or float32 [m].
 
         Raises:
-            ValueError: the observation has another shape.
+            ValueError: the observation has another shape, or is not finite.
         """
         from recrl.agents.spaces import environment_actions, observation_size  # noqa: PLC0415
 
@@ -200,6 +204,8 @@ class Policy:
                 f"an observation of {self.cmdp.name} must have shape ({size},), or (B, {size}) for a batch, "
                 f"got {rows.shape}"
             )
+        if not np.isfinite(rows).all():
+            raise ValueError(f"an observation of {self.cmdp.name} must be finite")
         batch = np.atleast_2d(rows)
         chosen = self.final.act_greedily(batch) if deterministic else self.final.act(batch, self.generator)
         actions = environment_actions(self.cmdp.action_space, chosen)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
 from recrl.environments.plugins import UnknownNameError
 from recrl.environments.registry import NotDrawnError, make_drawn, make_vector, options_model
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.validation_sentences import sentences
 
 if TYPE_CHECKING:
@@ -32,7 +34,7 @@ def make(task: str, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
         the last observation. ``cmdp`` describes the task.
 
     Raises:
-        RecrlError: there is no such task, or an option is wrong.
+        RecrlError: there is no such task, an option is wrong, or the task's own code raises an error.
 
     Example:
         >>> import recrl
@@ -42,7 +44,8 @@ def make(task: str, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
         (4, ('river',))
     """
     _check(task, options)
-    return make_vector(task, num_envs, options=options)
+    with _made(task):
+        return make_vector(task, num_envs, options=options)
 
 
 def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
@@ -72,12 +75,24 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
 
     _check(task, options)
     try:
-        environment = make_drawn(task, options=options)
+        with _made(task):
+            environment = make_drawn(task, options=options)
     except NotDrawnError as error:
         raise RecrlError(f"the task {task} is no single environment; use recrl.make({task!r})") from error
     space = environment.observation_space
     is_flat = isinstance(space, Box) and len(space.shape) == 1
     return _with_cost_arrays(environment if is_flat else FlattenObservation(environment))
+
+
+@contextmanager
+def _made(task: str) -> Iterator[None]:
+    """Say of an error in a task's code which task it is."""
+    try:
+        yield
+    except (NotDrawnError, RecrlError):
+        raise
+    except USERS_ERRORS as error:
+        raise RecrlError(f"the task {task} cannot be made: {described(error)}") from error
 
 
 def _with_cost_arrays(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:

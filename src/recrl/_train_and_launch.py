@@ -242,7 +242,9 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     try:
         data = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid))).encode()
     except (TypeError, ValueError) as error:
-        raise GridError([f"{SOURCE}: must hold plain values only: {error}"]) from error
+        raise GridError(
+            [f"{SOURCE}: must hold plain values only, and code by its import path, my_module:MyTask: {error}"]
+        ) from error
     try:
         return parse_grid(data, source=SOURCE, build=build)
     except GridError as error:

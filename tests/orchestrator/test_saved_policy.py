@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +45,7 @@ BOTH = tuple(FrozenPolicy)
 def run(folder: Path, spec: TrialSpec, *, updates: int | None = None) -> TrialStore:
     """The trial, stopped after some updates or run to its end."""
     store = SweepStore(folder, "small")
-    answers = iter([False] * (updates if updates is not None else spec.num_updates) + [True])
+    answers = itertools.chain([False] * updates, [True]) if updates is not None else itertools.repeat(False)
     run_recorded(spec, store.trial(spec), should_stop=lambda: next(answers))
     store.write_info({"name": store.name})
     store.write_specs([spec])

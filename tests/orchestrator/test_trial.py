@@ -24,6 +24,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.trial.attempt import run_recorded
+from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
@@ -312,6 +313,32 @@ def test_a_finished_trial_has_nothing_left_to_do(undisturbed: TrialStore, tmp_pa
     before = store.episodes_path.read_bytes()
     assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
     assert store.episodes_path.read_bytes() == before
+
+
+def test_a_trial_that_is_stopped_in_its_evaluation_continues_there(
+    undisturbed: TrialStore, tmp_path: Path
+) -> None:
+    stopped = SweepStore(tmp_path, "sweep").trial(SPEC)
+    state = run_recorded(SPEC, stopped, should_stop=stop_after(SPEC.num_updates + 1))
+    assert state is TrialState.WAITING
+    assert stopped.record().update == SPEC.num_updates
+    assert not stopped.evaluation_path.exists()
+    assert run_recorded(SPEC, stopped, should_stop=never) is TrialState.COMPLETE
+    assert stopped.evaluation_path.read_bytes() == undisturbed.evaluation_path.read_bytes()
+
+
+def test_a_stopping_worker_that_is_ended_by_a_second_signal_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopping = []
+
+    def advance(_: Trial) -> None:
+        stopping.append(True)
+        raise SystemExit(1)  # as Ray's handler of SIGTERM does
+
+    monkeypatch.setattr(Trial, "advance", advance)
+    store = SweepStore(tmp_path, "sweep").trial(SPEC)
+    assert run_recorded(SPEC, store, should_stop=lambda: bool(stopping)) is TrialState.WAITING
 
 
 @pytest.mark.parametrize("failing", [False, True])

@@ -218,7 +218,7 @@ def test_a_policy_is_loaded_by_its_row_in_trials(
     assert repr(recrl.load_policy(folder / "one", trial_id)) == repr(policy)
     with pytest.raises(recrl.RecrlError, match="one: no trial '3f2a' has begun; load_sweep"):
         recrl.load_policy(folder / "one", "3f2a")
-    with pytest.raises(recrl.RecrlError, match=r"one\.zip: an export has tables but no policies"):
+    with pytest.raises(recrl.RecrlError, match=r"one\.zip: an export and MLflow hold no policies"):
         recrl.load_policy("one.zip", trial_id)
     with pytest.raises(recrl.RecrlError, match="one: has no trial '3f2a'; "):
         recrl.load_policy(training.sweep, "3f2a")

@@ -7,7 +7,7 @@ import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.static import Decay, cosine, exponential, hold, limit_at, linear
+from recrl.teachers.static import Decay, StaticTeacher, cosine, exponential, hold, limit_at, linear
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 
 DECAYS = (linear, cosine, exponential)
@@ -67,6 +67,23 @@ def test_a_limit_is_d_d_exactly_from_the_end_of_the_budget_on(decay: Decay) -> N
 def test_an_infinite_start_stays_infinite_until_the_end(decay: Decay, p: float) -> None:
     assert limit_at(p, math.inf, 25.0, decay) == math.inf
     assert limit_at(p, math.inf, math.inf, decay) == math.inf
+
+
+@pytest.mark.parametrize("limit", [math.nan, 24.0, 101.0, -1.0])
+def test_a_decay_beyond_its_ends_is_an_error(limit: float) -> None:
+    with pytest.raises(ValueError, match="the decay must be between d_d = 25 and d_t = 100, got"):
+        limit_at(0.5, 100.0, 25.0, lambda p, train, deploy: limit)
+
+
+def test_a_decay_that_rises_is_left_to_the_trial_to_refuse() -> None:
+    spec = TeacherSpec("mine", {}, CostLimits((100.0,)), CostLimits((20.0,)), 100)
+    teacher = StaticTeacher(spec, decay=lambda p, train, deploy: 30.0 if p < 0.5 else 40.0)
+    _, state = teacher.start()
+    limits = []
+    for update in (1, 2):
+        step, state = teacher.step(state, ProgressReport(update=update, env_steps=40 * update, episodes=()))
+        limits.append(step.limits.values)
+    assert limits == [(30.0,), (40.0,)]
 
 
 def test_the_clock_counts_environment_steps() -> None:

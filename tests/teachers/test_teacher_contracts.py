@@ -132,7 +132,13 @@ def test_every_answer_passes_the_trials_checks(history: History) -> None:
         for update, answer in enumerate(played(spec, history.reports)):
             step, _ = checked_answer(answer, spec.name, len(names))
             check_limits_fall(
-                step, before, spec.train_limits, curriculum=spec.name, cost_names=names, update=update
+                step,
+                before,
+                spec.train_limits,
+                deploy_limits=spec.deploy_limits,
+                curriculum=spec.name,
+                cost_names=names,
+                update=update,
             )
             before = step.limits
 
@@ -359,6 +365,13 @@ INF = math.inf
             9.0,
             "the limit of noise is 12 after update 5, above its train_limits of 9; limits may only fall",
         ),
+        (
+            9.0,
+            0.5,
+            9.0,
+            "the limit of noise is 0.5 after update 5, below its deploy_limits of 1; limits may only fall to "
+            "that",
+        ),
     ],
 )
 def test_a_limit_that_rises_is_an_error_with_its_cost(
@@ -369,6 +382,7 @@ def test_a_limit_that_rises_is_an_error_with_its_cost(
             CurriculumStep(CostLimits((1.0, limit))),
             None if before is None else CostLimits((1.0, before)),
             CostLimits((1.0, train)),
+            deploy_limits=CostLimits((1.0, 1.0)),
             curriculum="rising",
             cost_names=("fuel", "noise"),
             update=0 if before is None else 5,

@@ -70,7 +70,7 @@ def test_an_import_path_leads_to_a_teacher(monkeypatch: pytest.MonkeyPatch) -> N
     step, _ = make_teacher(spec("somebodys_package:mine")).start()
     assert step.limits == CostLimits((50.0,))
     with pytest.raises(
-        TypeError, match=r"'somebodys_package:broken' must be a recrl.*TeacherKind, got <func"
+        TypeError, match=r"'somebodys_package:broken' must be a TeacherKind, got function; write MINE = "
     ):
         make_teacher(spec("somebodys_package:broken"))
 

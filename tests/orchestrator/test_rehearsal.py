@@ -1,0 +1,191 @@
+"""The user's own parts are tried before a launch: do they work, and do they resume exactly?"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from recrl.orchestrator.errors import GridError
+from recrl.orchestrator.grid.checking import parse_grid
+
+OWN = '''\
+import gymnasium
+import numpy as np
+from pydantic import BaseModel
+
+from recrl.agents.algorithms.ppo import make_ppo
+from recrl.agents.registry import AGENTS, AgentEntry
+from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.teachers.registry import TeacherKind
+
+
+class Room(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(2, np.float32), 1.0, False, self.steps == 7, {"cost": float(action)}
+
+
+class Unseeded(Room):
+    def reset(self, *, seed=None, options=None):
+        _, info = super().reset(seed=seed)
+        return np.random.default_rng().uniform(-1.0, 1.0, 2).astype(np.float32), info
+
+
+class Broken(Room):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated, truncated, info if self.steps < 5 else {}
+
+
+class NoOptions(BaseModel, extra="forbid"):
+    pass
+
+
+class Wrapped:
+    def __init__(self, agent):
+        self.agent, self.count = agent, 0
+
+    def __getattr__(self, name):
+        return getattr(self.agent, name)
+
+    def update(self, rollout, costs, step):
+        self.count += 1
+        return {**self.agent.update(rollout, costs, step), "count": self.count}
+
+
+class Infinite(Wrapped):
+    def update(self, rollout, costs, step):
+        return {**self.agent.update(rollout, costs, step), "reach": float("inf")}
+
+
+class OddName(Wrapped):
+    def update(self, rollout, costs, step):
+        return {**self.agent.update(rollout, costs, step), "we ird,name": 1.0}
+
+
+class NoRestore(Wrapped):
+    def load_state_dict(self, state):
+        raise KeyError("count")
+
+
+def entry(kind):
+    config = AGENTS["ppo"].config
+    make = lambda cmdp, options, seed: kind(make_ppo(cmdp, config.model_validate({}), seed))
+    return AgentEntry(kind.__name__, NoOptions, lambda cmdp, options, seed: make(cmdp, options, seed))
+
+
+COUNTER, INFINITE, ODD_NAME, NO_RESTORE = map(entry, (Wrapped, Infinite, OddName, NoRestore))
+
+
+class Staircase:
+    """Keeps its step in itself."""
+
+    def __init__(self, spec):
+        self.spec, self.at = spec, 0
+
+    def start(self):
+        return CurriculumStep(CostLimits((5.0,))), {"update": 0}
+
+    def step(self, state, report):
+        self.at += 1
+        return CurriculumStep(CostLimits((5.0 - 0.1 * self.at,))), {"update": report.update}
+
+
+class TooLow(Staircase):
+    def step(self, state, report):
+        return CurriculumStep(CostLimits((0.5,))), {"update": report.update}
+
+
+class NoStep:
+    def __init__(self, spec):
+        pass
+
+    def start(self):
+        return CurriculumStep(CostLimits((5.0,))), {"update": 0}
+
+
+KINDS = (Staircase, TooLow, NoStep)
+STAIRCASE, TOO_LOW, NO_STEP = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
+'''
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_rehearsed.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_rehearsed", raising=False)
+
+
+def problems(
+    task: str = "two-state", agents: Sequence[str] = ("cpo",), methods: Sequence[str] = ("none",)
+) -> list[str]:
+    data = f"""\
+name: own
+tasks: [{{name: "{task}", deploy_limits: 2, train_limits: 5}}]
+agents: {list(agents)}
+methods: {list(methods)}
+seeds: 1
+run: {{total_steps: 10_000}}
+"""
+    try:
+        parse_grid(data.encode(), source="grid.yaml", build=True)
+    except GridError as error:
+        return list(error.problems)
+    return []
+
+
+def test_what_works_and_resumes_is_right() -> None:
+    assert problems(task="own_rehearsed:Room") == []
+
+
+def test_a_task_whose_episodes_do_not_follow_from_their_seed() -> None:
+    (problem,) = problems(task="own_rehearsed:Unseeded", agents=["cpo", "own_rehearsed:COUNTER"])
+    assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Unseeded ")
+    assert "reset(seed=...)" in problem
+
+
+def test_a_task_that_fails_after_its_first_step() -> None:
+    (problem,) = problems(task="own_rehearsed:Broken")
+    assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Broken fails in its first updates: ")
+    assert "cost" in problem
+
+
+@pytest.mark.parametrize(
+    ("agent", "sentence"),
+    [
+        (
+            "COUNTER",
+            "continue exactly after a restart from a checkpoint: count is [1, 2, 3] and not [3, 4, 5]; what ",
+        ),
+        ("INFINITE", "metric reach must be a finite number or NaN, got inf"),
+        ("ODD_NAME", "the name of a metric must consist of letters, digits and _, got 'we ird,name'"),
+        ("NO_RESTORE", "after a restart from a checkpoint: KeyError: 'count'; what changes must be in the "),
+    ],
+)
+def test_an_agent(agent: str, sentence: str) -> None:
+    (problem,) = problems(agents=[f"own_rehearsed:{agent}"])
+    assert problem.startswith(f"grid.yaml:3: agents.0: own_rehearsed:{agent} on two-state ")
+    assert sentence in problem
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "sentence"),
+    [
+        ("STAIRCASE", "does not continue exactly after a restart from a checkpoint: ValueError: curriculum "),
+        ("TOO_LOW", "the limit of wear is 0.5 after update 1, below its deploy_limits of 2"),
+        ("NO_STEP", "AttributeError: 'NoStep' object has no attribute 'step'"),
+    ],
+)
+def test_a_curriculum(curriculum: str, sentence: str) -> None:
+    (problem,) = problems(methods=[f"own_rehearsed:{curriculum}"])
+    assert problem.startswith(f"grid.yaml:4: methods.0: own_rehearsed:{curriculum} on two-state ")
+    assert sentence in problem
