@@ -33,7 +33,7 @@ from recrl.agents.learning.estimates import Estimates, row_targets
 from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed
+from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed, united
 from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
 from recrl.agents.networks.flat_parameters import Adam
@@ -96,8 +96,10 @@ class ActorCritic:
             "value_scale": self._value_scale,
             "recent_episodes": self._recent,
             "constraint": self._constraint,
-            **rule.parts,
         }
+        if taken := sorted(rule.parts.keys() & {"policy", "critics", "generator", *self._parts}):
+            raise ValueError(f"a rule's parts need other names than the agent's own, got {', '.join(taken)}")
+        self._parts |= rule.parts
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
@@ -151,13 +153,15 @@ class ActorCritic:
         experience = Experience.of(self._policy, batch, advantages, constraints)
         if step.entropy_coefficient:
             experience = experience.with_entropy(step.entropy_coefficient)
-        metrics = {
-            **improve_and_measure(self._rule, self._policy, experience, self._generator),
-            **indexed("cost_gap", constraints.gaps),
-            **indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0)),  # eps of Lemma 1
-            **estimates.explained_variances(),
-            **self._fit_critics(batch, estimates.targets),
-        }
+        metrics = united(
+            improve_and_measure(self._rule, self._policy, experience, self._generator),
+            {
+                **indexed("cost_gap", constraints.gaps),
+                **indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0)),  # eps of Lemma 1
+                **estimates.explained_variances(),
+                **self._fit_critics(batch, estimates.targets),
+            },
+        )
         self._encoder.learn(observations)
         return metrics
 

@@ -81,10 +81,23 @@ def improve_and_measure(
     new = policy.distribution(batch.unique_observations)
     centred = batch.per_pair(advantages - advantages.mean(axis=0))
     gains = surrogate(experience.ratios(new), centred).numpy(force=True)
-    return {
-        **metrics,
-        "kl": float(mean_divergence(experience.old, new, batch.observation_weights)),
-        "entropy": float(torch.dot(batch.observation_weights, new.entropy())),
-        "surrogate_reward": float(gains[0]),
-        **indexed("surrogate_cost", gains[1:]),
-    }
+    return united(
+        metrics,
+        {
+            "kl": float(mean_divergence(experience.old, new, batch.observation_weights)),
+            "entropy": float(torch.dot(batch.observation_weights, new.entropy())),
+            "surrogate_reward": float(gains[0]),
+            **indexed("surrogate_cost", gains[1:]),
+        },
+    )
+
+
+def united(of_rule: Mapping[str, float], common: Mapping[str, float]) -> dict[str, float]:
+    """Return the metrics of a rule and those that every agent has.
+
+    Raises:
+        ValueError: a metric of the rule has the name of another one.
+    """
+    if taken := sorted(of_rule.keys() & common.keys()):
+        raise ValueError(f"a rule's metrics need other names than the agent's own, got {', '.join(taken)}")
+    return {**of_rule, **common}

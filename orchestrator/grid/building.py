@@ -19,7 +19,8 @@ from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import check_limits_fall, checked_answer
 
-PLAIN_AGENT, NO_CURRICULUM = Choice("ppo-lag"), Choice("none")
+PLAIN_AGENT = Choice("ppo-lag")
+NO_CURRICULUM, NO_LIMITS = Choice("none"), Choice("unconstrained")
 
 
 class BuildError(Exception):
@@ -51,8 +52,8 @@ def cmdp_of(task: Choice) -> CMDPSpec:
 def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[Place, str, str]]:
     """Build the user's own agents, networks and curricula on each task that they meet, and rehearse them.
 
-    The user's own tasks are rehearsed with ``ppo-lag`` without a curriculum, agents without a curriculum, and
-    curricula with ``ppo-lag``; see ``recrl.orchestrator.trial.rehearsal``.
+    The user's own tasks are rehearsed with ``ppo-lag`` without a curriculum, agents without a curriculum
+    and without limits, and curricula with ``ppo-lag``; see ``recrl.orchestrator.trial.rehearsal``.
 
     Args:
         grid: the grid.
@@ -78,8 +79,10 @@ def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[P
         except USERS_ERRORS as error:
             yield place, f"{label} cannot be built on {TASK_MARK}: {described(error)}", task
             continue
-        for sentence in _mistakes(replace(spec, method=NO_CURRICULUM)) if task not in failed else ():
-            yield place, f"{label} on {TASK_MARK} {sentence}", task
+        for method in (NO_CURRICULUM, NO_LIMITS) if task not in failed else ():
+            if sentences := list(_mistakes(replace(spec, method=method))):
+                yield place, f"{label} on {TASK_MARK} {sentences[0]}", task
+                break
     for (task, label), spec in methods.items():
         place = ("methods", [method.label for method in grid.methods].index(label))
         try:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import torch
 
+from recrl.agents.evaluation import FrozenPolicy, StoppedError
 from recrl.orchestrator.errors import USERS_ERRORS, described
+from recrl.orchestrator.files.checkpoint_format import encode
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.trial.trial import Trial
+from recrl.orchestrator.trial.saved_policy import SavedTrial
+from recrl.orchestrator.trial.trial import Trial, TrialSeeds, evaluation_rows
 from recrl.teachers.registry import make_teacher
 
 UPDATES_BEFORE, UPDATES_AFTER = 2, 3  # the restart; the last update is in the deployment phase
@@ -50,21 +53,58 @@ def rehearse(spec: TrialSpec) -> None:
     torch.set_num_threads(1)
     try:
         with tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
-            whole = _updates(small, Path(scratch) / "whole", restart=False)
+            whole = _run(small, Path(scratch) / "whole", restart=False)
             try:
-                resumed = _updates(small, Path(scratch) / "resumed", restart=True)
+                resumed = _run(small, Path(scratch) / "resumed", restart=True)
             except USERS_ERRORS as error:
                 raise RestartError(f"{described(error)}; {REMEDY}") from error
+            _compare(whole, resumed)
+            _act(whole)
     finally:
         torch.set_num_threads(threads)
-    for name in whole.columns.drop(OF_THE_CLOCK):
-        without, after = (rows[name].iloc[UPDATES_BEFORE:].to_numpy() for rows in (whole, resumed))
+
+
+def _compare(whole: TrialStore, resumed: TrialStore) -> None:
+    """Compare the rows of all updates, and the state after the last one."""
+    rows = whole.updates(), resumed.updates()
+    for name in rows[0].columns.drop(OF_THE_CLOCK):
+        without, after = (each[name].iloc[UPDATES_BEFORE:].to_numpy() for each in rows)
         if not np.array_equal(without, after, equal_nan=without.dtype.kind == "f"):
             raise RestartError(f"{name} is {after.tolist()} and not {without.tolist()}; {REMEDY}")
+    states = [_final_state(store) for store in (whole, resumed)]
+    for name, state in states[0].items():
+        if states[1].get(name) != state:
+            raise RestartError(f"the {name} differs after {UPDATES_AFTER} more updates; {REMEDY}")
 
 
-def _updates(spec: TrialSpec, folder: Path, *, restart: bool) -> pd.DataFrame:
-    """Return a row per update."""
+def _final_state(store: TrialStore) -> dict[str, bytes]:
+    """Return each part of a trial's state, as bytes that can be compared."""
+    checkpoint = store.latest_checkpoint()
+    assert checkpoint is not None
+    tree = checkpoint["trial"]
+    parts = {"state of the curriculum": tree["teacher"]}
+    parts |= {f"part {name!r} of the agent's state": part for name, part in tree["agent"].items()}
+    return {name: encode({"part": part}) for name, part in parts.items()}
+
+
+def _act(store: TrialStore) -> None:
+    """Let the final policy act for some steps, stochastic and deterministic."""
+    policy = SavedTrial.load(store).policy
+    for kind in FrozenPolicy:
+        checks = itertools.chain([False], itertools.repeat(True))  # stop after the first steps
+        with suppress(StoppedError):
+            evaluation_rows(
+                policy,
+                store.spec,
+                [kind],
+                num_episodes=1,
+                seed=TrialSeeds.of(store.spec).evaluation,
+                should_stop=checks.__next__,
+            )
+
+
+def _run(spec: TrialSpec, folder: Path, *, restart: bool) -> TrialStore:
+    """Run a trial to its end."""
     store = TrialStore(folder / spec.folder_name)
     parts = [UPDATES_BEFORE, UPDATES_AFTER] if restart else [UPDATES_BEFORE + UPDATES_AFTER]
     for updates in parts:
@@ -72,4 +112,4 @@ def _updates(spec: TrialSpec, folder: Path, *, restart: bool) -> pd.DataFrame:
             for _ in range(updates):
                 trial.advance()
             trial.save()
-    return store.updates()
+    return store

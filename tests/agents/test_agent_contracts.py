@@ -11,8 +11,12 @@ import torch
 from gymnasium.spaces import Box
 
 from recrl.agents.agent import Agent, EntropyRewarded, Rollout
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
+from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.errors import DivergedError
+from recrl.agents.learning.actor_critic import fresh_agent
+from recrl.agents.learning.policy_rule import united
 from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.agents.shared_options import AscentConfig
 from recrl.environments.cmdp import CostLimits, CurriculumStep
@@ -58,6 +62,22 @@ def flattened(tree: Any) -> list[Any]:
 
 every_agent = pytest.mark.parametrize("agent", AGENTS)
 every_task = pytest.mark.parametrize("task", TASKS)
+
+
+@pytest.mark.parametrize("name", ["policy", "generator", "average", "encoder"])
+def test_a_rule_may_not_replace_a_part_of_its_agent(name: str) -> None:
+    cmdp, config = make_vector("two-state", 1).cmdp, agent_config("cpo", {})
+    assert isinstance(config, CPOConfig)
+    rule = ConstrainedPolicyOptimisation(config, 1)
+    rule.parts = {name: rule.parts["violation_integral"]}
+    with pytest.raises(ValueError, match=f"other names than the agent's own, got {name}"):
+        fresh_agent(cmdp, config, np.random.SeedSequence(0), lambda _: rule)
+
+
+def test_a_rule_may_not_replace_a_metric_of_its_agent() -> None:
+    assert united({"mine": 1.0}, {"kl": 0.1}) == {"mine": 1.0, "kl": 0.1}
+    with pytest.raises(ValueError, match="other names than the agent's own, got kl"):
+        united({"mine": 1.0, "kl": 0.0}, {"kl": 0.1})
 
 
 @every_agent

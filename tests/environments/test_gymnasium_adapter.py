@@ -209,7 +209,7 @@ def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
         (
             "cost",
             "x",
-            "wrong: info['cost'] must be a finite number for each of cost (the environment's cost_names), got",
+            "wrong: info['cost'] must be a finite number for each of cost (the environment's cost_names), ",
         ),
     ],
 )

@@ -72,6 +72,30 @@ class OddName(Wrapped):
         return {**self.agent.update(rollout, costs, step), "we ird,name": 1.0}
 
 
+class Silent(Wrapped):
+    """Keeps its count for itself; no metric shows it."""
+
+    def update(self, rollout, costs, step):
+        self.count += 1
+        return self.agent.update(rollout, costs, step)
+
+    def state_dict(self):
+        return {**self.agent.state_dict(), "hidden": self.count}
+
+
+class Limited(Wrapped):
+    def update(self, rollout, costs, step):
+        return {**self.agent.update(rollout, costs, step), "whole": int(step.limits.values[0])}
+
+
+class NoMode(Wrapped):
+    def update(self, rollout, costs, step):
+        return self.agent.update(rollout, costs, step)
+
+    def final_policy(self):
+        return None
+
+
 class NoRestore(Wrapped):
     def load_state_dict(self, state):
         raise KeyError("count")
@@ -84,6 +108,7 @@ def entry(kind):
 
 
 COUNTER, INFINITE, ODD_NAME, NO_RESTORE = map(entry, (Wrapped, Infinite, OddName, NoRestore))
+SILENT, LIMITED, NO_MODE = map(entry, (Silent, Limited, NoMode))
 
 
 class Staircase:
@@ -166,6 +191,12 @@ def test_a_task_that_fails_after_its_first_step() -> None:
             "COUNTER",
             "continue exactly after a restart from a checkpoint: count is [1, 2, 3] and not [3, 4, 5]; what ",
         ),
+        (
+            "SILENT",
+            "part 'hidden' of the agent's state differs after 3 more updates; what changes must ",
+        ),
+        ("LIMITED", "fails in its first updates: OverflowError: cannot convert float infinity to integer"),
+        ("NO_MODE", "fails in its first updates: AttributeError: 'NoneType' object has no attribute 'act'"),
         ("INFINITE", "metric reach must be a finite number or NaN, got inf"),
         ("ODD_NAME", "the name of a metric must consist of letters, digits and _, got 'we ird,name'"),
         ("NO_RESTORE", "after a restart from a checkpoint: KeyError: 'count'; what changes must be in the "),
