@@ -8,6 +8,7 @@ are read from the files.
 from __future__ import annotations
 
 import logging
+import queue
 import signal
 import threading
 import time
@@ -33,6 +34,7 @@ from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, Tria
 SYNC_SECONDS = 120.0
 HASTY_SYNC_SECONDS = 10.0
 REQUEST_SECONDS = 0.5  # between two checks for a stop request
+ONE_SIGNAL_SECONDS = 0.5  # see ``stopping_on_signals``
 
 logger = logging.getLogger("recrl.sweep")
 
@@ -195,20 +197,32 @@ def _stopping_on_request(store: SweepStore, stop: threading.Event) -> Iterator[N
 def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Iterator[None]:
     """Set ``stop`` on the first SIGINT or SIGTERM; the second raises KeyboardInterrupt, the third kills.
 
+    A signal may interrupt the main thread anywhere: while it prints, holds the lock of ``stop``, or handles
+    another signal. So the handler does only what may be interrupted, and another thread does the rest.
+    Signals within ``ONE_SIGNAL_SECONDS`` count as one: a process may get them from its group and its parent.
+
     Args:
         stop: the event of the launch.
-        say: called on the first signal, in a thread of its own. The signal may have interrupted the main
-            thread while it printed, and a stream refuses a write within its own write.
+        say: called on the first signal, in that thread.
     """
-    speaker = threading.Thread(target=say, name="recrl-stopping", daemon=True)
+    first: queue.SimpleQueue[bool] = queue.SimpleQueue()
+    came: list[float] = []
+
+    def answer() -> None:
+        if first.get():
+            stop.set()
+            say()
 
     def handle(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
+        came.append(time.monotonic())
+        if stop.is_set() and came[-1] - came[0] > ONE_SIGNAL_SECONDS:
             for signum in signals:
                 signal.signal(signum, signal.SIG_DFL)
             raise KeyboardInterrupt
-        stop.set()
-        speaker.start()
+        first.put(True)  # only the first one is taken
+
+    answering = threading.Thread(target=answer, name="recrl-stopping", daemon=True)
+    answering.start()
 
     signals = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, handle) for number in signals}
@@ -217,8 +231,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if speaker.is_alive():
-            speaker.join()
+        first.put(False)
+        answering.join()
 
 
 def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) -> None:

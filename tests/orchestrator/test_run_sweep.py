@@ -16,7 +16,13 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.launch_plan import Plan, PlannedAction
-from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep, stopping_on_signals
+from recrl.orchestrator.run_sweep import (
+    ONE_SIGNAL_SECONDS,
+    SweepResult,
+    SweepRunSettings,
+    run_sweep,
+    stopping_on_signals,
+)
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import SweepProgress
@@ -240,10 +246,28 @@ def test_one_signal_stops_gently_and_a_second_at_once(number: signal.Signals) ->
     with pytest.raises(KeyboardInterrupt), stopping_on_signals(stop, lambda: said.append("stopping")):
         os.kill(os.getpid(), number)
         assert stop.wait(10.0)
+        os.kill(os.getpid(), number)  # as `timeout` does, which also signals the process's group
+        threading.Event().wait(2 * ONE_SIGNAL_SECONDS)
         os.kill(os.getpid(), number)
         threading.Event().wait(10.0)
     assert said == ["stopping"]
     assert signal.getsignal(number) is before
+
+
+def test_signals_at_the_same_time_are_one() -> None:
+    stop = threading.Event()
+    with stopping_on_signals(stop, lambda: None):
+        for _ in range(50):
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.wait(10.0)
+
+
+def test_the_first_signal_is_gentle_also_if_another_terminal_had_asked_to_stop() -> None:
+    stop = threading.Event()
+    stop.set()
+    with stopping_on_signals(stop, lambda: None):
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def test_what_is_said_of_a_signal_does_not_interrupt_a_write_of_the_main_thread() -> None:
