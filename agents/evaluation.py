@@ -78,7 +78,7 @@ def evaluate(
         ``num_episodes`` episodes, environment by environment.
 
     Raises:
-        RuntimeError: no episode ends in ``MAX_STEPS`` steps of each environment.
+        RuntimeError: environments with a share left finish none in ``MAX_STEPS`` steps.
         StoppedError: see ``should_stop``.
     """
     environment_seed, policy_seed = _spawned(seed)
@@ -94,14 +94,15 @@ def evaluate(
             raise StoppedError
         if steps >= MAX_STEPS:
             raise RuntimeError(
-                f"evaluation: no episode ended in {MAX_STEPS:,} steps of each environment; the task must "
+                f"evaluation: no episode ended in {MAX_STEPS:,} steps of an environment; the task must "
                 "return terminated or truncated at some time (gymnasium.wrappers.TimeLimit does)"
             )
         _, finished = collector.collect(_Actor(actor, policy), generator)
-        steps = 0 if finished else steps + CHUNK_STEPS
+        steps += CHUNK_STEPS
         for episode in finished:
             if len(done[episode.environment]) < shares[episode.environment]:
                 done[episode.environment].append(episode)
+                steps = 0
     return tuple(episode for episodes in done for episode in episodes)
 
 

@@ -214,12 +214,17 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
             say()
 
     def handle(number: int, frame: FrameType | None) -> None:
-        came.append(time.monotonic())
-        if stop.is_set() and came[-1] - came[0] > ONE_SIGNAL_SECONDS:
-            for signum in signals:
-                signal.signal(signum, signal.SIG_DFL)
+        now = time.monotonic()
+        if came and now - came[-1] <= ONE_SIGNAL_SECONDS:
+            return
+        came.append(now)
+        if len(came) == 1:
+            first.put(True)
+        elif len(came) == 2:
             raise KeyboardInterrupt
-        first.put(True)  # only the first one is taken
+        else:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
 
     answering = threading.Thread(target=answer, name="recrl-stopping", daemon=True)
     answering.start()
@@ -229,6 +234,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
     try:
         yield
     finally:
+        if len(came) > 1:  # its duplicates must not reach the handlers of before
+            time.sleep(max(0.0, came[-1] + ONE_SIGNAL_SECONDS - time.monotonic()))
         for number, handler in before.items():
             signal.signal(number, handler)
         first.put(False)

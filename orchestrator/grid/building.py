@@ -81,7 +81,8 @@ def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[P
             continue
         for method in (NO_CURRICULUM, NO_LIMITS) if task not in failed else ():
             if sentences := list(_mistakes(replace(spec, method=method))):
-                yield place, f"{label} on {TASK_MARK} {sentences[0]}", task
+                limits = " without limits" if method is NO_LIMITS else ""
+                yield place, f"{label} on {TASK_MARK}{limits} {sentences[0]}", task
                 break
     for (task, label), spec in methods.items():
         place = ("methods", [method.label for method in grid.methods].index(label))
@@ -96,12 +97,18 @@ def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[P
 
 def _mistakes(spec: TrialSpec) -> Iterator[str]:
     """Rehearse a trial; yield what is wrong, if anything."""
-    from recrl.orchestrator.trial.rehearsal import RestartError, rehearse  # noqa: PLC0415  (imports torch)
+    from recrl.orchestrator.trial.rehearsal import (  # noqa: PLC0415  (imports torch)
+        FinalPolicyError,
+        RestartError,
+        rehearse,
+    )
 
     try:
         rehearse(spec)
     except RestartError as error:
         yield f"does not continue exactly after a restart from a checkpoint: {error}"
+    except FinalPolicyError as error:
+        yield f"can learn, but its final policy fails: {error}"
     except USERS_ERRORS as error:
         yield f"fails in its first updates: {described(error)}"
 

@@ -66,7 +66,7 @@ def read_grid(path: Path, *, build: bool = False) -> GridSpec:
 
     Args:
         path: of the file.
-        build: whether to build the user's own agents, networks and curricula once on each task.
+        build: whether to build and rehearse the user's own tasks, agents, networks and curricula.
 
     Raises:
         GridError: the file is missing or wrong; one located sentence for each mistake.

@@ -7,23 +7,30 @@ import tempfile
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from recrl.agents.evaluation import FrozenPolicy, StoppedError
+from recrl.agents.registry import make_agent
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.files.checkpoint_format import encode
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.saved_policy import SavedTrial
-from recrl.orchestrator.trial.trial import Trial, TrialSeeds, evaluation_rows
+from recrl.orchestrator.trial.trial import Trial, TrialSeeds, evaluation_rows, open_environments
 from recrl.teachers.registry import make_teacher
+from recrl.teachers.teacher import TeacherSpec
 
 UPDATES_BEFORE, UPDATES_AFTER = 2, 3  # the restart; the last update is in the deployment phase
 MOST_ENVIRONMENTS, MOST_STEPS = 2, 16
 REMEDY = "what changes must be in the saved state; reset(seed=...) and the actions must determine an episode"
 OF_THE_CLOCK = ["time", "collect_seconds", "update_seconds"]
+
+
+class FinalPolicyError(Exception):
+    """The final policy of a rehearsal, or its noise, fails."""
 
 
 class RestartError(Exception):
@@ -38,6 +45,7 @@ def rehearse(spec: TrialSpec) -> None:
 
     Raises:
         RestartError: the second one fails or differs.
+        FinalPolicyError: the updates are right, but the final policy cannot act, or noise cannot be added.
         Exception: the first one fails.
     """
     num_envs, steps = min(spec.num_envs, MOST_ENVIRONMENTS), min(spec.rollout_steps, MOST_STEPS)
@@ -53,13 +61,16 @@ def rehearse(spec: TrialSpec) -> None:
     torch.set_num_threads(1)
     try:
         with tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
-            whole = _run(small, Path(scratch) / "whole", restart=False)
+            whole = _run(small, spec.teacher, Path(scratch) / "whole", restart=False)
             try:
-                resumed = _run(small, Path(scratch) / "resumed", restart=True)
+                resumed = _run(small, spec.teacher, Path(scratch) / "resumed", restart=True)
             except USERS_ERRORS as error:
                 raise RestartError(f"{described(error)}; {REMEDY}") from error
             _compare(whole, resumed)
-            _act(whole)
+            try:
+                _act(whole)
+            except USERS_ERRORS as error:
+                raise FinalPolicyError(described(error)) from error
     finally:
         torch.set_num_threads(threads)
 
@@ -82,13 +93,22 @@ def _final_state(store: TrialStore) -> dict[str, bytes]:
     checkpoint = store.latest_checkpoint()
     assert checkpoint is not None
     tree = checkpoint["trial"]
+    if not isinstance(tree["agent"], dict):
+        raise RestartError(f"an agent's state_dict must return a dict, got {type(tree['agent']).__name__}")
     parts = {"state of the curriculum": tree["teacher"]}
     parts |= {f"part {name!r} of the agent's state": part for name, part in tree["agent"].items()}
-    return {name: encode({"part": part}) for name, part in parts.items()}
+    return {name: encode({"part": _sorted(part)}) for name, part in parts.items()}
+
+
+def _sorted(tree: Any) -> Any:
+    """Return a tree with the keys of its dicts in order."""
+    if isinstance(tree, dict):
+        return {key: _sorted(tree[key]) for key in sorted(tree)}
+    return [_sorted(part) for part in tree] if isinstance(tree, list) else tree
 
 
 def _act(store: TrialStore) -> None:
-    """Let the final policy act for some steps, stochastic and deterministic."""
+    """Let the final policy act for some steps, stochastic and deterministic, and add noise to it."""
     policy = SavedTrial.load(store).policy
     for kind in FrozenPolicy:
         checks = itertools.chain([False], itertools.repeat(True))  # stop after the first steps
@@ -101,14 +121,23 @@ def _act(store: TrialStore) -> None:
                 seed=TrialSeeds.of(store.spec).evaluation,
                 should_stop=checks.__next__,
             )
+    with open_environments(store.spec, 1) as environments:
+        observations, _ = environments.reset(seed=0)
+        agent = make_agent(
+            store.spec.agent.name,
+            environments.cmdp,
+            store.spec.agent.options,
+            TrialSeeds.of(store.spec).agent,
+        )
+    agent.add_noise(0.1, observations)
 
 
-def _run(spec: TrialSpec, folder: Path, *, restart: bool) -> TrialStore:
-    """Run a trial to its end."""
+def _run(spec: TrialSpec, curriculum: TeacherSpec, folder: Path, *, restart: bool) -> TrialStore:
+    """Run a trial to its end; its curriculum has the budget of the whole trial."""
     store = TrialStore(folder / spec.folder_name)
     parts = [UPDATES_BEFORE, UPDATES_AFTER] if restart else [UPDATES_BEFORE + UPDATES_AFTER]
     for updates in parts:
-        with closing(Trial(spec, store.begin(spec), make_teacher(spec.teacher))) as trial:
+        with closing(Trial(spec, store.begin(spec), make_teacher(curriculum))) as trial:
             for _ in range(updates):
                 trial.advance()
             trial.save()

@@ -36,12 +36,12 @@ LINE_SECONDS = 60.0  # at most between two lines of progress
 
 
 def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
-    """Check a whole grid without running it.
+    """Check a whole grid without running its trials.
 
     Args:
         grid: the path of a grid file, or its content as a dictionary.
-        trust: whether to import and call what the grid names by an import path, and to build it once on each
-            task. Do so only with grids whose author you trust.
+        trust: whether to import what the grid names by an import path, and to run its first updates on each
+            task, with a restart. Do so only with grids whose author you trust.
 
     Returns:
         The checked grid with all defaults; ``trials()`` has its trials.
@@ -93,7 +93,8 @@ def launch(
     Raises:
         GridError: the grid is wrong; nothing was started.
         RecrlError: another process runs the sweep, or Ray, MLflow or the disk cannot be used.
-        KeyboardInterrupt: Ctrl-C or SIGTERM stopped it before its end; the same call continues.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or ``recrl-sweep stop`` stopped it before its end; the same call
+            continues.
     """
     # of the command line only what prints is used
     from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
@@ -116,7 +117,8 @@ def launch(
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
             stopped = launch_and_print(checked, options, TextConsole(), given=given) is ExitCode.STOPPED
         else:
-            stopped = launch_grid(checked, options).result.stopped
+            result = launch_grid(checked, options).result
+            stopped = result.stopped and not result.progress.is_complete
         if stopped:
             raise KeyboardInterrupt
         return load_sweep(Path(root) / checked.name, trust=True)
@@ -161,7 +163,8 @@ def train(
     Raises:
         GridError: an argument is wrong; one sentence for each mistake.
         RecrlError: the trial failed; its traceback is a note of the error.
-        KeyboardInterrupt: Ctrl-C or SIGTERM stopped it; with a ``folder`` the same call continues.
+        KeyboardInterrupt: Ctrl-C or SIGTERM stopped it before its end; with a ``folder`` the same call
+            continues.
 
     Example:
         >>> import recrl

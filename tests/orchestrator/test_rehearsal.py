@@ -96,6 +96,34 @@ class NoMode(Wrapped):
         return None
 
 
+class NoNoise(NoMode):
+    def final_policy(self):
+        return self.agent.final_policy()
+
+    def add_noise(self, noise, observations):
+        raise NotImplementedError
+
+
+class Listed(NoNoise):
+    def state_dict(self):
+        return [self.agent.state_dict()]
+
+    def load_state_dict(self, state):
+        self.agent.load_state_dict(state[0])
+
+
+class Reordered(NoMode):
+    """Right, but the keys of its state change places."""
+
+    def final_policy(self):
+        return self.agent.final_policy()
+
+    def state_dict(self):
+        self.flip = not getattr(self, "flip", False)
+        extra = {"a": 1, "b": 2} if self.flip else {"b": 2, "a": 1}
+        return {**self.agent.state_dict(), "extra": extra}
+
+
 class NoRestore(Wrapped):
     def load_state_dict(self, state):
         raise KeyError("count")
@@ -109,6 +137,7 @@ def entry(kind):
 
 COUNTER, INFINITE, ODD_NAME, NO_RESTORE = map(entry, (Wrapped, Infinite, OddName, NoRestore))
 SILENT, LIMITED, NO_MODE = map(entry, (Silent, Limited, NoMode))
+NO_NOISE, LISTED, REORDERED = map(entry, (NoNoise, Listed, Reordered))
 
 
 class Staircase:
@@ -130,6 +159,17 @@ class TooLow(Staircase):
         return CurriculumStep(CostLimits((0.5,))), {"update": report.update}
 
 
+class Long(TooLow):
+    """Needs the whole trial's budget."""
+
+    def __init__(self, spec):
+        super().__init__(spec)
+        assert spec.train_steps > 5_000
+
+    def step(self, state, report):
+        return CurriculumStep(CostLimits((4.0,))), {"update": report.update}
+
+
 class NoStep:
     def __init__(self, spec):
         pass
@@ -138,8 +178,8 @@ class NoStep:
         return CurriculumStep(CostLimits((5.0,))), {"update": 0}
 
 
-KINDS = (Staircase, TooLow, NoStep)
-STAIRCASE, TOO_LOW, NO_STEP = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
+KINDS = (Staircase, TooLow, NoStep, Long)
+STAIRCASE, TOO_LOW, NO_STEP, LONG = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
 '''
 
 
@@ -170,6 +210,7 @@ run: {{total_steps: 10_000}}
 
 def test_what_works_and_resumes_is_right() -> None:
     assert problems(task="own_rehearsed:Room") == []
+    assert problems(agents=["own_rehearsed:REORDERED"], methods=["own_rehearsed:LONG"]) == []
 
 
 def test_a_task_whose_episodes_do_not_follow_from_their_seed() -> None:
@@ -195,10 +236,21 @@ def test_a_task_that_fails_after_its_first_step() -> None:
             "SILENT",
             "part 'hidden' of the agent's state differs after 3 more updates; what changes must ",
         ),
-        ("LIMITED", "fails in its first updates: OverflowError: cannot convert float infinity to integer"),
-        ("NO_MODE", "fails in its first updates: AttributeError: 'NoneType' object has no attribute 'act'"),
+        (
+            "LIMITED",
+            "without limits fails in its first updates: OverflowError: cannot convert float infinity ",
+        ),
+        ("NO_NOISE", "can learn, but its final policy fails: NotImplementedError"),
+        ("LISTED", "an agent's state_dict must return a dict, got list"),
+        (
+            "NO_MODE",
+            "can learn, but its final policy fails: AttributeError: 'NoneType' object has no attribute 'act'",
+        ),
         ("INFINITE", "metric reach must be a finite number or NaN, got inf"),
-        ("ODD_NAME", "the name of a metric must consist of letters, digits and _, got 'we ird,name'"),
+        (
+            "ODD_NAME",
+            "letters, digits and _, and not begin with a digit, got 'we ird,name'",
+        ),
         ("NO_RESTORE", "after a restart from a checkpoint: KeyError: 'count'; what changes must be in the "),
     ],
 )

@@ -254,6 +254,19 @@ def test_one_signal_stops_gently_and_a_second_at_once(number: signal.Signals) ->
     assert signal.getsignal(number) is before
 
 
+def test_a_second_signal_may_come_twice_as_well() -> None:
+    stop = threading.Event()
+    with pytest.raises(KeyboardInterrupt), stopping_on_signals(stop, lambda: None):
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+        threading.Event().wait(2 * ONE_SIGNAL_SECONDS)
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            threading.Event().wait(10.0)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)  # would end this process
+
+
 def test_signals_at_the_same_time_are_one() -> None:
     stop = threading.Event()
     with stopping_on_signals(stop, lambda: None):

@@ -5,12 +5,15 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
 
+from recrl.agents import evaluation
+from recrl.agents.collection import Collector
 from recrl.agents.evaluation import FrozenPolicy, evaluate, film
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS, make_drawn, make_vector
@@ -90,6 +93,23 @@ def test_another_seed_gives_other_episodes_and_the_same_seed_the_same(complete: 
     assert path.name == "update-00000005__seed-7.csv"
     assert once.equals(again)
     assert not once.equals(other)
+
+
+def test_an_evaluation_ends_although_only_some_episodes_do(
+    complete: TrialStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "MAX_STEPS", 1_000)
+    environments = make_vector("two-state", 2, options={"horizon": 10})
+    collect = Collector.collect
+
+    def without_the_second(self: Collector, *rest: Any) -> Any:
+        rollout, finished = collect(self, *rest)
+        return rollout, tuple(episode for episode in finished if episode.environment == 0)
+
+    monkeypatch.setattr(Collector, "collect", without_the_second)
+    policy, seed = SavedTrial.load(complete).policy, np.random.SeedSequence(0)
+    with pytest.raises(RuntimeError, match="no episode ended in 1,000 steps of an environment"):
+        evaluate(policy, environments, FrozenPolicy.STOCHASTIC, num_episodes=4, seed=seed)
 
 
 def test_a_stopped_trial_is_looked_at_as_far_as_it_is(tmp_path: Path) -> None:

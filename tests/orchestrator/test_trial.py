@@ -315,7 +315,7 @@ def test_a_finished_trial_has_nothing_left_to_do(undisturbed: TrialStore, tmp_pa
     assert store.episodes_path.read_bytes() == before
 
 
-def test_a_trial_that_is_stopped_in_its_evaluation_continues_there(
+def test_a_trial_that_is_stopped_in_its_evaluation_is_evaluated_by_the_next_launch(
     undisturbed: TrialStore, tmp_path: Path
 ) -> None:
     stopped = SweepStore(tmp_path, "sweep").trial(SPEC)
