@@ -276,8 +276,8 @@ class Trial:
         for name, value in metrics.items():
             if not (isinstance(name, str) and name.isidentifier()):
                 raise RowError(
-                    f"{agent}: the name of a metric must consist of letters, digits and _, and not begin with "
-                    f"a digit, got {name!r}"
+                    f"{agent}: the name of a metric must consist of letters, digits and _, and not begin "
+                    f"with a digit, got {name!r}"
                 )
             if not isinstance(value, int | float | np.number) or math.isinf(value):
                 raise RowError(f"{agent}: metric {name} must be a finite number or NaN, got {value!r}")
