@@ -72,7 +72,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             cost_names = (
                 first.get_wrapper_attr("cost_names") if first.has_wrapper_attr("cost_names") else ("cost",)
             )
-        if not isinstance(cost_names, list | tuple) or not all(isinstance(each, str) for each in cost_names):
+        if not _are_names(cost_names):
             raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(cost_names)}")
         horizon = first.spec.max_episode_steps if first.spec is not None else None
         self.cmdp = CMDPSpec(
@@ -268,6 +268,14 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if costs.min() < 0.0:
             raise ValueError(f"{self.cmdp.name}: info['cost'] must be at least 0, got {info['cost']}")
         return costs
+
+
+def _are_names(value: object) -> bool:
+    return (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and all(isinstance(each, str) for each in value)
+    )
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:

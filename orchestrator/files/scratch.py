@@ -34,19 +34,17 @@ def scratch_folder(
         before_removal: called with each folder of a dead process before it is removed.
     """
     remove_dead(parent, prefix=prefix, before_removal=before_removal)
-    held = False
-    while not held:
+    while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
         with (folder / LOCK).open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            held = (
-                os.fstat(lock.fileno()).st_nlink > 0
-            )  # else another process removed it before it was locked
-            if held:
-                try:
-                    yield folder
-                finally:
-                    _remove(folder)
+            if not os.fstat(lock.fileno()).st_nlink:
+                continue  # another process removed the folder before it was locked
+            try:
+                yield folder
+            finally:
+                _remove(folder)
+            return
 
 
 def remove_dead(

@@ -66,37 +66,49 @@ def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[P
     tasks = {it.task.label: it for it in trials if _is_own_task(it.task)}
     agents = {(it.task.label, it.agent.label): it for it in trials if _is_own_agent(it.agent)}
     methods = {(it.task.label, it.method.label): it for it in trials if it.method.name not in TEACHERS}
+    task_labels = [cell.task.label for cell in grid.tasks]
+    agent_labels = [agent.label for agent in grid.agents]
+    method_labels = [method.label for method in grid.methods]
     failed = set()
     for task, spec in tasks.items():
-        place = ("tasks", [cell.task.label for cell in grid.tasks].index(task))
-        for sentence in _mistakes(replace(spec, agent=PLAIN_AGENT, method=NO_CURRICULUM)):
+        if mistake := _mistake(replace(spec, agent=PLAIN_AGENT, method=NO_CURRICULUM)):
             failed.add(task)
-            yield place, f"{TASK_MARK} {sentence}", task
+            yield ("tasks", task_labels.index(task)), f"{TASK_MARK} {mistake}", task
     for (task, label), spec in agents.items():
-        place = ("agents", [agent.label for agent in grid.agents].index(label))
-        try:
-            make_agent(spec.agent.name, cmdps[task], spec.agent.options, np.random.SeedSequence(0))
-        except USERS_ERRORS as error:
-            yield place, f"{label} cannot be built on {TASK_MARK}: {described(error)}", task
-            continue
-        for method in (NO_CURRICULUM, NO_LIMITS) if task not in failed else ():
-            if sentences := list(_mistakes(replace(spec, method=method))):
-                limits = " without limits" if method is NO_LIMITS else ""
-                yield place, f"{label} on {TASK_MARK}{limits} {sentences[0]}", task
-                break
+        if mistake := _agents_mistake(spec, cmdps[task], is_rehearsed=task not in failed):
+            yield ("agents", agent_labels.index(label)), f"{label} {mistake}", task
     for (task, label), spec in methods.items():
-        place = ("methods", [method.label for method in grid.methods].index(label))
-        try:
-            _check_start(spec, cmdps[task])
-        except USERS_ERRORS as error:
-            yield place, f"{label} cannot be started on {TASK_MARK}: {described(error)}", task
-            continue
-        for sentence in _mistakes(replace(spec, agent=PLAIN_AGENT)) if task not in failed else ():
-            yield place, f"{label} on {TASK_MARK} {sentence}", task
+        if mistake := _curriculums_mistake(spec, cmdps[task], is_rehearsed=task not in failed):
+            yield ("methods", method_labels.index(label)), f"{label} {mistake}", task
 
 
-def _mistakes(spec: TrialSpec) -> Iterator[str]:
-    """Rehearse a trial; yield what is wrong, if anything."""
+def _agents_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool) -> str:
+    """Return what is wrong with a trial's agent, or nothing."""
+    try:
+        make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
+    except USERS_ERRORS as error:
+        return f"cannot be built on {TASK_MARK}: {described(error)}"
+    if not is_rehearsed:
+        return ""
+    if mistake := _mistake(replace(spec, method=NO_CURRICULUM)):
+        return f"on {TASK_MARK} {mistake}"
+    if mistake := _mistake(replace(spec, method=NO_LIMITS)):
+        return f"on {TASK_MARK} without limits {mistake}"
+    return ""
+
+
+def _curriculums_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool) -> str:
+    """Return what is wrong with a trial's curriculum, or nothing."""
+    try:
+        _check_start(spec, cmdp)
+    except USERS_ERRORS as error:
+        return f"cannot be started on {TASK_MARK}: {described(error)}"
+    mistake = _mistake(replace(spec, agent=PLAIN_AGENT)) if is_rehearsed else ""
+    return f"on {TASK_MARK} {mistake}" if mistake else ""
+
+
+def _mistake(spec: TrialSpec) -> str:
+    """Rehearse a trial; return what is wrong, or nothing."""
     from recrl.orchestrator.trial.rehearsal import (  # noqa: PLC0415  (imports torch)
         FinalPolicyError,
         RestartError,
@@ -106,11 +118,12 @@ def _mistakes(spec: TrialSpec) -> Iterator[str]:
     try:
         rehearse(spec)
     except RestartError as error:
-        yield f"does not continue exactly after a restart from a checkpoint: {error}"
+        return f"does not continue exactly after a restart from a checkpoint: {error}"
     except FinalPolicyError as error:
-        yield f"can learn, but its final policy fails: {error}"
+        return f"can learn, but its final policy fails: {error}"
     except USERS_ERRORS as error:
-        yield f"fails in its first updates: {described(error)}"
+        return f"fails in its first updates: {described(error)}"
+    return ""
 
 
 def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:

@@ -2,35 +2,35 @@
 
 from __future__ import annotations
 
-import itertools
 import tempfile
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from recrl.agents.evaluation import FrozenPolicy, StoppedError
+from recrl.agents.agent import final_policy
 from recrl.agents.registry import make_agent
+from recrl.agents.spaces import environment_actions
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.files.checkpoint_format import encode
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.trial.saved_policy import SavedTrial
-from recrl.orchestrator.trial.trial import Trial, TrialSeeds, evaluation_rows, open_environments
+from recrl.orchestrator.trial.one_thread import one_thread
+from recrl.orchestrator.trial.trial import Trial, TrialSeeds, open_environments
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import TeacherSpec
 
 UPDATES_BEFORE, UPDATES_AFTER = 2, 3  # the restart; the last update is in the deployment phase
 MOST_ENVIRONMENTS, MOST_STEPS = 2, 16
 REMEDY = "what changes must be in the saved state; reset(seed=...) and the actions must determine an episode"
+NOISE = 0.1
 OF_THE_CLOCK = ["time", "collect_seconds", "update_seconds"]
 
 
 class FinalPolicyError(Exception):
-    """The final policy of a rehearsal, or its noise, fails."""
+    """A rehearsed agent learns, but its final policy cannot act, or noise cannot be added to its policy."""
 
 
 class RestartError(Exception):
@@ -45,7 +45,7 @@ def rehearse(spec: TrialSpec) -> None:
 
     Raises:
         RestartError: the second one fails or differs.
-        FinalPolicyError: the updates are right, but the final policy cannot act, or noise cannot be added.
+        FinalPolicyError: the updates are right, but the final policy or the noise fails.
         Exception: the first one fails.
     """
     num_envs, steps = min(spec.num_envs, MOST_ENVIRONMENTS), min(spec.rollout_steps, MOST_STEPS)
@@ -57,22 +57,17 @@ def rehearse(spec: TrialSpec) -> None:
         deploy_steps=num_envs * steps,
         evaluation_episodes=0,
     )
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
-            whole = _run(small, spec.teacher, Path(scratch) / "whole", restart=False)
-            try:
-                resumed = _run(small, spec.teacher, Path(scratch) / "resumed", restart=True)
-            except USERS_ERRORS as error:
-                raise RestartError(f"{described(error)}; {REMEDY}") from error
-            _compare(whole, resumed)
-            try:
-                _act(whole)
-            except USERS_ERRORS as error:
-                raise FinalPolicyError(described(error)) from error
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread(), tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
+        whole = _run(small, spec.teacher, Path(scratch) / "whole", restart=False)
+        try:
+            resumed = _run(small, spec.teacher, Path(scratch) / "resumed", restart=True)
+        except USERS_ERRORS as error:
+            raise RestartError(f"{described(error)}; {REMEDY}") from error
+        _compare(whole, resumed)
+        try:
+            _act(whole)
+        except USERS_ERRORS as error:
+            raise FinalPolicyError(described(error)) from error
 
 
 def _compare(whole: TrialStore, resumed: TrialStore) -> None:
@@ -88,11 +83,17 @@ def _compare(whole: TrialStore, resumed: TrialStore) -> None:
             raise RestartError(f"the {name} differs after {UPDATES_AFTER} more updates; {REMEDY}")
 
 
-def _final_state(store: TrialStore) -> dict[str, bytes]:
-    """Return each part of a trial's state, as bytes that can be compared."""
+def _final_tree(store: TrialStore) -> dict[str, Any]:
+    """Return the state of a trial after its last update."""
     checkpoint = store.latest_checkpoint()
     assert checkpoint is not None
-    tree = checkpoint["trial"]
+    tree: dict[str, Any] = checkpoint["trial"]
+    return tree
+
+
+def _final_state(store: TrialStore) -> dict[str, bytes]:
+    """Return each part of the agent's and the curriculum's state, as bytes that can be compared."""
+    tree = _final_tree(store)
     if not isinstance(tree["agent"], dict):
         raise RestartError(f"an agent's state_dict must return a dict, got {type(tree['agent']).__name__}")
     parts = {"state of the curriculum": tree["teacher"]}
@@ -108,28 +109,17 @@ def _sorted(tree: Any) -> Any:
 
 
 def _act(store: TrialStore) -> None:
-    """Let the final policy act for some steps, stochastic and deterministic, and add noise to it."""
-    policy = SavedTrial.load(store).policy
-    for kind in FrozenPolicy:
-        checks = itertools.chain([False], itertools.repeat(True))  # stop after the first steps
-        with suppress(StoppedError):
-            evaluation_rows(
-                policy,
-                store.spec,
-                [kind],
-                num_episodes=1,
-                seed=TrialSeeds.of(store.spec).evaluation,
-                should_stop=checks.__next__,
-            )
-    with open_environments(store.spec, 1) as environments:
+    """Take a step with the final policy, stochastic and deterministic; add noise to the agent's policy."""
+    spec, seeds = store.spec, TrialSeeds.of(store.spec)
+    with open_environments(spec, 1) as environments:
+        agent = make_agent(spec.agent.name, environments.cmdp, spec.agent.options, seeds.agent)
+        agent.load_state_dict(_final_tree(store)["agent"])
+        policy = final_policy(agent)
         observations, _ = environments.reset(seed=0)
-        agent = make_agent(
-            store.spec.agent.name,
-            environments.cmdp,
-            store.spec.agent.options,
-            TrialSeeds.of(store.spec).agent,
-        )
-    agent.add_noise(0.1, observations)
+        generator = np.random.default_rng(seeds.exploration)
+        for actions in (policy.act(observations, generator), policy.act_greedily(observations)):
+            environments.step(environment_actions(environments.single_action_space, actions))
+        agent.add_noise(NOISE, observations)
 
 
 def _run(spec: TrialSpec, curriculum: TeacherSpec, folder: Path, *, restart: bool) -> TrialStore:

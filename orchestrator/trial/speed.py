@@ -7,11 +7,10 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-import torch
-
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.trial.one_thread import one_thread
 from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import make_teacher
 
@@ -31,10 +30,8 @@ def measured_speed(spec: TrialSpec, *, seconds: float = MEASURED_SECONDS) -> flo
     Raises:
         RecrlError: the task or the agent raised an error.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     try:
-        with tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
+        with one_thread(), tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
             store = TrialStore(Path(scratch) / spec.folder_name)
             with closing(Trial(spec, store.begin(spec), make_teacher(spec.teacher))) as trial:
                 return _speed(trial, seconds)
@@ -42,8 +39,6 @@ def measured_speed(spec: TrialSpec, *, seconds: float = MEASURED_SECONDS) -> flo
         raise
     except USERS_ERRORS as error:
         raise RecrlError(f"{spec.title}: cannot be measured: {described(error)}") from error
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _speed(trial: Trial, seconds: float) -> float:

@@ -174,6 +174,8 @@ def train(
         >>> training.policy.act([1.0, 0.0], deterministic=True) in (0, 1)
         True
     """
+    from recrl.orchestrator.trial.one_thread import one_thread  # noqa: PLC0415  (imports torch)
+
     with ExitStack() as stack:
         place = Path(folder) if folder is not None else _scratch(stack)
         grid = {
@@ -258,19 +260,6 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
 def _in_yaml(token: re.Match[str]) -> str:
     """Return a number of JSON that is not finite as YAML writes it, and a string as it is."""
     return {"Infinity": ".inf", "NaN": ".nan"}.get(token[0], token[0])
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let PyTorch use one thread until the end of the block."""
-    import torch  # noqa: PLC0415
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class _LineInPlace(logging.Handler):
