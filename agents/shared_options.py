@@ -164,10 +164,11 @@ class ActorCriticConfig(BaseModel):
         "average is the final policy, for evaluation and export (ours). 0: the last policy (paper).",
     )
     min_std: NonNegative = Field(
-        default=0.0,
-        description="Lower bound of the standard deviations of continuous actions, as a fraction of half "
-        "the action's range; they are raised to it after each update (ours). Under a falling limit a policy "
-        "without it can become too certain to change in time. 0: no bound (paper).",
+        default=0.4,
+        description="Lower bound of the standard deviations of two continuous actions, as a fraction of half "
+        "the action's range; of m actions it is times sqrt(2 / m). They are raised to it after each update "
+        "(ours). Under a falling limit a policy without it can become too certain to change in time. "
+        "0: no bound (paper).",
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",

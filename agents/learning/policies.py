@@ -47,7 +47,8 @@ class StochasticPolicy:
         form: of the network.
         last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
         generator: the initialisation's randomness.
-        min_std: lower bound of a Gaussian's standard deviations, as a fraction of half the action's range.
+        min_std: lower bound of a Gaussian's two standard deviations, as a fraction of half the action's
+            range. Of m actions it is times sqrt(2 / m).
 
     Attributes:
         parameters: all of them, in one block.
@@ -215,9 +216,14 @@ class StochasticPolicy:
         return self._widen(noise, form)
 
     def bound_std(self) -> None:
-        """Raise a Gaussian's standard deviations to their lower bound."""
+        """Raise a Gaussian's standard deviations to their lower bound.
+
+        So the noise has a mean squared length of at least 2 min_std^2 half ranges, however many actions
+        there are.
+        """
         if self._min_std > 0.0 and not self.is_categorical:
-            least = torch.as_tensor(np.log(self._min_std * self._half_ranges), dtype=self.log_std.dtype)
+            fraction = self._min_std * (2.0 / len(self._half_ranges)) ** 0.5
+            least = torch.as_tensor(np.log(fraction * self._half_ranges), dtype=self.log_std.dtype)
             self.log_std.copy_(torch.maximum(self.log_std, least.to(self.log_std.device)))
 
     def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:

@@ -317,7 +317,8 @@ def test_no_update_lets_a_standard_deviation_fall_below_its_bound(agent: str) ->
     lessons = Lessons(agent, "continuous-bandit", {"min_std": 0.9})
     space = make_vector("continuous-bandit", 4).cmdp.action_space
     assert isinstance(space, Box)
-    log_std = np.log(0.9 * 0.5 * (space.high - space.low))
+    share = (2.0 / space.shape[0]) ** 0.5
+    log_std = np.log(0.9 * share * 0.5 * (space.high - space.low))
     least = float(log_std.sum()) + 0.5 * len(log_std) * math.log(2.0 * math.pi * math.e)
     for _ in range(SEVERAL_UPDATES):
         assert lessons.update()["entropy"] >= least - 1e-5

@@ -215,12 +215,23 @@ def test_the_first_standard_deviations_are_the_same_fraction_of_half_of_every_ra
     assert found == pytest.approx([math.exp(-0.5), 0.4 * math.exp(-0.5), math.exp(-0.5)])
 
 
-def test_standard_deviations_are_raised_to_a_fraction_of_half_the_range() -> None:
-    space = Box(np.array([-1.0, -4.0, -np.inf]), np.array([1.0, 4.0, np.inf]), dtype=np.float64)
+@pytest.mark.parametrize(
+    ("half_ranges", "before", "after"),
+    [
+        ([4.0], [0.1], [0.5 * 2.0**0.5 * 4.0]),
+        ([1.0, 4.0], [0.7, 0.7], [0.7, 2.0]),
+        ([1.0, np.inf] + [1.0] * 6, [0.1] * 8, [0.25] * 8),  # an infinite range counts as one
+    ],
+)
+def test_standard_deviations_are_raised_to_a_fraction_of_half_the_range(
+    half_ranges: list[float], before: list[float], after: list[float]
+) -> None:
+    half = np.array(half_ranges)
+    space = Box(-half, half, dtype=np.float64)
     policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0), min_std=0.5)
-    policy.log_std.copy_(torch.log(torch.tensor([0.7, 0.7, 0.1])))
+    policy.log_std.copy_(torch.log(torch.tensor(before)))
     policy.bound_std()
-    assert policy.log_std.exp().tolist() == pytest.approx([0.7, 2.0, 0.5])
+    assert policy.log_std.exp().tolist() == pytest.approx(after)
 
 
 @pytest.mark.parametrize("space", SPACES)
