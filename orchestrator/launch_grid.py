@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.file_models import Resources
-from recrl.orchestrator.launch_plan import Plan, trials_at_once
+from recrl.orchestrator.launch_plan import Plan, TrialSelection, trials_at_once
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.run_sweep import (
@@ -51,10 +51,7 @@ class LaunchOptions:
     Attributes:
         root: the folder of all sweeps.
         storage: the address of an object store that keeps the sweep, or None.
-        only: the selected trials, see ``only_selection.select``; all by default.
-        retry_failed: whether failed trials are tried again.
-        rerun_damaged: whether damaged trials that were complete or failed are run again.
-        rerun_changed: whether trials that ran other code than is installed now are run again.
+        selection: the trials to run.
         max_concurrent: largest number of parallel trials; None for the grid's.
         address: of an existing Ray cluster; None to start one here.
         ship_package: whether to send recrl itself to that cluster.
@@ -66,10 +63,7 @@ class LaunchOptions:
 
     root: Path
     storage: str | None = None
-    only: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    retry_failed: bool = False
-    rerun_damaged: bool = False
-    rerun_changed: bool = False
+    selection: TrialSelection = field(default_factory=TrialSelection)
     max_concurrent: int | None = None
     address: str | None = None
     ship_package: bool = False
@@ -175,10 +169,7 @@ def launch_grid(
             grid,
             place,
             executor,
-            only=options.only,
-            retry_failed=options.retry_failed,
-            rerun_damaged=options.rerun_damaged,
-            rerun_changed=options.rerun_changed,
+            selection=options.selection,
             start_sync=_sync_to(uri) if uri else None,
             watch=watch,
             finish=finish,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -46,6 +46,24 @@ class PlannedAction(StrEnum):
             PlannedAction.REPAIR,
             PlannedAction.RERUN,
         )
+
+
+@dataclass(frozen=True)
+class TrialSelection:
+    """The trials of a grid that a launch runs.
+
+    Attributes:
+        only: the selected trials, see ``only_selection.select``; all by default.
+        retry_failed: whether failed trials are tried again.
+        rerun_damaged: whether damaged trials that were complete or failed are run again; other damaged ones
+            always are.
+        rerun_changed: whether trials that ran other code than is installed now are run again.
+    """
+
+    only: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    retry_failed: bool = False
+    rerun_damaged: bool = False
+    rerun_changed: bool = False
 
 
 @dataclass(frozen=True)
@@ -126,37 +144,27 @@ class Estimate:
     unknown: tuple[str, ...]
 
 
-def make_plan(
-    specs: Sequence[TrialSpec],
-    store: SweepStore,
-    *,
-    only: Mapping[str, Sequence[str]] | None = None,
-    retry_failed: bool = False,
-    rerun_damaged: bool = False,
-    rerun_changed: bool = False,
-) -> Plan:
+def make_plan(specs: Sequence[TrialSpec], store: SweepStore, selection: TrialSelection | None = None) -> Plan:
     """Make a plan by comparing the grid's trials with the files.
 
     Args:
         specs: the trials of the grid, all of them.
         store: of the sweep; need not exist.
-        only: the selected trials, see ``only_selection.select``; all by default.
-        retry_failed: whether failed trials are tried again.
-        rerun_damaged: whether damaged trials that were complete or failed are run again; other damaged ones
-            always are. If true, every file is read and its digest checked.
-        rerun_changed: whether trials that ran other code than is installed now are run again.
+        selection: the trials to run; by default all that are neither complete nor failed. With
+            ``rerun_damaged`` every file is read and its digest checked.
 
     Raises:
         RecrlError: ``only`` matches no trial of the grid.
     """
+    selection = selection or TrialSelection()
     wanted = {spec.folder_name for spec in specs}
     trials = []
-    for spec in select(specs, only or {}):
+    for spec in select(specs, selection.only):
         trial = store.trial(spec)
-        record = trial.verified_record() if rerun_damaged else trial.record()
-        action = _planned_action(record, retry_failed=retry_failed, rerun_damaged=rerun_damaged)
+        record = trial.verified_record() if selection.rerun_damaged else trial.record()
+        action = _planned_action(record, selection)
         changed = has_other_code(trial, spec)
-        if changed and rerun_changed and (action.is_to_do or action is PlannedAction.COMPLETE):
+        if changed and selection.rerun_changed and (action.is_to_do or action is PlannedAction.COMPLETE):
             action = PlannedAction.RERUN
         trials.append(PlannedTrial(spec, action, record, changed))
     orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)
@@ -214,15 +222,16 @@ def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: 
     return min(fitting, max_concurrent or fitting)
 
 
-def _planned_action(record: TrialRecord, *, retry_failed: bool, rerun_damaged: bool) -> PlannedAction:
+def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAction:
     match record.status:
         case TrialState.COMPLETE:
             return PlannedAction.COMPLETE
         case TrialState.FAILED:
-            return PlannedAction.RETRY if retry_failed else PlannedAction.FAILED
+            return PlannedAction.RETRY if selection.retry_failed else PlannedAction.FAILED
         case TrialState.DAMAGED:
-            left_alone = record.claims in (TrialState.COMPLETE, TrialState.FAILED)
-            return PlannedAction.DAMAGED if left_alone and not rerun_damaged else PlannedAction.REPAIR
+            was_ended = record.claims in (TrialState.COMPLETE, TrialState.FAILED)
+            left_alone = was_ended and not selection.rerun_damaged
+            return PlannedAction.DAMAGED if left_alone else PlannedAction.REPAIR
         case TrialState.WAITING | TrialState.RUNNING:
             return PlannedAction.RESUME if record.attempt else PlannedAction.NEW
 

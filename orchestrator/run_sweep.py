@@ -12,9 +12,9 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Protocol
 
@@ -24,7 +24,7 @@ from recrl.orchestrator.executors import Executor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.only_selection import select
-from recrl.orchestrator.launch_plan import Plan, PlannedAction, make_plan
+from recrl.orchestrator.launch_plan import Plan, PlannedAction, TrialSelection, make_plan
 from recrl.orchestrator.provenance.versions import collect
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
@@ -81,10 +81,7 @@ class SweepRunSettings:
         grid: the checked grid.
         place: of the sweep's files.
         executor: runs the trials.
-        only: the selected trials, see ``only_selection.select``; all by default.
-        retry_failed: whether failed trials are tried again.
-        rerun_damaged: whether damaged trials that were complete or failed are run again.
-        rerun_changed: whether trials that ran other code than is installed now are run again.
+        selection: the trials to run.
         start_sync: starts the MLflow sync, before the first trial.
         watch: called with the plan before the first trial.
         finish: called after the last trial, before the sync stops: draws figures, for example.
@@ -93,10 +90,7 @@ class SweepRunSettings:
     grid: GridSpec
     place: SweepPlace
     executor: Executor
-    only: Mapping[str, Sequence[str]] | None = None
-    retry_failed: bool = False
-    rerun_damaged: bool = False
-    rerun_changed: bool = False
+    selection: TrialSelection = field(default_factory=TrialSelection)
     start_sync: Callable[[SweepStore], RunningSync] | None = None
     watch: Callable[[Plan], None] = lambda plan: None
     finish: Callable[[SweepProgress], None] = lambda after: None
@@ -116,31 +110,20 @@ def run_sweep(settings: SweepRunSettings, *, stop: threading.Event) -> SweepResu
             executor cannot run.
     """
     place, store = settings.place, settings.place.store
-    if settings.rerun_damaged or settings.rerun_changed:
+    if settings.selection.rerun_damaged or settings.selection.rerun_changed:
         place.require_reruns()
     specs = settings.grid.trials()
-    select(specs, settings.only or {})  # a mistake in ``only`` must leave no files
+    select(specs, settings.selection.only)  # a mistake in ``only`` must leave no files
     with store.lock(), _stopping_on_request(store, stop), place.held(stop):
         place.pull()
         _write_files(settings.grid, specs, store)
         place.publish()
         _leave_none_running(specs, store)  # trials of a launch that died
-        plan = _plan(settings, specs)
+        plan = make_plan(specs, store, settings.selection)
         settings.watch(plan)
         for trial in plan.with_action(PlannedAction.RERUN):
             store.trial(trial.spec).set_all_aside()
         return _run(settings, plan, stop)
-
-
-def _plan(settings: SweepRunSettings, specs: Sequence[TrialSpec]) -> Plan:
-    return make_plan(
-        specs,
-        settings.place.store,
-        only=settings.only,
-        retry_failed=settings.retry_failed,
-        rerun_damaged=settings.rerun_damaged,
-        rerun_changed=settings.rerun_changed,
-    )
 
 
 def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> SweepResult:

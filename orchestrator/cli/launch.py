@@ -12,7 +12,7 @@ from rich.console import Console
 
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short, show
-from recrl.orchestrator.cli.plan import say_other_code, say_plan
+from recrl.orchestrator.cli.plan import say_other_code, say_plan, selection_of
 from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
 from recrl.orchestrator.cli.status import say_failures
 from recrl.orchestrator.errors import RecrlError
@@ -21,7 +21,6 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
-from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, LaunchOutcome, launch_grid
 from recrl.orchestrator.launch_plan import Plan
 from recrl.orchestrator.redaction import redacted
@@ -39,10 +38,7 @@ def run_launch(request: LaunchRequest, console: Console) -> ExitCode:
     options = LaunchOptions(
         root=request.root,
         storage=request.storage,
-        only=parse_only(request.only),
-        retry_failed=request.retry_failed,
-        rerun_damaged=request.rerun_damaged,
-        rerun_changed=request.rerun_changed,
+        selection=selection_of(request),
         max_concurrent=request.max_concurrent,
         address=request.address,
         ship_package=request.ship_package,
@@ -179,10 +175,10 @@ def _say_result(
         return ExitCode.STOPPED
     if damaged := result.progress.with_status(DisplayStatus.DAMAGED):
         them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
-        rerun = again if options.rerun_damaged else f"{again} --rerun-damaged"
+        rerun = again if options.selection.rerun_damaged else f"{again} --rerun-damaged"
         say(console, f"{them} left alone; to move the damaged files aside and run again: {rerun}")
     if result.failed:
-        retry = again if options.retry_failed else f"{again} --retry-failed"
+        retry = again if options.selection.retry_failed else f"{again} --retry-failed"
         say(console, f"Try what failed again with: {retry}")
     elif not damaged:
         say(console, f"Not everything could be finished. Continue with: {again}")

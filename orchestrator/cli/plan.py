@@ -8,7 +8,7 @@ from rich.console import Console
 
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import number_of_trials, print_table, say, short
-from recrl.orchestrator.cli.requests import PlanRequest, ValidateRequest
+from recrl.orchestrator.cli.requests import GridRequest, PlanRequest, ValidateRequest
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -16,7 +16,7 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import room
-from recrl.orchestrator.launch_plan import Plan, estimate, kind_of, make_plan, unmeasured
+from recrl.orchestrator.launch_plan import Plan, TrialSelection, estimate, kind_of, make_plan, unmeasured
 from recrl.orchestrator.provenance.code_changes import other_code_sentence
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialState
@@ -39,19 +39,19 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
     return ExitCode.OK
 
 
+def selection_of(request: GridRequest) -> TrialSelection:
+    """Return the trials that a request selects."""
+    return TrialSelection(
+        parse_only(request.only), request.retry_failed, request.rerun_damaged, request.rerun_changed
+    )
+
+
 def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     """Print what a launch would do; nothing is started, and only the copy of an object store is written."""
     grid = read_grid(request.grid)
     store = SweepStore(request.root, grid.name)
     sweep_place(store, request.storage).refresh()
-    plan = make_plan(
-        grid.trials(),
-        store,
-        only=parse_only(request.only),
-        retry_failed=request.retry_failed,
-        rerun_damaged=request.rerun_damaged,
-        rerun_changed=request.rerun_changed,
-    )
+    plan = make_plan(grid.trials(), store, selection_of(request))
     at_once, where = room(
         grid.resources, address=request.address, max_concurrent=request.max_concurrent, cores=request.cores
     )

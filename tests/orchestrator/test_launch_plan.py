@@ -6,7 +6,7 @@ import pytest
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.launch_plan import PlannedAction, estimate, make_plan, trials_at_once
+from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, estimate, make_plan, trials_at_once
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 GRID = b"""\
@@ -62,7 +62,9 @@ def test_each_trial_gets_the_work_its_files_ask_for(store: SweepStore) -> None:
 def test_failed_trials_are_tried_again_only_when_asked(store: SweepStore) -> None:
     _begin(store, SPECS[0], env_steps=200, end=TrialState.FAILED)
     assert make_plan(SPECS[:1], store).to_do == ()
-    assert make_plan(SPECS[:1], store, retry_failed=True).trials[0].action is PlannedAction.RETRY
+    assert (
+        make_plan(SPECS[:1], store, TrialSelection(retry_failed=True)).trials[0].action is PlannedAction.RETRY
+    )
 
 
 def test_trials_that_left_the_grid_are_listed_and_kept(store: SweepStore) -> None:
@@ -74,7 +76,7 @@ def test_trials_that_left_the_grid_are_listed_and_kept(store: SweepStore) -> Non
 
 def test_a_selection_makes_no_orphans(store: SweepStore) -> None:
     _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
-    plan = make_plan(SPECS, store, only={"seed": ["1"]})
+    plan = make_plan(SPECS, store, TrialSelection(only={"seed": ["1"]}))
     assert {spec.seed for spec in plan.to_do} == {1}
     assert plan.orphans == ()
 

@@ -26,6 +26,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.launch_plan import TrialSelection
 from recrl.orchestrator.remote.commit_upload import Upload
 from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore
@@ -62,7 +63,9 @@ class Machine:
 
     def launch(self, *, stop: threading.Event | None = None, retry_failed: bool = False) -> SweepResult:
         self.storage.mark()
-        settings = SweepRunSettings(grid(), self.storage, InlineExecutor(), retry_failed=retry_failed)
+        settings = SweepRunSettings(
+            grid(), self.storage, InlineExecutor(), TrialSelection(retry_failed=retry_failed)
+        )
         return run_sweep(settings, stop=stop or threading.Event())
 
 
@@ -149,7 +152,9 @@ def test_a_damaged_local_copy_says_that_it_is_one(tmp_path: Path, local: SweepSt
 def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
     here = machine(tmp_path, "here")
     with pytest.raises(RecrlError, match="trials of a sweep in an object store are not run again: "):
-        settings = SweepRunSettings(grid(), here.storage, InlineExecutor(), rerun_damaged=True)
+        settings = SweepRunSettings(
+            grid(), here.storage, InlineExecutor(), TrialSelection(rerun_damaged=True)
+        )
         run_sweep(settings, stop=threading.Event())
     assert not here.store.folder.exists()
 

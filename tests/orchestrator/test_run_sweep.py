@@ -15,7 +15,7 @@ from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.launch_plan import Plan, PlannedAction
+from recrl.orchestrator.launch_plan import Plan, PlannedAction, TrialSelection
 from recrl.orchestrator.run_sweep import (
     ONE_SIGNAL_SECONDS,
     SweepResult,
@@ -71,7 +71,7 @@ def _grid(text: str = GRID) -> GridSpec:
 def _launch(store: SweepStore, grid: GridSpec | None = None, *, retry_failed: bool = False) -> SweepResult:
     stop = threading.Event()
     settings = SweepRunSettings(
-        grid or _grid(), SweepPlace(store), InlineExecutor(), retry_failed=retry_failed
+        grid or _grid(), SweepPlace(store), InlineExecutor(), TrialSelection(retry_failed=retry_failed)
     )
     return run_sweep(settings, stop=stop)
 
@@ -198,7 +198,7 @@ def test_two_launches_of_a_sweep_at_once_are_refused(store: SweepStore) -> None:
 def test_a_wrong_selection_leaves_no_trace(store: SweepStore) -> None:
     with pytest.raises(RecrlError, match="--only: no trial has method 'dynamic'"):
         only = {"method": ["dynamic"]}
-        settings = SweepRunSettings(_grid(), SweepPlace(store), InlineExecutor(), only=only)
+        settings = SweepRunSettings(_grid(), SweepPlace(store), InlineExecutor(), TrialSelection(only=only))
         run_sweep(settings, stop=threading.Event())
     assert not store.folder.exists()
 
