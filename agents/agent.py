@@ -136,8 +136,9 @@ class Agent(FinalPolicy, Protocol):
 
         Args:
             rollout: T x B steps collected with the current policy.
-            episode_costs: undiscounted costs of the episodes that finished in it, [E, k]. With E = 0 nothing
-                is known about the constraints, and steps that depend on them are skipped.
+            episode_costs: undiscounted costs of the episodes that finished in it, [E, k]. With E = 0 the
+                mean costs are estimated from the steps so far; only a CVaR is unknown until an episode has
+                finished.
             step: the curriculum's output for this update. Its limits may be infinite. Its policy noise has
                 already been added (``add_noise``). ``EntropyRewarded`` agents use its entropy coefficient.
 

@@ -76,7 +76,7 @@ class ActorCriticConfig(BaseModel):
         description="Import path package.module:function of your own network. The function takes "
         "the numbers of inputs and outputs and returns a torch.nn.Module from [U, "
         "inputs] to [U, outputs]. It makes the policy and every critic. Then "
-        "hidden_sizes, activation and initialisation are not used.",
+        "hidden_sizes, activation, initialisation and last_layer_scale are not used.",
     )
     initialisation: Literal["orthogonal", "xavier"] = Field(
         default="orthogonal", description="Initialisation of the weights (ours; paper xavier)."
@@ -165,10 +165,10 @@ class ActorCriticConfig(BaseModel):
     )
     min_std: NonNegative = Field(
         default=0.4,
-        description="Lower bound of the standard deviations of two continuous actions, as a fraction of half "
-        "the action's range; of m actions it is times sqrt(2 / m). They are raised to it after each update "
-        "(ours). Under a falling limit a policy without it can become too certain to change in time. "
-        "0: no bound (paper).",
+        description="Lower bound of the standard deviations of continuous actions, as a fraction of half "
+        "the action's range; of more than two actions, m, it is times sqrt(2 / m). They are raised to it "
+        "after each step of the policy (ours). Under a falling limit a policy without it can become too "
+        "certain to change in time. Where the noise itself costs, lower it. 0: no bound (paper).",
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",
@@ -254,7 +254,8 @@ class LagrangianConfig(BaseModel):
     )
     multiplier_step: Positive = Field(
         default=0.1,
-        description="Step of the dual ascent, K_I, or Adam's learning rate, without unit (ours; paper 0.05).",
+        description="Step of the dual ascent, K_I, or Adam's learning rate (ours; paper 0.05). With "
+        "multiplier_unit: cost, the first two are per unit of episode cost.",
     )
     multiplier_proportional: NonNegative = Field(
         default=1.0, description="K_P of the rule proportional-integral (ours)."
@@ -265,10 +266,15 @@ class LagrangianConfig(BaseModel):
     )
 
     @model_validator(mode="after")
-    def _softplus_begins_above_zero(self) -> Self:
+    def _first_multiplier_is_in_range(self) -> Self:
         if self.multiplier_rule == "softplus-adam" and self.multiplier_initial <= 0.0:
             raise ValueError(
                 f"multiplier_initial must be above 0 with the rule softplus-adam, "
+                f"got {self.multiplier_initial}"
+            )
+        if self.multiplier_rule != "softplus-adam" and self.multiplier_initial > self.multiplier_maximum:
+            raise ValueError(
+                f"multiplier_initial must be at most multiplier_maximum, {self.multiplier_maximum}, "
                 f"got {self.multiplier_initial}"
             )
         return self

@@ -17,6 +17,9 @@ import numpy.typing as npt
 from gymnasium.spaces import Box, Discrete, MultiBinary
 
 from recrl.agents.errors import UnsupportedSpaceError
+from recrl.environments.cmdp import Floats
+
+UNBOUNDED = 1e30
 
 
 def observation_size(space: gymnasium.Space[Any]) -> int:
@@ -70,11 +73,28 @@ def action_size(space: gymnasium.Space[Any]) -> int:
     raise UnsupportedSpaceError(f"action space must be Discrete or a Box of floats, got {space}")
 
 
+def action_range(space: Box) -> tuple[Floats, Floats]:
+    """Return the middle of each action component's range and half its length, [m] each.
+
+    They are the agent's zero and unit. A component without two bounds has 0 and 1. A bound of ``UNBOUNDED``
+    or beyond, such as the largest number of a type, counts as none.
+
+    >>> action_range(Box(np.float32([10.0, -np.inf]), np.float32([20.0, 5.0])))
+    (array([15.,  0.]), array([5., 1.]))
+    """
+    low, high = (np.asarray(bound, np.float64).reshape(-1) for bound in (space.low, space.high))
+    bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
+    middle = np.where(bounded, 0.5 * (np.where(bounded, high, 0.0) + np.where(bounded, low, 0.0)), 0.0)
+    half = np.where(bounded, 0.5 * (np.where(bounded, high, 0.0) - np.where(bounded, low, 0.0)), 1.0)
+    return middle, half
+
+
 def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Convert B actions of an agent, int64 [B] or float32 [B, m], to actions of the task.
 
-    Discrete actions are shifted to the space's first one; Gaussian ones are clipped to the bounds of the
-    Box. The agent learns from the unclipped actions, whose density is known.
+    Discrete actions are shifted to the space's first one. Gaussian ones are in half ranges from the middle of
+    the range, and the result is clipped to the bounds of the Box. The agent learns from the unclipped
+    actions, whose density is known.
     """
     if isinstance(space, Discrete):
         shifted: npt.NDArray[np.int64] = actions + space.start
@@ -84,6 +104,7 @@ def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) 
         raise ValueError(
             f"an agent's actions must have shape (B, {math.prod(space.shape)}), got {actions.shape}"
         )
-    shaped = actions.reshape(len(actions), *space.shape)
+    middle, half = action_range(space)
+    shaped = (middle + half * actions).reshape(len(actions), *space.shape)
     clipped: npt.NDArray[Any] = np.clip(shaped, space.low, space.high).astype(space.dtype)
     return clipped

@@ -56,13 +56,15 @@ class DynamicConfig(BaseModel):
     )
     return_tolerance: float = Field(
         default=0.1,
-        ge=0.0,
-        description="eps_r: largest relative change of a converged mean return (paper: 0.1).",
+        gt=0.0,
+        description="eps_r: largest relative change of a converged mean return (paper: 0.1). With "
+        "window_grows a window needs up to 1 / eps_r^2 episodes.",
     )
     cost_tolerance: float = Field(
         default=0.1,
-        ge=0.0,
-        description="eps_c: largest relative change of a converged mean cost (paper: 0.1).",
+        gt=0.0,
+        description="eps_c: largest relative change of a converged mean cost (paper: 0.1). With "
+        "window_grows a window needs up to 1 / eps_c^2 episodes.",
     )
     return_floor: float = Field(
         default=1.0,
@@ -73,8 +75,8 @@ class DynamicConfig(BaseModel):
     cost_floor: float = Field(
         default=1.0,
         ge=0.0,
-        description="Least mean cost in the convergence test, in units of the episode cost; "
-        "smaller ones count as this.",
+        description="Least mean cost in the convergence test, and least limit in adherence_tolerance, in "
+        "units of the episode cost; smaller ones count as this.",
     )
     adherence_tolerance: Literal["relative", "standard_error", "none"] = Field(
         default="relative",

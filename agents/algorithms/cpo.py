@@ -8,8 +8,8 @@ same numbers, so that b and c have one unit. So the step does not depend on the 
 Costs fall by less than the linear model predicts. So an integral of the violations is added to them, unless
 its gain is 0, as in the source (``recrl.agents.constraints.violation_integral``).
 
-While the constrained cost is unknown, the policy does not change. A cost whose limit is infinite is no
-constraint.
+While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
+change. A cost whose limit is infinite is no constraint.
 
 Notation: N samples, k costs, P parameters, delta the trust region's size, H its metric.
 """
@@ -53,12 +53,12 @@ class LocalModel:
     """
 
     def __init__(self, policy: StochasticPolicy, experience: Experience, advantages: Floats) -> None:
-        self._policy, self._experience = policy, experience
+        self.policy, self._experience = policy, experience
         self._advantages = experience.batch.per_pair(advantages)
 
     def gradients(self) -> Tensor:
         """Return the gradients of all surrogates at the policy's present parameters, [1 + k, P]."""
-        now = self._policy.evaluate(self._experience.batch.unique_observations)
+        now = self.policy.evaluate(self._experience.batch.unique_observations)
         surrogates = self._surrogates(now.distribution)
         return torch.stack([now.gradient(each, retain_graph=True).clone() for each in surrogates.unbind()])
 
@@ -69,7 +69,7 @@ class LocalModel:
         the direction has a cosine of 0.998 with the full one and takes a tenth of the time.
         """
         rows, weights = self._experience.batch.thinned(config.metric_samples, generator)
-        return FisherMetric(self._policy, rows, weights, config.damping)
+        return FisherMetric(self.policy, rows, weights, config.damping)
 
     def _surrogates(self, distribution: Distribution) -> Tensor:
         return surrogate(self._experience.ratios(distribution), self._advantages)
@@ -82,7 +82,7 @@ class LocalModel:
     def measure(self) -> tuple[npt.NDArray[np.floating], float]:
         """Return the surrogates [1 + k] and the mean KL at the present parameters, in nats."""
         batch = self._experience.batch
-        distribution = self._policy.distribution(batch.unique_observations)
+        distribution = self.policy.distribution(batch.unique_observations)
         divergence = mean_divergence(self._experience.old, distribution, batch.observation_weights)
         return self._surrogates(distribution).numpy(force=True), float(divergence)
 
@@ -93,6 +93,8 @@ def linearise(
     """Return the step's problem reduced to products, and H^-1 g, H^-1 b_1, ..., H^-1 b_j, [1 + j, P]."""
     gradients = model.gradients()
     chosen = torch.cat([-gradients[:1], gradients[1 + torch.as_tensor(active.index)]])
+    wanted = torch.as_tensor(np.concatenate([[True], active.violations > 0.0]))
+    model.policy.hold_bounded_std(chosen, -chosen[wanted])
     solved = torch.stack(
         [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in chosen]
     )
@@ -188,9 +190,9 @@ class ConstrainedPolicyOptimisation:
         problem, solved = linearise(model, active, metric, config)
         solution = self._solve(problem)
         is_acceptable = acceptance(model, active, solution, config.target_kl)
-        metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
+        metrics = line_search(policy, to_parameter_step(solution, solved), is_acceptable, config)
         rejected = metrics["policy_steps"] == 0.0
-        integral.note_step(active.index, problem.beyond_reach() | (rejected & (active.violations > 0.0)))
+        integral.note_step(active.index, problem.unmet(solution) | (rejected & (active.violations > 0.0)))
         multipliers[:] = 0.0
         multipliers[active.index] = solution.multipliers / spreads[1 + active.index]
         return {

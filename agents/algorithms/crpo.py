@@ -23,7 +23,8 @@ a reward step ends at the limit. Before, steps go as far beyond the limit on one
 coefficient lambda is the option ``kl_penalty``, with the unit and the purpose of that of ``trpo-lag``; 0 is
 the source's.
 
-While the constrained cost is unknown, the policy does not change.
+While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
+change.
 
 Notation: N samples, k costs, of which j have a finite limit.
 """
@@ -135,7 +136,7 @@ class ConstraintRectifiedPolicyOptimisation:
             solution = cost_step(problem, int(np.searchsorted(active.index, corrected)), config)
             multipliers[corrected] = np.inf  # as if this were the only constraint; recorded as NaN
         is_acceptable = improvement(model, corrected, config.target_kl)
-        metrics = line_search(policy.parameters, to_parameter_step(solution, solved), is_acceptable, config)
+        metrics = line_search(policy, to_parameter_step(solution, solved), is_acceptable, config)
         return {**metrics, **indexed("multiplier", multipliers)}
 
 

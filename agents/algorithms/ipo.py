@@ -18,8 +18,8 @@ which its slope is kappa,
 so that a violated constraint is an exact penalty with the factor kappa. Advantages and c are in the units of
 ``constraints.relative_units``, so that one kappa serves tasks of any units.
 
-While the constrained cost is unknown, the policy does not change. Notation: N samples, D pairs, k costs, j of
-them can bind.
+While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
+change. Notation: N samples, D pairs, k costs, j of them can bind.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ Where a limit is kept the penalty has no gradient at first. The first steps foll
 Adam step may leave the trust region before the penalty acts. So, ours, the change is scaled back to the KL
 target_kl: ``trust_region: kept``.
 
-While the constrained cost is unknown, the policy does not change. Notation: N samples, D pairs, k costs, j of
-them can bind.
+While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
+change. Notation: N samples, D pairs, k costs, j of them can bind.
 """
 
 from __future__ import annotations

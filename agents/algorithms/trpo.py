@@ -55,7 +55,9 @@ def trust_region_step(
     """
     model = LocalModel(policy, experience, objective[:, None])
     metric = model.metric(config, generator)
-    gradient = model.gradients()[0]
+    gradients = model.gradients()
+    policy.hold_bounded_std(gradients, gradients)
+    gradient = gradients[0]
     direction = conjugate_gradient(metric, gradient, iterations=config.conjugate_gradient_steps)
     squared = float(torch.dot(direction, metric(direction)))
     require_finite("the squared length of the trust region's direction", squared)
@@ -68,7 +70,7 @@ def trust_region_step(
         now, divergence = model.measure()
         return bool(now[0] >= before[0]) and divergence <= config.target_kl
 
-    return line_search(policy.parameters, direction, is_acceptable, config)
+    return line_search(policy, direction, is_acceptable, config)
 
 
 def step_size(squared: float, target_kl: float, kl_penalty: float) -> float:

@@ -9,8 +9,9 @@ A state is a dict of float64 arrays [k], which a checkpoint stores directly; eac
 Notation: k costs.
 
 Which to use: ``projected_ascent`` is an integrator, so the cost oscillates about the limit; the proportional
-term of ``proportional_integral`` damps this. Neither winds down below 0 nor accumulates old violations, so
-both respond immediately to a changed limit. ``softplus_adam`` does both; it is here because the paper's
+term of ``proportional_integral`` damps this. Neither winds down below 0 nor, under a positive limit,
+accumulates old violations, so both respond immediately to a changed limit. Under a limit of 0 no gap is
+negative, so their multipliers never fall. ``softplus_adam`` does both; it is here because the paper's
 agents use it.
 """
 
@@ -54,7 +55,7 @@ def start_softplus_adam(num_costs: int, initial: float) -> dict[str, Floats]:
     zeros = np.zeros(num_costs)
     return {
         "multipliers": np.full(num_costs, initial),
-        "theta": np.full(num_costs, np.log(np.expm1(initial))),
+        "theta": np.full(num_costs, initial + np.log(-np.expm1(-initial))),
         "first_moment": zeros,
         "second_moment": zeros,
         "steps": zeros,

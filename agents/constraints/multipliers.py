@@ -8,8 +8,8 @@ to the multipliers' units: the agent ascends A_r - sum_i mu_i A_i.
 per unit of cost, the multiplier of the CMDP is lambda_i = mu_i u_i. ``cost`` is the paper's: violations in
 episode cost, standardised reward advantages, raw cost advantages.
 
-While the constrained cost is unknown, the multipliers do not change. A cost with an infinite limit has the
-multiplier 0.
+While the constrained cost is unknown (a CVaR before the first episode has finished), the multipliers do not
+change. A cost with an infinite limit has the multiplier 0.
 
 Notation: N samples, k costs.
 """

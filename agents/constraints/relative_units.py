@@ -31,8 +31,8 @@ class RelativeAdvantages:
         rewards: standardised advantages, [N].
         costs: centred advantages of each cost times its ``factors``, [N, k].
         factors: u_i / the spread of the reward's advantages in this rollout, [k]; 0 if the cost has not
-            occurred.
-        exchange_rates: u, reward per unit of cost, [k]; likewise.
+            occurred. Before any reward, 1 / the spread of the cost's: costs are avoided from the start.
+        exchange_rates: u, reward per unit of cost, [k]; 0 before any reward or cost i.
     """
 
     rewards: Floats
@@ -56,8 +56,9 @@ class RelativeUnits:
         centred = advantages - advantages.mean(axis=0)
         spread = reward_spread(centred)
         self._spreads.add((centred**2).mean(axis=0))
-        exchange_rates = quotient(self._spreads.values[:1], self._spreads.values[1:])
-        factors = exchange_rates / spread
+        of_reward, of_costs = self._spreads.values[:1], self._spreads.values[1:]
+        exchange_rates = quotient(of_reward, of_costs)
+        factors = exchange_rates / spread if of_reward > 0.0 else quotient(np.ones(1), of_costs)
         return RelativeAdvantages(centred[:, 0] / spread, centred[:, 1:] * factors, factors, exchange_rates)
 
     def state_dict(self) -> dict[str, Any]:
@@ -91,7 +92,7 @@ class RelativeConstraints:
     def of(cls, experience: Experience, units: RelativeUnits) -> RelativeConstraints:
         """Include the rollout's advantages in the units, and scale advantages and known gaps."""
         scaled, active = units.of(experience.advantages), ActiveConstraints.of(experience.constraints)
-        occurred = scaled.exchange_rates[active.index] > 0.0
+        occurred = scaled.factors[active.index] > 0.0
         index = active.index[occurred]
         violations = scaled.factors[index] * active.violations[occurred]
         return cls(scaled.rewards, scaled.costs[:, index], violations, index, scaled.exchange_rates)

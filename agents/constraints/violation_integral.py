@@ -6,7 +6,7 @@ predicted. It settles above the limit, where the realised fall balances the rise
 causes. An integral of the gap g, the mean episode cost minus the limit, removes this steady error, as in
 every controller:
 
-    I <- max(I + K min(g, e), 0),    if g = 0: I <- (1 - K) I;
+    I <- max(I + K min(g, e), 0),    if d = 0 and g is negligible beside I: I <- (1 - K) I;
 
 c is computed from g + I in place of g. e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost,
 bounds what a gap adds. An episode costs at least 0, so g is at least -d, but an untrained policy may exceed
@@ -16,7 +16,7 @@ bounded likewise (``multiplier_rules.proportional_integral``).
 
 If the last step could not meet its constraint, a larger I would change nothing, and would delay the return to
 the reward. Then I does not grow (anti-wind-up). Under a limit of 0 g is never negative: there I falls only by
-the second rule, while g is 0.
+the second rule. A life table's estimate only approaches 0, so g needs not be 0 exactly.
 
 g, e and I are in episode cost, so K has no unit. In cost per step the request I would grow with the length of
 the episodes, as robots learn not to fall. K = 0 is the published algorithm.
@@ -35,6 +35,8 @@ import numpy.typing as npt
 
 from recrl.agents.experience import Constraints
 from recrl.environments.cmdp import Floats
+
+NEGLIGIBLE = 1e-6
 
 
 class ViolationIntegral:
@@ -62,7 +64,8 @@ class ViolationIntegral:
         sizes = np.hypot(constraints.limits[index], constraints.standard_errors[index])
         change = self._gain * np.minimum(gaps, sizes)
         grows = np.where(self._unmet[index], np.minimum(change, 0.0), change)
-        forgotten = np.where(gaps == 0.0, self._gain * self._integral[index], 0.0)
+        kept = (constraints.limits[index] == 0.0) & (gaps <= NEGLIGIBLE * self._integral[index])
+        forgotten = np.where(kept, self._gain * self._integral[index], 0.0)
         self._integral[index] = np.maximum(self._integral[index] + grows - forgotten, 0.0)
         corrected = constraints.gaps.copy()
         corrected[index] = gaps + self._integral[index]

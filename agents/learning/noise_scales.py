@@ -55,18 +55,17 @@ def matching_scale(logits: Floats, weights: Floats, noise: float) -> float:
     return 0.5 * (low + high)
 
 
-def matching_log_std(log_std: Floats, half_ranges: Floats, noise: float) -> Floats:
+def matching_log_std(log_std: Floats, noise: float) -> Floats:
     """Return the log_std that gives each action component the variance of the eps-mixture around the mean.
 
-    sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + eps h^2 / 3): h^2 / 3 is the variance of a uniform action on
-    an interval of half-range h. (The distance between the mean and the interval's middle, which adds to the
-    mixture's variance, is left out: it depends on the observation.)
+    sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + eps / 3): 1 / 3 is the variance of a uniform action in half
+    ranges. (The distance between the mean and the middle of the range, which adds to the mixture's variance,
+    is left out: it depends on the observation.)
 
     Args:
-        log_std: of the present policy, [m].
-        half_ranges: h, half the length of the action interval, [m]; 1 where it is unbounded.
+        log_std: of the present policy, in half ranges, [m].
         noise: eps in (0, 1].
     """
     variance = np.exp(2.0 * log_std)
-    mixed = (1.0 - noise) * variance + noise * half_ranges**2 / 3.0
+    mixed = (1.0 - noise) * variance + noise / 3.0
     return 0.5 * np.log(np.maximum(variance, mixed))

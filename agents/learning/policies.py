@@ -9,6 +9,7 @@ Notation: U rows, B observations, n observation components, A actions, m action 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 from weakref import ref
@@ -17,7 +18,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Discrete
 from torch import Tensor
 
 from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
@@ -30,8 +31,10 @@ from recrl.agents.spaces import action_size
 from recrl.environments.cmdp import Floats
 
 # Usual initial log standard deviation of a Gaussian policy whose actions are within [-1, 1], also that of
-# safety-starter-agents. Of other actions it is relative to half their range, as ``min_std`` is.
+# safety-starter-agents.
 INITIAL_LOG_STD = -0.5
+# float32: a log_std that was raised to its bound is this close to it.
+ROUNDING_OF_LOG_STD = 1e-6
 # Noise 1 would make a tempered Gaussian infinitely wide; this bound makes it a thousand times wider.
 SMALLEST_TEMPERING = 1e-3
 
@@ -39,7 +42,9 @@ SMALLEST_TEMPERING = 1e-3
 class StochasticPolicy:
     """The policy pi(a | s): categorical for Discrete actions, diagonal Gaussian for Box.
 
-    The Gaussian's log_std does not depend on the state; it is the last m of the parameters.
+    The Gaussian's actions are in half ranges from the middle of the task's
+    (``recrl.agents.spaces.action_range``). Its log_std does not depend on the state; it is the last m of the
+    parameters.
 
     Args:
         num_observations: n.
@@ -47,10 +52,11 @@ class StochasticPolicy:
         form: of the network.
         last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
         generator: the initialisation's randomness.
-        min_std: lower bound of a Gaussian's two standard deviations, as a fraction of half the action's
-            range. Of m actions it is times sqrt(2 / m).
+        min_std: lower bound of a Gaussian's standard deviations, in half ranges; of m > 2 actions it is
+            times sqrt(2 / m).
 
     Attributes:
+        action_space: of one environment.
         parameters: all of them, in one block.
         stack: the network.
         is_categorical: whether actions are Discrete.
@@ -67,6 +73,7 @@ class StochasticPolicy:
         min_std: float = 0.0,
     ) -> None:
         num_outputs = action_size(action_space)
+        self.action_space = action_space
         self.is_categorical = isinstance(action_space, Discrete)
         self.parameters, self.stack = make_stack(
             form,
@@ -78,11 +85,10 @@ class StochasticPolicy:
             role="policy",
             others=[] if self.is_categorical else [(num_outputs,)],
         )
-        if isinstance(action_space, Box):
-            half = 0.5 * (action_space.high.astype(np.float64) - action_space.low).reshape(-1)
-            self._half_ranges = np.where(np.isfinite(half), half, 1.0)
-            self.log_std.copy_(torch.as_tensor(INITIAL_LOG_STD + np.log(self._half_ranges)))
-        self._min_std = min_std
+        if not self.is_categorical:
+            self.log_std.fill_(INITIAL_LOG_STD)
+        least = min_std * min(1.0, (2.0 / num_outputs) ** 0.5)
+        self._least_log_std = None if self.is_categorical or least == 0.0 else math.log(least)
         self.bound_std()
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
         acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
@@ -218,13 +224,27 @@ class StochasticPolicy:
     def bound_std(self) -> None:
         """Raise a Gaussian's standard deviations to their lower bound.
 
-        So the noise has a mean squared length of at least 2 min_std^2 half ranges, however many actions
-        there are.
+        With two actions or more, the noise then has a mean squared length of at least 2 min_std^2 squared
+        half ranges, however many there are.
         """
-        if self._min_std > 0.0 and not self.is_categorical:
-            fraction = self._min_std * (2.0 / len(self._half_ranges)) ** 0.5
-            least = torch.as_tensor(np.log(fraction * self._half_ranges), dtype=self.log_std.dtype)
-            self.log_std.copy_(torch.maximum(self.log_std, least.to(self.log_std.device)))
+        if self._least_log_std is not None:
+            self.log_std.clamp_(min=self._least_log_std)
+
+    def hold_bounded_std(self, gradients: Tensor, ascents: Tensor) -> None:
+        """Set the derivatives by a log_std to 0 if it is at its bound and an ascent would lower it.
+
+        A step that such derivatives lead would spend its KL on what ``bound_std`` takes back.
+
+        Args:
+            gradients: of any functions, [j, P]; changed in place.
+            ascents: the directions in which the step is to go, [i, P].
+        """
+        if self._least_log_std is None:
+            return
+        num = self.log_std.numel()
+        at_bound = self.log_std <= self._least_log_std + ROUNDING_OF_LOG_STD
+        held = at_bound & (ascents[:, -num:] < 0.0).any(dim=0)
+        gradients[:, -num:].masked_fill_(held, 0.0)
 
     def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
         distinct = find_repeated(observations)
@@ -246,7 +266,7 @@ class StochasticPolicy:
         if form == "temperature":
             after = before - np.log(max(1.0 - noise, SMALLEST_TEMPERING))
         else:
-            after = matching_log_std(before, self._half_ranges, noise)
+            after = matching_log_std(before, noise)
         self.log_std.copy_(torch.as_tensor(after))
         mean_before, mean_after = float(np.exp(before).mean()), float(np.exp(after).mean())
         return {

@@ -35,7 +35,10 @@ ACTIVATIONS: Mapping[str, type[nn.Module]] = {
 
 
 def perceptron(
-    hidden_sizes: Sequence[int], activation: str, initialiser: Callable[[Tensor, torch.Generator], None]
+    hidden_sizes: Sequence[int],
+    activation: str,
+    initialiser: Callable[[Tensor, torch.Generator], None],
+    last_scale: float = 1.0,
 ) -> Callable[[torch.Generator], ModuleFactory]:
     """Return a factory of multi-layer perceptrons with an activation between the layers.
 
@@ -43,6 +46,7 @@ def perceptron(
         hidden_sizes: widths of the hidden layers.
         activation: a key of ``ACTIVATIONS``.
         initialiser: draws each weight matrix, [in, out]; biases start at 0.
+        last_scale: factor on the last layer's initial weights.
     """
 
     def seeded(generator: torch.Generator) -> ModuleFactory:
@@ -56,6 +60,7 @@ def perceptron(
                 layer.weight.data = drawn.T.contiguous()
                 nn.init.zeros_(layer.bias)
                 layers += [layer, ACTIVATIONS[activation]()]
+            layer.weight.data.mul_(last_scale)
             return nn.Sequential(*layers[:-1])
 
         return make
@@ -66,8 +71,7 @@ def perceptron(
 class ModuleStack:
     """C separate modules of one kind, each followed by a constant factor.
 
-    The factor is not learnt. It acts like the last layer's scale: it makes policies more random and rescales
-    critics (``scale``).
+    The factor is 1 at first and not learnt. It makes policies more random and rescales critics (``scale``).
 
     Args:
         modules: C of them, without buffers, in evaluation mode.
@@ -88,12 +92,12 @@ class ModuleStack:
         """The shapes of all parameters, module by module, then of the C factors."""
         return [tuple(each.shape) for module in modules for each in module.parameters()] + [(len(modules),)]
 
-    def initialise(self, last_scale: float) -> None:
-        """Copy the modules' own initial parameters into the block; start with the factor ``last_scale``."""
+    def initialise(self) -> None:
+        """Copy the modules' own initial parameters into the block; start with the factor 1."""
         for module, values in zip(self._modules, self._values, strict=True):
             for name, value in module.named_parameters():
                 values[name].copy_(value.detach())
-        self._factors.fill_(last_scale)
+        self._factors.fill_(1.0)
 
     def to_module(self) -> nn.Module:
         """Return a copy of the first network, with its factor."""

@@ -71,7 +71,7 @@ def make_stack(
         num_networks: C.
         num_inputs: n.
         num_outputs: of each.
-        last_scale: factor on the initial outputs.
+        last_scale: factor on the initial weights of the last layer; a user's network keeps its own.
         generator: the initialisation's randomness.
         role: of the networks, for errors: ``policy`` or ``critic``.
         others: shapes of further parameters at the end of the block.
@@ -85,11 +85,12 @@ def make_stack(
         stack = TanhStack(parameters, len(sizes) - 1)
         stack.initialise(form.initialiser, last_scale, generator)
         return parameters, stack
-    factory = form.factory or perceptron(form.hidden_sizes, form.activation, form.initialiser)(generator)
+    standard = perceptron(form.hidden_sizes, form.activation, form.initialiser, last_scale)
+    factory = form.factory or standard(generator)
     with torch.random.fork_rng(devices=[]):  # a user's module draws from PyTorch's global generator
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
         modules = [checked_module(factory, num_inputs, num_outputs, role=role) for _ in range(num_networks)]
     parameters = FlatParameters([*ModuleStack.shapes(modules), *others])
     of_modules = ModuleStack(modules, parameters)
-    of_modules.initialise(last_scale)
+    of_modules.initialise()
     return parameters, of_modules

@@ -52,6 +52,9 @@ NO_INFLUENCE = 1e-12
 NO_GRADIENT = 1e-10
 # Tolerance of a constraint for rounding, as a fraction of what the trust region can change.
 FEASIBILITY_TOLERANCE = 1e-9
+# A constraint that a solved step should meet may be violated by this fraction of what the trust region can
+# change.
+ROUNDING = 1e-6
 
 
 class StepCase(IntEnum):
@@ -91,11 +94,11 @@ class StepProblem:
             self.violations - solution.gradient_weight * self.mixed - self.gram @ solution.constraint_weights
         )
 
-    def beyond_reach(self) -> npt.NDArray[np.bool_]:
-        """Return which constraints no step within the trust region meets, each taken alone, [k]."""
+    def unmet(self, solution: DualSolution) -> npt.NDArray[np.bool_]:
+        """Return which violated constraints a step leaves violated, to first order, [k]."""
         reach = np.sqrt(2.0 * self.radius * np.maximum(np.diag(self.gram), 0.0))
-        beyond: npt.NDArray[np.bool_] = self.violations > reach
-        return beyond
+        left: npt.NDArray[np.bool_] = (self.violations > 0.0) & (self.after(solution) > ROUNDING * reach)
+        return left
 
 
 @dataclass(frozen=True, eq=False)

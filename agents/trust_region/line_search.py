@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.shared_options import TrustRegionConfig
 
@@ -18,6 +19,7 @@ def backtrack(
     *,
     ratio: float,
     tries: int,
+    project: Callable[[], None] = lambda: None,
 ) -> int | None:
     """Move along ``step`` and shorten it until the new policy is acceptable.
 
@@ -27,6 +29,7 @@ def backtrack(
         is_acceptable: checks the policy at its present parameters.
         ratio: factor in (0, 1) on the step from one try to the next.
         tries: largest number of tries, at least 1.
+        project: moves the parameters to the nearest allowed ones before each check.
 
     Returns:
         j, the number of times the step was shortened (it is then ``ratio ** j`` times the full one), or
@@ -35,6 +38,7 @@ def backtrack(
     start = parameters.values.clone()
     for shortened in range(tries):
         torch.add(start, step, alpha=ratio**shortened, out=parameters.values)
+        project()
         if is_acceptable():
             return shortened
     parameters.values.copy_(start)
@@ -42,16 +46,21 @@ def backtrack(
 
 
 def line_search(
-    parameters: FlatParameters, step: Tensor, is_acceptable: Callable[[], bool], config: TrustRegionConfig
+    policy: StochasticPolicy, step: Tensor, is_acceptable: Callable[[], bool], config: TrustRegionConfig
 ) -> dict[str, float]:
-    """``backtrack`` with an agent's settings.
+    """``backtrack`` with an agent's settings; standard deviations below their bound are raised to it.
 
     Returns:
         Metrics: ``policy_steps``, 1 or 0; ``line_search_steps``, how often the step was shortened; and
         ``step_norm``, the length of the step taken.
     """
     shortened = backtrack(
-        parameters, step, is_acceptable, ratio=config.backtrack_ratio, tries=config.backtrack_tries
+        policy.parameters,
+        step,
+        is_acceptable,
+        ratio=config.backtrack_ratio,
+        tries=config.backtrack_tries,
+        project=policy.bound_std,
     )
     taken = 0.0 if shortened is None else config.backtrack_ratio**shortened
     return {

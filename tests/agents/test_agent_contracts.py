@@ -317,8 +317,46 @@ def test_no_update_lets_a_standard_deviation_fall_below_its_bound(agent: str) ->
     lessons = Lessons(agent, "continuous-bandit", {"min_std": 0.9})
     space = make_vector("continuous-bandit", 4).cmdp.action_space
     assert isinstance(space, Box)
-    share = (2.0 / space.shape[0]) ** 0.5
-    log_std = np.log(0.9 * share * 0.5 * (space.high - space.low))
+    log_std = np.log(0.9 * min(1.0, (2.0 / space.shape[0]) ** 0.5) * np.ones(space.shape))
     least = float(log_std.sum()) + 0.5 * len(log_std) * math.log(2.0 * math.pi * math.e)
     for _ in range(SEVERAL_UPDATES):
         assert lessons.update()["entropy"] >= least - 1e-5
+
+
+@pytest.mark.parametrize("agent", ["cpo", "pcpo", "crpo", "trpo", "trpo-lag"])
+def test_a_trust_region_step_at_the_bound_of_the_standard_deviations_is_what_was_accepted(agent: str) -> None:
+    lessons = Lessons(agent, "continuous-bandit", {"min_std": 0.6, "target_kl": 0.005})
+    for _ in range(8):
+        lessons.update()
+    # Without a binding limit, the accepted surrogate does not fall.
+    for _ in range(4):
+        metrics = lessons.update(math.inf)
+        assert metrics["policy_steps"] == 1.0
+        assert 0.0 < metrics["kl"] <= 0.005
+        assert metrics["surrogate_reward"] >= -1e-6
+
+
+@pytest.mark.parametrize("activation", ["relu", "elu", "gelu", "silu"])
+def test_every_activation_learns_about_as_fast_as_tanh(activation: str) -> None:
+    first, other = (Lessons("ppo-lag", "two-state", {"activation": each}) for each in ("tanh", activation))
+    expected, found = (np.mean([each.update(math.inf)["kl"] for _ in range(5)]) for each in (first, other))
+    assert 0.2 * expected < found < 5.0 * expected
+
+
+class _Rewardless(Lessons):
+    """A task without rewards: only the limit remains."""
+
+    def collect(self) -> tuple[Rollout, tuple[FinishedEpisode, ...]]:
+        rollout, episodes = super().collect()
+        return replace(rollout, rewards=np.zeros_like(rollout.rewards)), episodes
+
+
+@pytest.mark.parametrize("agent", ["ppo-lag", "trpo-lag", "focops", "p3o", "cpo"])
+def test_costs_are_avoided_before_any_reward_was_seen(agent: str) -> None:
+    lessons = _Rewardless(agent, "two-state")
+    costs = []
+    for _ in range(30):
+        rollout, episodes = lessons.collect()
+        costs.append(float(rollout.costs.mean()))
+        lessons.agent.update(rollout, episode_costs(episodes, 1), lessons.step(0.5))
+    assert np.mean(costs[-3:]) < 0.6 * np.mean(costs[:3])

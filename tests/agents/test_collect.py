@@ -222,6 +222,25 @@ def test_a_space_that_no_agent_handles_is_refused() -> None:
         action_size(MultiBinary(2))
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "action", "expected"),
+    [
+        (-1.0, 1.0, 0.25, 0.25),
+        (10.0, 20.0, 0.4, 17.0),
+        (10.0, 20.0, -3.0, 10.0),
+        (-np.inf, np.inf, -3.0, -3.0),
+        (0.0, np.inf, 3.0, 3.0),
+        (0.0, np.inf, -3.0, 0.0),
+        (np.finfo(np.float32).min, np.finfo(np.float32).max, 2.0, 2.0),
+    ],
+)
+def test_continuous_actions_are_in_half_ranges_from_the_middle(
+    low: float, high: float, action: float, expected: float
+) -> None:
+    space = Box(low, high, (1, 1), np.float32)
+    assert environment_actions(space, np.array([[action]], np.float32)).tolist() == [[[expected]]]
+
+
 def test_discrete_actions_are_shifted_to_the_first() -> None:
     assert environment_actions(Discrete(2, start=5), np.array([0, 1])).tolist() == [5, 6]
 

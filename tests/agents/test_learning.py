@@ -29,19 +29,21 @@ class Lesson:
     num_envs: int = 32
 
 
+# The closed-form optimum is of a policy without noise.
+NO_BOUND = {"min_std": 0.0}
 LESSONS = [
     Lesson("ppo-lag", "two-state", (3.0,), 150, seeds=2),
     Lesson("cpo", "two-state", (3.0,), 80, seeds=2),
     Lesson("ppo-lag", "two-state-2", (5.0, 2.0), 150, seeds=2, num_envs=64),
     Lesson("cpo", "two-state-2", (5.0, 2.0), 80, seeds=2),
-    Lesson("ppo-lag", "continuous-bandit", (2.5,), 500, seeds=2),
-    Lesson("cpo", "continuous-bandit", (2.5,), 80, seeds=2),
+    Lesson("ppo-lag", "continuous-bandit", (2.5,), 500, seeds=2, options=NO_BOUND),
+    Lesson("cpo", "continuous-bandit", (2.5,), 80, seeds=2, options=NO_BOUND),
     Lesson("trpo-lag", "two-state", (3.0,), 150),
     Lesson("trpo-lag", "two-state-2", (5.0, 2.0), 200),
-    Lesson("trpo-lag", "continuous-bandit", (2.5,), 150),
+    Lesson("trpo-lag", "continuous-bandit", (2.5,), 150, options=NO_BOUND),
     Lesson("pcpo", "two-state", (3.0,), 100),
     Lesson("pcpo", "two-state-2", (5.0, 2.0), 100),
-    Lesson("pcpo", "continuous-bandit", (2.5,), 100),
+    Lesson("pcpo", "continuous-bandit", (2.5,), 100, options=NO_BOUND),
     Lesson("focops", "two-state", (3.0,), 150),
     Lesson("focops", "two-state-2", (5.0, 2.0), 150, num_envs=128),
     Lesson("p3o", "two-state", (3.0,), 200),

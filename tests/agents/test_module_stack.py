@@ -43,7 +43,7 @@ class Both:
         modules = [self.module(number) for number in range(NETWORKS)]
         self.block = FlatParameters(ModuleStack.shapes(modules))
         self.stack = ModuleStack(modules, self.block)
-        self.stack.initialise(1.0)
+        self.stack.initialise()
 
     def module(self, number: int) -> nn.Module:
         layers: list[nn.Module] = []

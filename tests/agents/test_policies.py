@@ -1,6 +1,5 @@
 """Policies: their distributions, sampling, noise, and the trust region's metric."""
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -88,7 +87,7 @@ def test_sampled_gaussian_actions_have_the_policys_moments() -> None:
     actions = policy.sample(observation.repeat(40_000, 1).numpy(), np.random.default_rng(0))
     assert actions.dtype == np.float32
     np.testing.assert_allclose(actions.mean(axis=0), policy.mode(observation.numpy())[0], atol=0.02)
-    np.testing.assert_allclose(actions.std(axis=0), np.exp(-0.5) * TWO_COMPONENTS.high, rtol=0.02)
+    np.testing.assert_allclose(actions.std(axis=0), np.exp(-0.5), rtol=0.02)
 
 
 def test_a_sure_policy_never_does_anything_else() -> None:
@@ -181,12 +180,12 @@ def test_observations_that_repeat_count_as_often_as_they_do() -> None:
 def test_noise_never_sharpens_a_policy() -> None:
     assert matching_scale(np.zeros((4, 3)), np.full(4, 0.25), 0.3) == pytest.approx(1.0)
     wide = np.log(np.array([10.0]))
-    assert matching_log_std(wide, np.ones(1), 0.5) == pytest.approx(wide)
+    assert matching_log_std(wide, 0.5) == pytest.approx(wide)
 
 
 def test_gaussian_noise_gives_the_variance_of_the_mixture() -> None:
-    found = matching_log_std(np.log(np.array([0.1, 0.1])), np.array([1.0, 2.0]), 0.3)
-    assert np.exp(2.0 * found) == pytest.approx([0.7 * 0.01 + 0.3 / 3.0, 0.7 * 0.01 + 0.3 * 4.0 / 3.0])
+    found = matching_log_std(np.log(np.array([0.1, 0.2])), 0.3)
+    assert np.exp(2.0 * found) == pytest.approx([0.7 * 0.01 + 0.3 / 3.0, 0.7 * 0.04 + 0.3 / 3.0])
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -202,36 +201,37 @@ def test_noise_makes_a_policy_more_random(space: Space[object], form: str) -> No
     assert float(policy.distribution(rows).entropy().mean()) > before
 
 
-def test_an_unbounded_action_is_noised_as_if_its_half_range_were_one() -> None:
-    policy = policy_for(Box(-np.inf, np.inf, (1,)))
+def test_the_strongest_noise_is_that_of_uniform_actions() -> None:
+    policy = policy_for(TWO_COMPONENTS)
     policy.log_std.fill_(-5.0)
     policy.add_noise(1.0, random_rows().numpy(), "match-mixture")
-    assert policy.log_std.exp().item() == pytest.approx(3.0**-0.5)
+    assert policy.log_std.exp().tolist() == pytest.approx([3.0**-0.5] * 2)
 
 
-def test_the_first_standard_deviations_are_the_same_fraction_of_half_of_every_range() -> None:
-    space = Box(np.array([-1.0, 0.0, -np.inf]), np.array([1.0, 0.8, np.inf]), dtype=np.float64)
-    found = policy_for(space).log_std.exp().tolist()
-    assert found == pytest.approx([math.exp(-0.5), 0.4 * math.exp(-0.5), math.exp(-0.5)])
+def bounded_policy(stds: list[float]) -> StochasticPolicy:
+    space = Box(-1.0, 1.0, (len(stds),))
+    policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0), min_std=0.5)
+    policy.log_std.copy_(torch.log(torch.tensor(stds)))
+    return policy
 
 
 @pytest.mark.parametrize(
-    ("half_ranges", "before", "after"),
-    [
-        ([4.0], [0.1], [0.5 * 2.0**0.5 * 4.0]),
-        ([1.0, 4.0], [0.7, 0.7], [0.7, 2.0]),
-        ([1.0, np.inf] + [1.0] * 6, [0.1] * 8, [0.25] * 8),  # an infinite range counts as one
-    ],
+    ("before", "after"), [([0.1], [0.5]), ([0.7, 0.1], [0.7, 0.5]), ([0.3] + [0.1] * 7, [0.3] + [0.25] * 7)]
 )
-def test_standard_deviations_are_raised_to_a_fraction_of_half_the_range(
-    half_ranges: list[float], before: list[float], after: list[float]
-) -> None:
-    half = np.array(half_ranges)
-    space = Box(-half, half, dtype=np.float64)
-    policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0), min_std=0.5)
-    policy.log_std.copy_(torch.log(torch.tensor(before)))
+def test_standard_deviations_are_raised_to_their_bound(before: list[float], after: list[float]) -> None:
+    policy = bounded_policy(before)
     policy.bound_std()
     assert policy.log_std.exp().tolist() == pytest.approx(after)
+
+
+def test_a_standard_deviation_at_its_bound_is_held_if_an_ascent_would_lower_it() -> None:
+    policy = bounded_policy([0.25] * 3 + [0.6] + [0.25] * 4)
+    gradients = torch.ones(2, len(policy.parameters.values))
+    ascents = torch.zeros_like(gradients)
+    ascents[:, -8:] = torch.tensor([[-1.0, 1.0, 1.0, -1.0] + [0.0] * 4, [0.0, -1.0, 1.0, -1.0] + [0.0] * 4])
+    policy.hold_bounded_std(gradients, ascents)
+    assert gradients[:, -8:].tolist() == [[0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]] * 2
+    assert bool((gradients[:, :-8] == 1.0).all())
 
 
 @pytest.mark.parametrize("space", SPACES)

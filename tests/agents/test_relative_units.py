@@ -54,3 +54,10 @@ def test_a_cost_can_bind_if_it_has_a_limit_and_has_occurred() -> None:
     assert found.in_reward_per_cost(np.array([3.0, 5.0])).tolist() == [6.0, 0.0, 20.0]
     without_limit = constraints_of(np.array([math.inf, 5.0, 9.0]), np.array([-math.inf, -5.0, -2.0]))
     assert without_limit.index.tolist() == [2]
+
+
+def test_before_any_reward_costs_count_in_their_own_spread() -> None:
+    found = RelativeUnits(3).of(ADVANTAGES * np.array([0.0, 1.0, 1.0, 1.0]))
+    assert found.rewards.tolist() == [0.0, 0.0]
+    assert found.costs.tolist() == [[1.0, 0.0, -1.0], [-1.0, 0.0, 1.0]]
+    assert found.exchange_rates.tolist() == [0.0, 0.0, 0.0]

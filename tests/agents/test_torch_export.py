@@ -15,7 +15,7 @@ from recrl.agents.torch_export import PolicyModule
 from recrl.environments.cmdp import ObservationComponent
 
 PARTS = (ObservationComponent("speed", 2), ObservationComponent("walls", 3, lidar_range=3.0))
-SPACES = (Discrete(4), Box(-1.0, 1.0, (2,), np.float32))
+SPACES = (Discrete(4), Box(np.array([-1.0, 10.0], np.float32), np.array([1.0, 20.0], np.float32)))
 INITIALISER = INITIALISERS["orthogonal"]
 
 
@@ -41,11 +41,14 @@ def test_a_module_computes_what_the_agent_does(space: Any, own: bool, normalise:
     module = PolicyModule(encoder, policy)
     rows = observations()
     inputs = torch.as_tensor(rows)
-    expected = policy.outputs(encoder(rows))
+    expected, log_std = policy.outputs(encoder(rows)), np.empty(0)
+    if isinstance(space, Box):
+        expected = [0.0, 15.0] + np.array([1.0, 5.0]) * expected
+        log_std = policy.log_std.numpy() + np.log([1.0, 5.0])
     np.testing.assert_allclose(module(inputs).detach().numpy(), expected, rtol=1e-5, atol=1e-6)
     exported = torch.export.export(module, (inputs,), dynamic_shapes=({0: torch.export.Dim("batch")},))
     few = exported.module()(inputs[:3]).detach().numpy()
     np.testing.assert_allclose(few, expected[:3], rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(module.log_std, policy.log_std if isinstance(space, Box) else [])
+    np.testing.assert_allclose(module.log_std, log_std, rtol=1e-6)
     policy.parameters.values.zero_()  # it is a copy
     np.testing.assert_allclose(module(inputs).detach().numpy(), expected, rtol=1e-5, atol=1e-6)

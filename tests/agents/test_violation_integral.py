@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.experience import Constraints
 from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, solve_dual
@@ -64,16 +65,35 @@ def test_a_limit_of_0_that_is_kept_forgets_old_violations() -> None:
     after(integral, 2.0)
     assert integral.values.tolist() == [1.0]
     for expected in (0.5, 0.25):
-        assert after(integral, 0.0) == [expected]
+        assert after(integral, 0.0, limit=0.0) == [expected]
+    assert after(integral, 1e-9, limit=0.0) == pytest.approx(
+        [0.125]
+    )  # a life table's estimate only approaches 0
 
 
 @pytest.mark.parametrize("mixed", [-2.0, -0.2, 0.0])
-def test_a_constraint_is_beyond_reach_if_no_step_of_the_trust_region_meets_it(mixed: float) -> None:
+def test_a_constraint_is_unmet_if_no_step_of_the_trust_region_meets_it(mixed: float) -> None:
     # A step of length sqrt(2 * 0.5) = 1 along b, of length 2, decreases the cost by at most 2.
     for violation, expected in [(-5.0, False), (0.0, False), (1.9, False), (2.1, True)]:
         problem = StepProblem(1.0, np.array([mixed]), np.array([[4.0]]), np.array([violation]), 0.5)
-        assert problem.beyond_reach().tolist() == [expected]
-        assert (solve_dual(problem).case is StepCase.RECOVERY) == expected
+        solution = solve_dual(problem)
+        assert problem.unmet(solution).tolist() == [expected]
+        assert (solution.case is StepCase.RECOVERY) == expected
+
+
+def test_constraints_that_hinder_one_another_are_unmet_though_each_alone_could_be_met() -> None:
+    gram = np.array([[1.0, -0.9], [-0.9, 1.0]])
+    problem = StepProblem(1.0, np.zeros(2), gram, np.full(2, 0.1), 0.01)  # reach alone: sqrt(0.02) = 0.14
+    solution = solve_dual(problem)
+    assert problem.after(solution) == pytest.approx([0.0684, 0.0684], abs=1e-3)
+    assert problem.unmet(solution).tolist() == [True, True]
+
+
+def test_a_projected_step_that_was_scaled_back_leaves_its_constraint_unmet() -> None:
+    problem = StepProblem(1.0, np.array([-0.9]), np.eye(1), np.array([0.13]), 0.01)
+    solution = projected_step(problem)
+    assert problem.after(solution) == pytest.approx([0.00222], abs=1e-5)  # alone, 0.13 is within reach
+    assert problem.unmet(solution).tolist() == [True]
 
 
 @pytest.mark.parametrize(("gain", "settled"), [(0.0, 0.6), (0.1, 0.0)])
@@ -94,7 +114,7 @@ def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_rea
         )
         solution = solve_dual(problem)
         assert solution.case is StepCase.CONSTRAINED
-        integral.note_step(BOTH[:1], problem.beyond_reach())
+        integral.note_step(BOTH[:1], problem.unmet(solution))
         predicted = problem.after(solution) - problem.violations
         cost += 0.3 + 0.5 * float(predicted[0])
     assert cost - limit == pytest.approx(settled, abs=1e-6)
