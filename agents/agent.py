@@ -70,7 +70,10 @@ class Policy(Protocol):
     """A policy that can collect experience: the only part of an agent that a collector needs."""
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
-        """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        """Sample actions for B observations [B, n]: int64 [B], or float32 [B, m].
+
+        Continuous ones are in half ranges from the middle of the task's range.
+        """
         ...
 
 
@@ -115,7 +118,7 @@ class FinalPolicy(Policy, Protocol):
     """A policy that is evaluated: stochastic as it was trained, or by its mode."""
 
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
-        """Return the policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
+        """Return the policy's mode for B observations [B, n], as ``act`` does."""
         ...
 
 

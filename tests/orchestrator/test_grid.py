@@ -190,6 +190,26 @@ def test_exclusions_leave_out_what_matches_everything_in_them() -> None:
     ]
 
 
+def test_a_curriculum_of_mean_costs_does_not_go_with_limits_on_a_cvar() -> None:
+    worst = SMALL.replace("[ppo-lag]", "[cpo, {name: ppo-lag, options: {constraint: cvar}}]")
+    (problem,) = _problems(worst)
+    assert problem == (
+        "grid.yaml:3: agents.1: constraint: cvar does not suit the train_limits of two-state, which are "
+        "measured as mean costs; give them as numbers"
+    )
+    given_limits = worst.replace("deploy_limits: 2", "deploy_limits: 2, train_limits: 6")
+    assert len(_grid(given_limits).trials()) == 8
+    dynamic = given_limits.replace("linear", "dynamic")
+    (problem,) = _problems(dynamic)
+    assert problem.startswith("grid.yaml:3: agents.1: constraint: cvar does not suit the method dynamic, ")
+    assert len(_grid(dynamic + "exclude: [{agent: ppo-lag, method: dynamic}]\n").trials()) == 6
+
+
+def test_cooling_cannot_relax_limits_of_0() -> None:
+    (problem,) = _problems(SMALL.replace("linear", "cooling").replace("limits: 2", "limits: 0"))
+    assert problem.startswith("grid.yaml:4: methods.1: cooling relaxes a limit in proportion to it, ")
+
+
 def test_limits_are_the_tasks_own_or_the_grids() -> None:
     grid = _grid(
         """\
