@@ -13,7 +13,7 @@ import numpy as np
 from recrl.agents.algorithms.own_options import PPOConfig
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import scaled_advantages
+from recrl.agents.learning.advantages import standardised_rewards
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, with_entropy
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
@@ -29,7 +29,7 @@ class ProximalPolicyOptimisation(FirstOrderRule[PPOConfig]):
     ) -> dict[str, float]:
         """Ascend the reward's surrogate."""
         config = self._config
-        rewards, _ = scaled_advantages(experience.advantages)
+        rewards = standardised_rewards(experience.advantages)
 
         def objective(part: Experience) -> Objective:
             signed = SignedAdvantages.split(part.batch, rewards)

@@ -18,7 +18,7 @@ from recrl.agents.algorithms.own_options import TRPOConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import scaled_advantages
+from recrl.agents.learning.advantages import standardised_rewards
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.shared_options import TrustRegionConfig
@@ -99,7 +99,7 @@ class TrustRegionPolicyOptimisation:
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
         """Take one step on the reward's surrogate."""
-        rewards, _ = scaled_advantages(experience.advantages)
+        rewards = standardised_rewards(experience.advantages)
         metrics = trust_region_step(policy, experience, rewards, self._config, generator)
         return {**metrics, **indexed("multiplier", np.zeros_like(experience.constraints.limits))}
 

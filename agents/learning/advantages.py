@@ -97,20 +97,10 @@ def each_by_its_spread(advantages: Floats) -> tuple[Floats, Floats]:
     return centred / spreads, spreads
 
 
-def scaled_advantages(advantages: Floats) -> tuple[Floats, Floats]:
-    """Centre all advantages and divide them by the standard deviation of the reward's.
-
-    The common divisor preserves the trade-off between reward and costs of the CMDP.
-
-    Args:
-        advantages: raw, [N, 1 + k].
-
-    Returns:
-        Of the reward, [N], and of the costs, [N, k].
-    """
-    centred = advantages - advantages.mean(axis=0)
-    scaled = centred / reward_spread(centred)
-    return scaled[:, 0], scaled[:, 1:]
+def standardised_rewards(advantages: Floats) -> Floats:
+    """Centre the reward's advantages and divide them by their standard deviation, [N, 1 + k] -> [N]."""
+    centred: Floats = advantages[:, 0] - advantages[:, 0].mean()
+    return centred / reward_spread(advantages)
 
 
 def penalised_advantages(rewards: Floats, costs: Floats, multipliers: Floats) -> Floats:

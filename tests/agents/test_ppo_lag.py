@@ -11,7 +11,7 @@ from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import SURROGATE_OBJECTIVES, PPOLagrangian
 from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.advantages import scaled_advantages
+from recrl.agents.learning.advantages import standardised_rewards
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
@@ -75,15 +75,12 @@ def test_no_limit_is_no_penalty(rule: str) -> None:
     assert metrics["multiplier_0"] == 0.0
 
 
-def test_rewards_are_standardised_and_costs_divided_by_the_same_number() -> None:
-    raw = np.array([[1.0, 4.0], [5.0, 10.0]])
-    rewards, costs = scaled_advantages(raw)
-    assert (rewards.tolist(), costs.tolist()) == ([-1.0, 1.0], [[-1.5], [1.5]])
+def test_rewards_are_standardised() -> None:
+    assert standardised_rewards(np.array([[1.0, 4.0], [5.0, 10.0]])).tolist() == [-1.0, 1.0]
 
 
 def test_equal_rewards_are_no_division_by_zero() -> None:
-    rewards, _ = scaled_advantages(np.array([[1.0, 0.0], [1.0, 1.0]]))
-    assert rewards.tolist() == [0.0, 0.0]
+    assert standardised_rewards(np.array([[1.0, 0.0], [1.0, 1.0]])).tolist() == [0.0, 0.0]
 
 
 def test_a_policy_that_has_not_moved_has_ratio_one() -> None:
@@ -105,7 +102,7 @@ def test_the_policy_climbs_the_penalised_advantages() -> None:
 
 def test_both_penalties_are_one_objective_before_anything_is_clipped() -> None:
     _, _, batch = fresh()
-    rewards, costs = scaled_advantages(ADVANTAGES)
+    rewards, costs = standardised_rewards(ADVANTAGES), ADVANTAGES[:, 1:]
     ratios = 1.0 + 0.1 * torch.arange(len(batch.actions)) / 10.0
     combined, separate = (
         float(SURROGATE_OBJECTIVES[penalty](batch, rewards, costs, np.array([2.0]), 0.2)(ratios))
