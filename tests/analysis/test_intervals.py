@@ -1,6 +1,7 @@
 """Estimators over few seeds: literals by hand, laws, other implementations' numbers, and coverage."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,13 +16,13 @@ from recrl.analysis.statistics.intervals import (
     interquartile_mean,
     mean_and_standard_error,
     mean_interval,
-    mean_of_tasks,
     paired_difference,
     performance_profile,
     probability_of_improvement,
     stratified_bootstrap,
     wilson_interval,
 )
+from tests.benchmarks.interval_statistics import mean_of_tasks
 
 # Two tables of scores, [5, 3] and [7, 3], and what rliable 1.2.0 says of them (arch 7.2.0).
 SCORES = np.array(
