@@ -288,7 +288,8 @@ def missing(sweep: Sweep) -> list[str]:
     if few and few != [1]:  # one seed: the answers say so
         sentences.append(
             f"{' or '.join(map(str, few))} seeds: bootstrap intervals are too short below {ENOUGH_RUNS} "
-            f"seeds (marked {table_formats.TOO_FEW}); Student's and Wilson's hold"
+            f"seeds (marked {table_formats.TOO_FEW}); Student's hold for normal data, Wilson's cover within "
+            "about 3 points of 95%"
         )
     return sentences
 

@@ -204,6 +204,16 @@ def test_bootstrap_covers_as_often_as_the_docstring_says(
     assert covered / repeats == pytest.approx(expected, abs=0.03)  # three standard errors
 
 
+def test_the_page_shows_every_simulated_share() -> None:
+    root = Path(__file__).parents[2]
+    simulated = (root / "results" / "statistics" / "intervals.txt").read_text().splitlines()
+    rows = [line.rsplit(maxsplit=3) for line in simulated if line.startswith("share of")]
+    page = (root / "docs" / "explanation" / "statistics.md").read_text()
+    assert len(rows) == 3
+    for name, *shares in rows:
+        assert f"| {name} | {' | '.join(share.removeprefix('0') for share in shares)} |" in page
+
+
 def test_student_covers_what_it_promises_at_five_runs() -> None:
     numbers = generator()
     covered = 0
