@@ -80,7 +80,9 @@ EVENT_COLUMNS = ("update", "end_step", "event")
 ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the data frames that it receives
 
 # The agents' metrics in figures and tables; MLflow and the export file have no others.
-DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
+DRAWN_METRICS = re.compile(
+    r"(multiplier|cost_advantage_max)_\d+|explained_variance_(reward|cost_\d+)|kl|case"
+)
 
 logger = logging.getLogger("recrl.sweep_data")
 
@@ -298,6 +300,8 @@ def drawn_columns(columns: Iterable[str]) -> list[str]:
 
     >>> drawn_columns(["update", "time", "collect_seconds", "cost_0", "limit_0", "entropy", "kl"])
     ['update', 'cost_0', 'limit_0', 'kl']
+    >>> drawn_columns(["explained_variance_reward", "explained_variance_cost_0", "value_loss_reward"])
+    ['explained_variance_reward', 'explained_variance_cost_0']
     """
     kept = {*KEY, *UPDATE_COLUMNS} - {"time", "collect_seconds", "update_seconds"}
     return [

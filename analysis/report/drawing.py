@@ -5,7 +5,8 @@
     return-against-cost         final policies, the infeasible region, and the frontier J*(d) (PDF and PNG)
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
-    diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence of each curriculum (PDF and PNG)
+    diagnostics_<task>_<agent>  limit, cost, multiplier, explained variance of the critics and KL divergence
+                                of each curriculum (PDF and PNG)
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
     bounds_<agent>              cumulative cost of training against Proposition 1 (PDF and PNG)
     performance-profiles        fraction of final policies that are feasible and return more (PDF and PNG)
@@ -68,7 +69,7 @@ CAPTIONS = {
     "on). Costs in the shaded region are above the limit",
     "bounds": "Cumulative cost of training against its bounds",
     "curricula": "Cost limits in force",
-    "diagnostics": "Limit, cost, multiplier and KL divergence",
+    "diagnostics": "Limit, cost, multiplier, explained variance of the critics, and KL divergence",
     "policies": "Final policies and their visits",
     "performance-profiles": "Fraction of final policies that are feasible and return more than the value "
     "below; an infeasible one counts as the worst",
