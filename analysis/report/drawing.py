@@ -30,11 +30,13 @@ is seeded here.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -43,6 +45,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.labels import GROUP, ordered
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import attempts, doubts
@@ -76,8 +79,32 @@ CAPTIONS = {
 }
 
 
-SKETCHED = re.compile(r"return-against-cost|learning-curves_.*|curricula")
+SKETCHED = ("return-against-cost", "learning-curves", "curricula")
 UNFINISHED = "A sketch: the other figures come at the end of the launch, or by recrl-sweep figures"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure that can be drawn.
+
+    Attributes:
+        kind: the key of its caption in CAPTIONS.
+        make: draws it; returns None without data.
+        about: the labels that the figure is about, which its caption begins with; may be empty.
+    """
+
+    kind: str
+    make: Callable[[], Figure | None]
+    about: tuple[str, ...] = ()
+
+    def __call__(self) -> Figure | None:
+        """Draw the figure; None without data."""
+        return self.make()
+
+    @property
+    def caption(self) -> str:
+        """The caption: the labels as in the grid, and what the figure shows."""
+        return f"{', '.join(self.about)}: {CAPTIONS[self.kind]}" if self.about else CAPTIONS[self.kind]
 
 
 class NothingToDrawError(RecrlError):
@@ -101,11 +128,12 @@ def draw(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[
             written.
     """
     drawn, mistakes = [], _Mistakes()
-    for stem, make in drawings(sweep, averaging=averaging).items():
+    figures = drawings(sweep, averaging=averaging)
+    for stem, drawing in figures.items():
         with mistakes.kept(stem):
-            if (figure := make()) is not None:
+            if (figure := drawing()) is not None:
                 drawn += styles.save(figure, folder, stem)
-    written = _with_pages(_noted(sweep, mistakes.notes), folder, drawn)
+    written = _with_pages(_noted(sweep, mistakes.notes), folder, drawn, figures)
     mistakes.raise_first()
     return written
 
@@ -119,11 +147,12 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> lis
         averaging: of the learning curves.
     """
     drawn, mistakes = [], _Mistakes()
-    for stem, make in drawings(sweep, averaging=averaging).items():
+    figures = drawings(sweep, averaging=averaging)
+    for stem, drawing in figures.items():
         with mistakes.kept(stem):
-            if SKETCHED.fullmatch(stem) and (figure := make()) is not None:
+            if drawing.kind in SKETCHED and (figure := drawing()) is not None:
                 drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
-    written = _with_pages(_noted(sweep, [*mistakes.notes, UNFINISHED]), folder, drawn)
+    written = _with_pages(_noted(sweep, [*mistakes.notes, UNFINISHED]), folder, drawn, figures)
     mistakes.raise_first()
     return written
 
@@ -156,12 +185,12 @@ def _noted(sweep: Sweep, notes: list[str]) -> Sweep:
     return dataclasses.replace(sweep, notes=(*sweep.notes, *notes))
 
 
-def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
+def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path], figures: Mapping[str, Drawing]) -> list[Path]:
     """Write the tables and the two reports with the figures; return all files, the reports first."""
     written, tables = write_tables(sweep, folder)
     reports = [
-        table_formats.write_text(_html(sweep, drawn, tables), folder / "report.html"),
-        table_formats.write_text(_markdown(sweep, drawn, tables), folder / "report.md"),
+        table_formats.write_text(_html(sweep, drawn, figures, tables), folder / "report.html"),
+        table_formats.write_text(_markdown(sweep, drawn, figures, tables), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
 
@@ -176,7 +205,7 @@ def _full_sizes(drawn: list[Path]) -> dict[Path, str]:
     }
 
 
-def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
+def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
     """Return the report as text: answers, verdicts, warnings, figures, tables, provenance."""
     judged = tables.verdicts
     lines = [f"# {table_formats.markdown_text(sweep.name)}", ""]
@@ -190,7 +219,8 @@ def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     lines += ["", "## Trials and warnings", "", _count(sweep), "", *_list(missing(sweep))]
     lines += ["", "## Figures", ""]
     for path in _full_sizes(drawn):
-        lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
+        caption = table_formats.markdown_text(figures[path.stem].caption)
+        lines += [f"![{path.stem}]({path.name})", "", f"{caption}.", ""]
     for it in tables.shown:
         lines += [f"## {it.heading}", "", table_formats.markdown(it.table), ""]
         lines += [it.note, ""] if it.note else []
@@ -208,8 +238,8 @@ def _marked(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(verdict=texts)
 
 
-def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Callable[[], Figure | None]]:
-    """Return the figures of a sweep by file stem, as functions; a function returns None without data.
+def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Drawing]:
+    """Return the figures of a sweep by file stem; each is drawn when it is called.
 
     Args:
         sweep: its frames.
@@ -225,26 +255,29 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Calla
         )
     agents = ordered(list(sweep.updates["agent"]), list(sweep.trials["agent"].cat.categories))
     cells = sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist()
-    made: dict[str, Callable[[], Figure | None]] = {
-        "return-against-cost": partial(return_against_cost, sweep)
-    }
+    made: dict[str, Drawing] = {}
+
+    def add(drawing: Drawing, *labels: str) -> None:
+        made[_free_stem("_".join((drawing.kind, *map(_safe, labels))), made)] = drawing
+
+    add(Drawing("return-against-cost", partial(return_against_cost, sweep)))
     without_episodes = _without_episodes(sweep)
     for agent in (it for it in agents if it not in without_episodes):
-        made[f"learning-curves_{_safe(agent)}"] = partial(
-            learning_curves.learning_curves, sweep, agent, averaging=averaging
-        )
-    made["curricula"] = partial(learning_curves.curricula, sweep)
+        curves = partial(learning_curves.learning_curves, sweep, agent, averaging=averaging)
+        add(Drawing("learning-curves", curves, (agent,)), agent)
+    add(Drawing("curricula", partial(learning_curves.curricula, sweep)))
     for task, agent in cells:
-        made[f"diagnostics_{_safe(task)}_{_safe(agent)}"] = partial(
-            curriculum_diagnostics, sweep, task, agent
-        )
+        diagnosed = partial(curriculum_diagnostics, sweep, task, agent)
+        add(Drawing("diagnostics", diagnosed, (task, agent)), task, agent)
     for agent in agents:
-        made[f"policies_{_safe(agent)}"] = partial(policy_maps, sweep, agent)
+        add(Drawing("policies", partial(policy_maps, sweep, agent), (agent,)), agent)
     for agent in agents:
         for i in range(sweep.num_costs):
-            which = f"_cost-{i}" if i else ""  # the number of the CSV files
-            made[f"bounds_{_safe(agent)}{which}"] = partial(cumulative_bounds, sweep, agent, cost=i)
-    made["performance-profiles"] = partial(performance_profiles, sweep, Measure.STOCHASTIC)
+            suffix = cost_suffix(sweep, i)
+            about = (agent, f"cost{suffix}") if suffix else (agent,)
+            labels = (agent, f"cost-{i}") if i else (agent,)  # the number of the CSV files
+            add(Drawing("bounds", partial(cumulative_bounds, sweep, agent, cost=i), about), *labels)
+    add(Drawing("performance-profiles", partial(performance_profiles, sweep, Measure.STOCHASTIC)))
     return made
 
 
@@ -256,6 +289,19 @@ def curve_averages() -> dict[str, CurveAverage]:
 def _safe(label: str) -> str:
     """Return a label as part of a file's name."""
     return re.sub(r"[^A-Za-z0-9.+-]+", "-", label)
+
+
+def _free_stem(stem: str, taken: Collection[str]) -> str:
+    """Return the stem, with a counter if another figure has it, as two labels may differ only in other signs.
+
+    Upper and lower case count as equal, because some file systems do not tell them apart.
+
+    >>> _free_stem("bounds_-0.1", ["bounds_-0.1", "Bounds_-0.1-2"]), _free_stem("curricula", [])
+    ('bounds_-0.1-3', 'curricula')
+    """
+    known = {it.casefold() for it in taken}
+    numbered = (f"{stem}-{count}" for count in itertools.count(2))
+    return next(it for it in itertools.chain([stem], numbered) if it.casefold() not in known)
 
 
 def _without_episodes(sweep: Sweep) -> list[str]:
@@ -302,18 +348,18 @@ def _count(sweep: Sweep) -> str:
     return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
-def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
+def _html(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
     """Return the page: answers, verdicts, warnings and the first figures; the rest is folded."""
     failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
     sentences = [_count(sweep), *missing(sweep)]
-    figures = _full_sizes(drawn)
-    first = {path: file for path, file in figures.items() if SKETCHED.fullmatch(path.stem)}
-    further = {path: file for path, file in figures.items() if path not in first}
+    files = _full_sizes(drawn)
+    first = {path: file for path, file in files.items() if figures[path.stem].kind in SKETCHED}
+    further = {path: file for path, file in files.items() if path not in first}
     settings = html_page.verbatim(sweep.grid) + html_page.verbatim(_settings(sweep))
     sections = [
         Section("Trials and warnings", html_page.items(sentences, kind="failed" if failed else "plain")),
-        Section("Figures", _figures(first)),
-        *([Section("More figures", _figures(further), folded=True)] if further else []),
+        Section("Figures", _figures(first, figures)),
+        *([Section("More figures", _figures(further, figures), folded=True)] if further else []),
         *(
             Section(it.heading, html_page.table(it.table, it.note, it.kinds), folded=True)
             for it in tables.shown
@@ -331,9 +377,9 @@ def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     )
 
 
-def _figures(figures: Mapping[Path, str]) -> str:
+def _figures(files: Mapping[Path, str], figures: Mapping[str, Drawing]) -> str:
     """Figures with their captions, as HTML."""
-    return "\n".join(html_page.figure(path, _caption(path), file) for path, file in figures.items())
+    return "\n".join(html_page.figure(path, figures[path.stem].caption, file) for path, file in files.items())
 
 
 def _made(sweep: Sweep) -> str:
@@ -371,11 +417,6 @@ def _settings(sweep: Sweep) -> str:
         if kind in ("task", "agent", "method")
     }
     return "\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)
-
-
-def _caption(path: Path) -> str:
-    kind, _, of = path.stem.partition("_")
-    return f"{of.replace('_', ', ')}: {CAPTIONS[kind]}" if of else CAPTIONS[kind]
 
 
 def _provenance(sweep: Sweep) -> list[str]:

@@ -102,6 +102,27 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     assert text.count("another seed may give another verdict") == 1  # the answers say so, the warnings do not
 
 
+def test_labels_that_differ_only_in_other_signs_have_figures_of_their_own(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=1, tasks=["a_1", "a 1"], agents=["β=0.1", "λ=0.1"], methods=["none"], updates=10
+    )
+    figures = drawing.drawings(sweep_data.load(store))
+    captions = {stem: it.caption.split(":")[0] for stem, it in figures.items() if it.kind == "diagnostics"}
+    assert captions == {
+        "diagnostics_a-1_-0.1": "a 1, β=0.1",
+        "diagnostics_a-1_-0.1-2": "a 1, λ=0.1",
+        "diagnostics_a-1_-0.1-3": "a_1, β=0.1",
+        "diagnostics_a-1_-0.1-4": "a_1, λ=0.1",
+    }
+    names = [path.name for path in drawing.sketch(sweep_data.load(store), tmp_path)]
+    assert {"learning-curves_-0.1.png", "learning-curves_-0.1-2.png"} <= set(names)
+    text = (tmp_path / "report.md").read_text()
+    assert "\nβ=0.1: Return and cost while training" in text
+    assert "\nλ=0.1: Return and cost while training" in text
+
+
 def test_tables_of_outcomes_say_their_tolerance(finished: Sweep, tmp_path: Path) -> None:
     notes = {it.heading: it.note for it in table_files.write_tables(finished, tmp_path)[1].shown}
     tolerance = "no mean cost exceeds its limit by more than 1% or, where it is sampled, one standard error"
