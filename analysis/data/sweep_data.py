@@ -11,7 +11,8 @@ that a task lacks are NaN. All returns and costs are undiscounted sums over an e
                  calls interrupted is running), error, task_name, agent_name, method_name, num_costs,
                  train_steps, boundary_step (the first step under d_d: B rounded up to a policy update),
                  total_steps (rounded up likewise), steps_per_update, env_steps (taken so far),
-                 cpu_seconds, train_limit_i, deploy_limit_i, start_limit_i (measured d_t, or NaN),
+                 cpu_seconds, train_limit_i, deploy_limit_i, start_limit_i (the d_t with which the
+                 curriculum started, measured or as given; infinite if it has none, NaN if it does not say),
                  optimal_return (J*(d_d), or NaN if unknown)
     phases       one row per trial and phase with at least one episode, summed over its episodes:
                  KEY, phase, episodes, steps, episode_return and cost_i (means), episode_return_std and
@@ -97,7 +98,7 @@ class TrialFacts:
         error: one line with the reason of a failure, or empty.
         env_steps: environment steps taken so far.
         cpu_seconds: CPU time so far.
-        start_limits: the d_t that its curriculum measured, [k], or None.
+        start_limits: the d_t with which its curriculum started, measured or as given, [k], or None.
         provenance: versions, commit, machine and digests of the code of each attempt, as in its file; empty
             if unknown.
     """

@@ -115,10 +115,13 @@ def _allowed(limit: float, *, exact: bool) -> str:
 
 
 def _training_limits(trials: pd.DataFrame, i: int) -> str:
-    """Say which d_t the curricula of a task began with, and whether they measured it; empty if none has."""
+    """Say which finite d_t the curricula of a task began with, and whether they measured it; may be empty.
+
+    ``start_limit`` is there for a given d_t, too, so only ``train_limit`` says which one was measured.
+    """
     trials = trials[trials["method_name"] != BASELINE]  # without a curriculum the limit is d_d throughout
-    measured = trials[f"start_limit_{i}"].dropna()
-    given = trials.loc[trials[f"start_limit_{i}"].isna(), f"train_limit_{i}"]
+    given, start = trials[f"train_limit_{i}"], trials[f"start_limit_{i}"]
+    measured = start[np.isinf(given) & np.isfinite(start)]
     given = given[np.isfinite(given)]
     parts = [(measured, "measured at the start of training"), (given, "from the grid")]
     return ", and ".join(f"{_range(values)}, {how}" for values, how in parts if len(values))

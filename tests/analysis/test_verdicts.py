@@ -1,5 +1,6 @@
 """A report's first lines: verdicts, counted and in words."""
 
+import dataclasses
 import math
 from html import unescape
 
@@ -161,6 +162,33 @@ def test_each_task_says_what_its_limits_mean(finished: Sweep) -> None:
         "river-a: A camp and a mine, one cost, closed-form optimum: for testing learners. Limit: 5 per "
         "episode, allowed 5.05 (1%, exact). Training limit d_t: 100.0, from the grid."
     )
+
+
+@pytest.mark.parametrize(
+    ("train_limits", "start_limits", "said"),
+    [
+        ([60.0, 60.0], [60.0, 60.0], " Training limit d_t: 60.00, from the grid."),
+        (
+            [math.inf, math.inf],
+            [61.52, math.inf],
+            " Training limit d_t: 61.52, measured at the start of training.",
+        ),
+        (
+            [math.inf, 60.0],
+            [61.52, 60.0],
+            " Training limit d_t: 61.52, measured at the start of training, and 60.00, from the grid.",
+        ),
+        ([math.inf, math.inf], [math.inf, math.nan], ""),
+    ],
+)
+def test_only_a_measured_training_limit_is_said_to_be_measured(
+    finished: Sweep, train_limits: list[float], start_limits: list[float], said: str
+) -> None:
+    chosen = (finished.trials["task"] == "river-a") & (finished.trials["method"] == "linear")
+    trials = finished.trials[chosen].head(2).assign(train_limit_0=train_limits, start_limit_0=start_limits)
+    table = judged([outcome("linear", 0, 9.5, 5.0, task="river-a")])
+    (sentence,) = verdict_texts.task_sentences(dataclasses.replace(finished, trials=trials), table)
+    assert sentence.endswith(f"allowed 5.05 (1%, exact).{said}")
 
 
 def test_violators_are_marked_by_text_and_colour() -> None:
