@@ -67,7 +67,8 @@ from recrl.orchestrator.spec import TrialState
 RELOAD_SECONDS = 120  # of the page of a sweep that runs
 CAPTIONS = {
     "return-against-cost": "Final policies: return against cost. Left of the limit is feasible, the shaded "
-    "region is not; filled marks are feasible within the tolerance, hollow ones are not",
+    "region is not; filled marks are feasible within the tolerance, hollow ones are not; a failed trial has "
+    "no mark",
     "learning-curves": "Return and cost while training, and magnified in the deployment phase (learning goes "
     "on). Costs in the shaded region are above the limit",
     "bounds": "Cumulative cost of training against its bounds",
@@ -75,7 +76,7 @@ CAPTIONS = {
     "diagnostics": "Limit, cost, multiplier, explained variance of the critics, and KL divergence",
     "policies": "Final policies and their visits",
     "performance-profiles": "Fraction of final policies that are feasible and return more than the value "
-    "below; an infeasible one counts as the worst",
+    "below; an infeasible one and a failed trial count as the worst",
 }
 
 
@@ -215,7 +216,7 @@ def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], t
         lines += _list(verdict_texts.task_sentences(sweep, judged))
         lines += _list(verdict_texts.explanation(judged))
     else:
-        lines.append(verdict_texts.NO_VERDICT)
+        lines.append(verdict_texts.no_verdict(sweep))
     lines += ["", "## Trials and warnings", "", _count(sweep), "", *_list(missing(sweep))]
     lines += ["", "## Figures", ""]
     for path in _full_sizes(drawn):
@@ -233,8 +234,9 @@ def _list(sentences: Sequence[str]) -> list[str]:
 
 
 def _marked(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the verdict table with violations in bold."""
-    texts = [f"**{text}**" if verdict_texts.INFEASIBLE in text else text for text in table["verdict"]]
+    """Return the verdict table with violations and failures in bold."""
+    bad = (verdict_texts.INFEASIBLE, verdict_texts.FAILED)
+    texts = [f"**{text}**" if any(word in text for word in bad) else text for text in table["verdict"]]
     return table.assign(verdict=texts)
 
 
@@ -397,7 +399,7 @@ def _made(sweep: Sweep) -> str:
 def _opening(sweep: Sweep, judged: pd.DataFrame) -> str:
     """Return the answers and the verdict table."""
     if not len(judged):
-        return html_page.items([verdict_texts.NO_VERDICT], kind="answers")
+        return html_page.items([verdict_texts.no_verdict(sweep)], kind="answers")
     return "\n".join(
         [
             html_page.items(verdict_texts.answers(judged), kind="answers"),

@@ -10,7 +10,7 @@ import pytest
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report import drawing, table_files
+from recrl.analysis.report import drawing, table_files, verdict_texts
 from recrl.analysis.report.drawing import NothingToDrawError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.faults.committing import commit_file
@@ -53,7 +53,11 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "outcomes.tex",
     ]
     text = written[1].read_text().splitlines()
-    assert text[2] == "- river-a: none of 2 final policies (1 agent x 1 curriculum x 2 seeds) solves it."
+    assert text[2] == (
+        "- river-a: none of 4 trials (1 agent x 2 curricula x 2 seeds) solves it so far; 1 failed; the sweep "
+        "is incomplete: 1 trial has no result yet."
+    )
+    assert any("| linear | **failed 1 of 2; no result yet 1 of 2** | " in line for line in text)
     assert text[6].startswith("| river-a | my cpo | none | feasible | ")
     assert "4 trials: 1 running, 2 complete, 1 failed." in text
     assert text.index("## Trials and warnings") < text.index("## Figures") < text.index("## Provenance")
@@ -134,6 +138,21 @@ def test_outcomes_alone_are_those_of_the_tables(finished: Sweep, tmp_path: Path)
     (alone,) = table_files.write_outcomes(finished, tmp_path / "alone")
     table_files.write_tables(finished, tmp_path)
     assert alone.read_bytes() == (tmp_path / "outcomes.csv").read_bytes()
+
+
+def test_trials_without_an_evaluation_are_not_said_to_be_incomplete(finished: Sweep, tmp_path: Path) -> None:
+    unevaluated = dataclasses.replace(finished, evaluations=finished.evaluations.iloc[:0])
+    _, tables = table_files.write_tables(unevaluated, tmp_path)
+    assert not len(tables.verdicts)
+    assert verdict_texts.no_verdict(unevaluated) == (
+        "No final policy was evaluated: set run.evaluation_episodes."
+    )
+    for status, sentence in (
+        ("failed", "No trial is complete: no verdict. All 36 failed."),
+        ("running", "No trial is complete yet: no verdict."),
+    ):
+        trials = finished.trials.assign(status=status)
+        assert verdict_texts.no_verdict(dataclasses.replace(finished, trials=trials)) == sentence
 
 
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
