@@ -11,7 +11,8 @@ that a task lacks are NaN. All returns and costs are undiscounted sums over an e
                  calls interrupted is running), error, task_name, agent_name, method_name, num_costs,
                  train_steps, boundary_step (the first step under d_d: B rounded up to a policy update),
                  total_steps (rounded up likewise), steps_per_update, env_steps (taken so far),
-                 cpu_seconds, train_limit_i, deploy_limit_i, start_limit_i (measured d_t, or NaN),
+                 cpu_seconds, train_limit_i, deploy_limit_i, start_limit_i (the d_t with which the
+                 curriculum started, measured or as given; infinite if it has none, NaN if it does not say),
                  optimal_return (J*(d_d), or NaN if unknown)
     phases       one row per trial and phase with at least one episode, summed over its episodes:
                  KEY, phase, episodes, steps, episode_return and cost_i (means), episode_return_std and
@@ -80,7 +81,9 @@ EVENT_COLUMNS = ("update", "end_step", "event")
 ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the data frames that it receives
 
 # The agents' metrics in figures and tables; MLflow and the export file have no others.
-DRAWN_METRICS = re.compile(r"(multiplier|cost_advantage_max)_\d+|kl|case")
+DRAWN_METRICS = re.compile(
+    r"(multiplier|cost_advantage_max)_\d+|explained_variance_(reward|cost_\d+)|kl|case"
+)
 
 logger = logging.getLogger("recrl.sweep_data")
 
@@ -95,7 +98,7 @@ class TrialFacts:
         error: one line with the reason of a failure, or empty.
         env_steps: environment steps taken so far.
         cpu_seconds: CPU time so far.
-        start_limits: the d_t that its curriculum measured, [k], or None.
+        start_limits: the d_t with which its curriculum started, measured or as given, [k], or None.
         provenance: versions, commit, machine and digests of the code of each attempt, as in its file; empty
             if unknown.
     """
@@ -298,6 +301,8 @@ def drawn_columns(columns: Iterable[str]) -> list[str]:
 
     >>> drawn_columns(["update", "time", "collect_seconds", "cost_0", "limit_0", "entropy", "kl"])
     ['update', 'cost_0', 'limit_0', 'kl']
+    >>> drawn_columns(["explained_variance_reward", "explained_variance_cost_0", "value_loss_reward"])
+    ['explained_variance_reward', 'explained_variance_cost_0']
     """
     kept = {*KEY, *UPDATE_COLUMNS} - {"time", "collect_seconds", "update_seconds"}
     return [

@@ -1,4 +1,4 @@
-"""Diagnostics of a curriculum: limit, cost, multiplier and step size over training, for each method.
+"""Diagnostics of a curriculum: limit, cost, multiplier, critics and step size over training, for each method.
 
 One figure per task and agent, one column per method. From top to bottom: the agent's own cost and the limit
 in force; the mean multipliers, if the agent has them; the explained variance of the reward and cost critics;
@@ -42,7 +42,7 @@ LEAST_EXPLAINED = -0.5  # critics may be arbitrarily wrong; smaller values are c
 
 
 def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0) -> Figure:
-    """Draw limit, cost, multiplier, KL divergence and events of every method.
+    """Draw limit, cost, multiplier, explained variances, KL divergence and events of every method.
 
     Args:
         sweep: with at least one update of this task and agent.
@@ -54,7 +54,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
         Lines are means over seeds, bands one standard error.
     """
     trials, updates, events = (
-        _of(frame, task, agent) for frame in (sweep.trials, sweep.updates, sweep.events)
+        panels.rows_of(frame, task, agent) for frame in (sweep.trials, sweep.updates, sweep.events)
     )
     boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
     count = int(total // trials["steps_per_update"].min())
@@ -179,7 +179,3 @@ def _is_noise(events: pd.DataFrame, method: str) -> pd.Series[bool]:
 
 def _known(updates: pd.DataFrame, quantity: str) -> bool:
     return quantity in updates and bool(np.isfinite(updates[quantity]).any())
-
-
-def _of(frame: pd.DataFrame, task: str, agent: str) -> pd.DataFrame:
-    return frame[(frame["task"] == task) & (frame["agent"] == agent)]

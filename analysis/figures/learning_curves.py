@@ -100,7 +100,7 @@ def curricula(sweep: Sweep) -> Figure:
         grid = figure.subplots(len(cells), len(agents), squeeze=False, sharey="row")
         for row, (task, i) in zip(grid, cells, strict=True):
             for axes, agent in zip(row, agents, strict=True):
-                trials, rows = _of(sweep.trials, task, agent), _of(updates, task, agent)
+                trials, rows = (panels.rows_of(frame, task, agent) for frame in (sweep.trials, updates))
                 if len(rows):
                     _curriculum_panel(axes, trials, rows, look, i)
                     axes.set_title(panels.panel_title(trials, rows), loc="left", pad=3.0)
@@ -240,7 +240,3 @@ def _column_titles(suffixes: Sequence[str]) -> list[str]:
         name = f"episode cost{suffix}"
         titles += [name, f"{name.removeprefix('episode ')} in deployment"]
     return titles
-
-
-def _of(frame: pd.DataFrame, task: str, agent: str) -> pd.DataFrame:
-    return frame[(frame["task"] == task) & (frame["agent"] == agent)]

@@ -150,6 +150,17 @@ def short_steps(steps: float) -> str:
     return f"{steps / 1e3:.4g}k" if abs(steps) >= 1e3 else f"{steps:g}"
 
 
+def rows_of(frame: pd.DataFrame, task: str, agent: str) -> pd.DataFrame:
+    """Return the rows of one task and agent.
+
+    Args:
+        frame: one of a sweep's data frames.
+        task: its label.
+        agent: the agent's label.
+    """
+    return frame[(frame["task"] == task) & (frame["agent"] == agent)]
+
+
 def panel_title(trials: pd.DataFrame, updates: pd.DataFrame, *, separator: str = ": ") -> str:
     """Return task, number of seeds (a range if methods differ) and steps."""
     seeds = updates.groupby("method", observed=True)["seed"]

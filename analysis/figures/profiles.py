@@ -1,9 +1,9 @@
 """Performance profiles: for every return, the fraction of runs that are feasible and return more.
 
-An infeasible run counts as worse than any return, so lines may start below 1; they never rise. The profile
-shows the whole distribution over runs: with five seeds, a failed run is a step of a fifth. From Agarwal et
-al. 2021, figure 4. There is one panel per task and agent, so that returns of different tasks need not be
-normalised.
+An infeasible run counts as worse than any return, and so does a failed trial. So lines may start below 1;
+they never rise. The profile shows the whole distribution over runs: with five seeds, one run is a step of a
+fifth. From Agarwal et al. 2021, figure 4. There is one panel per task and agent, so that returns of different
+tasks need not be normalised.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from recrl.analysis.statistics.intervals import performance_profile
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
+from recrl.orchestrator.spec import TrialState
 
 THRESHOLDS = 400
 
@@ -30,7 +31,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     """Draw one row per task, one column per agent, one line per curriculum.
 
     Args:
-        sweep: its complete trials are drawn.
+        sweep: its complete and failed trials are drawn.
         measure: the outcome.
 
     Returns:
@@ -40,6 +41,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     rows = rows[rows["measure"] == measure.value]
     if not len(rows):
         return None
+    failed = sweep.trials[sweep.trials["status"] == TrialState.FAILED.value]
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     tasks, agents = occurring(rows["task"]), occurring(rows["agent"])
     with styles.context():
@@ -50,9 +52,12 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
             thresholds = _thresholds(chosen)
             for axes, agent in zip(line, agents, strict=True):
                 for method, style in look.items():
-                    runs = chosen[(chosen["agent"] == agent) & (chosen["method"] == method)]
-                    if len(runs):
-                        shares = performance_profile(feasible_scores(runs), thresholds)
+                    runs, lost = (
+                        frame[frame["method"] == method]
+                        for frame in (panels.rows_of(it, task, agent) for it in (rows, failed))
+                    )
+                    if len(runs) + len(lost):
+                        shares = performance_profile(feasible_scores(runs, failed=len(lost)), thresholds)
                         axes.plot(thresholds, shares, **style.line, zorder=3.0 + bool(style.dashes))
                 for optimum in sorted(set(chosen["optimal_return"].dropna())):
                     axes.axvline(optimum, color=OPTIMUM_COLOUR, linewidth=0.7, zorder=1.0)
@@ -61,7 +66,8 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
             line[0].set_ylabel("fraction of runs")
         for axes in grid[-1]:
             axes.set_xlabel("return")
-        present = [method for method in look if (rows["method"] == method).any()]
+        ended = {*rows["method"], *failed["method"]}
+        present = [method for method in look if method in ended]
         panels.legend_above(
             figure,
             [Line2D([], [], **look[method].line, label=method) for method in present],
@@ -72,14 +78,15 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     return figure
 
 
-def feasible_scores(rows: pd.DataFrame) -> Floats:
-    """Return the returns of runs, minus infinity for an infeasible run, [n, 1].
+def feasible_scores(rows: pd.DataFrame, *, failed: int = 0) -> Floats:
+    """Return the returns of runs, minus infinity for an infeasible run and for each failed trial, [n, 1].
 
     Args:
         rows: of ``metrics.outcomes``.
+        failed: number of failed trials, which have no outcome.
     """
     scores = rows["episode_return"].where(rows["feasible"], -np.inf)
-    return scores.to_numpy(np.float64)[:, None]
+    return np.append(scores.to_numpy(np.float64), np.full(failed, -np.inf))[:, None]
 
 
 def _thresholds(rows: pd.DataFrame) -> Floats:

@@ -5,7 +5,8 @@
     return-against-cost         final policies, the infeasible region, and the frontier J*(d) (PDF and PNG)
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
-    diagnostics_<task>_<agent>  limit, cost, multiplier and KL divergence of each curriculum (PDF and PNG)
+    diagnostics_<task>_<agent>  limit, cost, multiplier, explained variance of the critics and KL divergence
+                                of each curriculum (PDF and PNG)
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
     bounds_<agent>              cumulative cost of training against Proposition 1 (PDF and PNG)
     performance-profiles        fraction of final policies that are feasible and return more (PDF and PNG)
@@ -29,11 +30,13 @@ is seeded here.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -42,6 +45,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.labels import GROUP, ordered
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import attempts, doubts
@@ -63,20 +67,45 @@ from recrl.orchestrator.spec import TrialState
 RELOAD_SECONDS = 120  # of the page of a sweep that runs
 CAPTIONS = {
     "return-against-cost": "Final policies: return against cost. Left of the limit is feasible, the shaded "
-    "region is not; filled marks are feasible within the tolerance, hollow ones are not",
+    "region is not; filled marks are feasible within the tolerance, hollow ones are not; a failed trial has "
+    "no mark",
     "learning-curves": "Return and cost while training, and magnified in the deployment phase (learning goes "
     "on). Costs in the shaded region are above the limit",
     "bounds": "Cumulative cost of training against its bounds",
     "curricula": "Cost limits in force",
-    "diagnostics": "Limit, cost, multiplier and KL divergence",
+    "diagnostics": "Limit, cost, multiplier, explained variance of the critics, and KL divergence",
     "policies": "Final policies and their visits",
     "performance-profiles": "Fraction of final policies that are feasible and return more than the value "
-    "below; an infeasible one counts as the worst",
+    "below; an infeasible one and a failed trial count as the worst",
 }
 
 
-SKETCHED = re.compile(r"return-against-cost|learning-curves_.*|curricula")
+SKETCHED = ("return-against-cost", "learning-curves", "curricula")
 UNFINISHED = "A sketch: the other figures come at the end of the launch, or by recrl-sweep figures"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure that can be drawn.
+
+    Attributes:
+        kind: the key of its caption in CAPTIONS.
+        make: draws it; returns None without data.
+        about: the labels that the figure is about, which its caption begins with; may be empty.
+    """
+
+    kind: str
+    make: Callable[[], Figure | None]
+    about: tuple[str, ...] = ()
+
+    def __call__(self) -> Figure | None:
+        """Draw the figure; None without data."""
+        return self.make()
+
+    @property
+    def caption(self) -> str:
+        """The caption: the labels as in the grid, and what the figure shows."""
+        return f"{', '.join(self.about)}: {CAPTIONS[self.kind]}" if self.about else CAPTIONS[self.kind]
 
 
 class NothingToDrawError(RecrlError):
@@ -100,11 +129,12 @@ def draw(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[
             written.
     """
     drawn, mistakes = [], _Mistakes()
-    for stem, make in drawings(sweep, averaging=averaging).items():
+    figures = drawings(sweep, averaging=averaging)
+    for stem, drawing in figures.items():
         with mistakes.kept(stem):
-            if (figure := make()) is not None:
+            if (figure := drawing()) is not None:
                 drawn += styles.save(figure, folder, stem)
-    written = _with_pages(_noted(sweep, mistakes.notes), folder, drawn)
+    written = _with_pages(_noted(sweep, mistakes.notes), folder, drawn, figures)
     mistakes.raise_first()
     return written
 
@@ -118,11 +148,12 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> lis
         averaging: of the learning curves.
     """
     drawn, mistakes = [], _Mistakes()
-    for stem, make in drawings(sweep, averaging=averaging).items():
+    figures = drawings(sweep, averaging=averaging)
+    for stem, drawing in figures.items():
         with mistakes.kept(stem):
-            if SKETCHED.fullmatch(stem) and (figure := make()) is not None:
+            if drawing.kind in SKETCHED and (figure := drawing()) is not None:
                 drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
-    written = _with_pages(_noted(sweep, [*mistakes.notes, UNFINISHED]), folder, drawn)
+    written = _with_pages(_noted(sweep, [*mistakes.notes, UNFINISHED]), folder, drawn, figures)
     mistakes.raise_first()
     return written
 
@@ -155,12 +186,12 @@ def _noted(sweep: Sweep, notes: list[str]) -> Sweep:
     return dataclasses.replace(sweep, notes=(*sweep.notes, *notes))
 
 
-def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path]) -> list[Path]:
+def _with_pages(sweep: Sweep, folder: Path, drawn: list[Path], figures: Mapping[str, Drawing]) -> list[Path]:
     """Write the tables and the two reports with the figures; return all files, the reports first."""
     written, tables = write_tables(sweep, folder)
     reports = [
-        table_formats.write_text(_html(sweep, drawn, tables), folder / "report.html"),
-        table_formats.write_text(_markdown(sweep, drawn, tables), folder / "report.md"),
+        table_formats.write_text(_html(sweep, drawn, figures, tables), folder / "report.html"),
+        table_formats.write_text(_markdown(sweep, drawn, figures, tables), folder / "report.md"),
     ]
     return [*reports, *drawn, *written]
 
@@ -175,7 +206,7 @@ def _full_sizes(drawn: list[Path]) -> dict[Path, str]:
     }
 
 
-def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
+def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
     """Return the report as text: answers, verdicts, warnings, figures, tables, provenance."""
     judged = tables.verdicts
     lines = [f"# {table_formats.markdown_text(sweep.name)}", ""]
@@ -185,11 +216,12 @@ def _markdown(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
         lines += _list(verdict_texts.task_sentences(sweep, judged))
         lines += _list(verdict_texts.explanation(judged))
     else:
-        lines.append(verdict_texts.NO_VERDICT)
+        lines.append(verdict_texts.no_verdict(sweep))
     lines += ["", "## Trials and warnings", "", _count(sweep), "", *_list(missing(sweep))]
     lines += ["", "## Figures", ""]
     for path in _full_sizes(drawn):
-        lines += [f"![{path.stem}]({path.name})", "", f"{_caption(path)}.", ""]
+        caption = table_formats.markdown_text(figures[path.stem].caption)
+        lines += [f"![{path.stem}]({path.name})", "", f"{caption}.", ""]
     for it in tables.shown:
         lines += [f"## {it.heading}", "", table_formats.markdown(it.table), ""]
         lines += [it.note, ""] if it.note else []
@@ -202,13 +234,14 @@ def _list(sentences: Sequence[str]) -> list[str]:
 
 
 def _marked(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the verdict table with violations in bold."""
-    texts = [f"**{text}**" if verdict_texts.INFEASIBLE in text else text for text in table["verdict"]]
+    """Return the verdict table with violations and failures in bold."""
+    bad = (verdict_texts.INFEASIBLE, verdict_texts.FAILED)
+    texts = [f"**{text}**" if any(word in text for word in bad) else text for text in table["verdict"]]
     return table.assign(verdict=texts)
 
 
-def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Callable[[], Figure | None]]:
-    """Return the figures of a sweep by file stem, as functions; a function returns None without data.
+def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Drawing]:
+    """Return the figures of a sweep by file stem; each is drawn when it is called.
 
     Args:
         sweep: its frames.
@@ -224,26 +257,29 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Calla
         )
     agents = ordered(list(sweep.updates["agent"]), list(sweep.trials["agent"].cat.categories))
     cells = sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist()
-    made: dict[str, Callable[[], Figure | None]] = {
-        "return-against-cost": partial(return_against_cost, sweep)
-    }
+    made: dict[str, Drawing] = {}
+
+    def add(drawing: Drawing, *labels: str) -> None:
+        made[_free_stem("_".join((drawing.kind, *map(_safe, labels))), made)] = drawing
+
+    add(Drawing("return-against-cost", partial(return_against_cost, sweep)))
     without_episodes = _without_episodes(sweep)
     for agent in (it for it in agents if it not in without_episodes):
-        made[f"learning-curves_{_safe(agent)}"] = partial(
-            learning_curves.learning_curves, sweep, agent, averaging=averaging
-        )
-    made["curricula"] = partial(learning_curves.curricula, sweep)
+        curves = partial(learning_curves.learning_curves, sweep, agent, averaging=averaging)
+        add(Drawing("learning-curves", curves, (agent,)), agent)
+    add(Drawing("curricula", partial(learning_curves.curricula, sweep)))
     for task, agent in cells:
-        made[f"diagnostics_{_safe(task)}_{_safe(agent)}"] = partial(
-            curriculum_diagnostics, sweep, task, agent
-        )
+        diagnosed = partial(curriculum_diagnostics, sweep, task, agent)
+        add(Drawing("diagnostics", diagnosed, (task, agent)), task, agent)
     for agent in agents:
-        made[f"policies_{_safe(agent)}"] = partial(policy_maps, sweep, agent)
+        add(Drawing("policies", partial(policy_maps, sweep, agent), (agent,)), agent)
     for agent in agents:
         for i in range(sweep.num_costs):
-            which = f"_cost-{i}" if i else ""  # the number of the CSV files
-            made[f"bounds_{_safe(agent)}{which}"] = partial(cumulative_bounds, sweep, agent, cost=i)
-    made["performance-profiles"] = partial(performance_profiles, sweep, Measure.STOCHASTIC)
+            suffix = cost_suffix(sweep, i)
+            about = (agent, f"cost{suffix}") if suffix else (agent,)
+            labels = (agent, f"cost-{i}") if i else (agent,)  # the number of the CSV files
+            add(Drawing("bounds", partial(cumulative_bounds, sweep, agent, cost=i), about), *labels)
+    add(Drawing("performance-profiles", partial(performance_profiles, sweep, Measure.STOCHASTIC)))
     return made
 
 
@@ -255,6 +291,19 @@ def curve_averages() -> dict[str, CurveAverage]:
 def _safe(label: str) -> str:
     """Return a label as part of a file's name."""
     return re.sub(r"[^A-Za-z0-9.+-]+", "-", label)
+
+
+def _free_stem(stem: str, taken: Collection[str]) -> str:
+    """Return the stem, with a counter if another figure has it, as two labels may differ only in other signs.
+
+    Upper and lower case count as equal, because some file systems do not tell them apart.
+
+    >>> _free_stem("bounds_-0.1", ["bounds_-0.1", "Bounds_-0.1-2"]), _free_stem("curricula", [])
+    ('bounds_-0.1-3', 'curricula')
+    """
+    known = {it.casefold() for it in taken}
+    numbered = (f"{stem}-{count}" for count in itertools.count(2))
+    return next(it for it in itertools.chain([stem], numbered) if it.casefold() not in known)
 
 
 def _without_episodes(sweep: Sweep) -> list[str]:
@@ -288,7 +337,8 @@ def missing(sweep: Sweep) -> list[str]:
     if few and few != [1]:  # one seed: the answers say so
         sentences.append(
             f"{' or '.join(map(str, few))} seeds: bootstrap intervals are too short below {ENOUGH_RUNS} "
-            f"seeds (marked {table_formats.TOO_FEW}); Student's and Wilson's hold"
+            f"seeds (marked {table_formats.TOO_FEW}); Student's hold for normal data, Wilson's cover within "
+            "about 3 points of 95%"
         )
     return sentences
 
@@ -300,18 +350,18 @@ def _count(sweep: Sweep) -> str:
     return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
-def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
+def _html(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
     """Return the page: answers, verdicts, warnings and the first figures; the rest is folded."""
     failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
     sentences = [_count(sweep), *missing(sweep)]
-    figures = _full_sizes(drawn)
-    first = {path: file for path, file in figures.items() if SKETCHED.fullmatch(path.stem)}
-    further = {path: file for path, file in figures.items() if path not in first}
+    files = _full_sizes(drawn)
+    first = {path: file for path, file in files.items() if figures[path.stem].kind in SKETCHED}
+    further = {path: file for path, file in files.items() if path not in first}
     settings = html_page.verbatim(sweep.grid) + html_page.verbatim(_settings(sweep))
     sections = [
         Section("Trials and warnings", html_page.items(sentences, kind="failed" if failed else "plain")),
-        Section("Figures", _figures(first)),
-        *([Section("More figures", _figures(further), folded=True)] if further else []),
+        Section("Figures", _figures(first, figures)),
+        *([Section("More figures", _figures(further, figures), folded=True)] if further else []),
         *(
             Section(it.heading, html_page.table(it.table, it.note, it.kinds), folded=True)
             for it in tables.shown
@@ -329,9 +379,9 @@ def _html(sweep: Sweep, drawn: list[Path], tables: Tables) -> str:
     )
 
 
-def _figures(figures: Mapping[Path, str]) -> str:
+def _figures(files: Mapping[Path, str], figures: Mapping[str, Drawing]) -> str:
     """Figures with their captions, as HTML."""
-    return "\n".join(html_page.figure(path, _caption(path), file) for path, file in figures.items())
+    return "\n".join(html_page.figure(path, figures[path.stem].caption, file) for path, file in files.items())
 
 
 def _made(sweep: Sweep) -> str:
@@ -349,7 +399,7 @@ def _made(sweep: Sweep) -> str:
 def _opening(sweep: Sweep, judged: pd.DataFrame) -> str:
     """Return the answers and the verdict table."""
     if not len(judged):
-        return html_page.items([verdict_texts.NO_VERDICT], kind="answers")
+        return html_page.items([verdict_texts.no_verdict(sweep)], kind="answers")
     return "\n".join(
         [
             html_page.items(verdict_texts.answers(judged), kind="answers"),
@@ -369,11 +419,6 @@ def _settings(sweep: Sweep) -> str:
         if kind in ("task", "agent", "method")
     }
     return "\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)
-
-
-def _caption(path: Path) -> str:
-    kind, _, of = path.stem.partition("_")
-    return f"{of.replace('_', ', ')}: {CAPTIONS[kind]}" if of else CAPTIONS[kind]
 
 
 def _provenance(sweep: Sweep) -> list[str]:

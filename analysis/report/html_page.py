@@ -45,7 +45,7 @@ ul.notes { padding-left: 1.2rem; }
 td.name small { display: none; color: #555; font-weight: 400; }
 tr.solved td.verdict { background: #e3f1e3; }
 tr.infeasible td { background: #fbe9e7; }
-tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
+tr.infeasible td.verdict, tr.failed td.verdict { color: #a11a0e; font-weight: 700; }
 .verdicts td.verdict { white-space: normal; min-width: 13rem; }
 .verdicts td:last-child { white-space: normal; min-width: 9rem; }
 @media screen and (max-width: 44rem) {
@@ -58,7 +58,7 @@ tr.infeasible td.verdict { color: #a11a0e; font-weight: 700; }
   .scroll::before { content: "scroll sideways →"; position: sticky; left: 0; color: #555;
                     font-size: 0.8rem; }
 }
-.failed { border-left: 4px solid #c0392b; padding-left: 0.6rem; }
+ul.failed { border-left: 4px solid #c0392b; padding-left: 0.6rem; }
 @media print {
   @page { margin: 14mm; }
   body { font-size: 10pt; max-width: none; padding: 0; }

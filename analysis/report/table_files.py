@@ -43,8 +43,15 @@ BOUNDS_NOTE = (
 COMPARED_CLAIMS_NOTE = (
     "Comparisons count the seeds that have both trials. Costs of training are those of the training phase. A "
     "difference is the mean over seeds with Student's 95% interval; beside it the fraction of the other "
-    "curriculum's mean, where that is above 0 beyond its interval. The paper's gains are at the end of the "
-    "training phase."
+    "curriculum's mean, where that is above 0 beyond its interval. Feasible pairs: seeds whose two final "
+    "policies are feasible; the others count, too. The paper's gains are at the end of the training phase."
+)
+FAILED_CLAIMS_NOTE = "In a failed trial, or a seed with one, a claim does not hold."
+FAILED_NOTE = (
+    "A failed trial counts as neither feasible nor solved; the means are over the n complete trials."
+)
+NO_GAIN = (
+    "–: a policy of a pair is infeasible, with the curriculum or with none; more return is then no gain."
 )
 
 
@@ -97,20 +104,22 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     if not len(rows):
         return written, Tables()
     generator = np.random.default_rng(BOOTSTRAP_SEED)
-    averaged = metrics.summary(rows)
+    averaged = metrics.summary(rows, sweep.trials)
     robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
     compared = metrics.comparisons(rows, generator)
-    weighed = claims.count_claims(rows, totals)
-    whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], sort=False)
-    judged = count_verdicts(rows, compared, curriculum_flags(sweep), cost_names(sweep))
+    weighed = claims.count_claims(rows, totals, sweep.trials)
+    whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], how="left", sort=False)
+    whole["too_few_seeds"] = whole["too_few_seeds"].ne(False)  # nor are there enough without a seed
+    judged = count_verdicts(rows, compared, curriculum_flags(sweep), sweep.trials, cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
     outcomes = _outcome_tables(rows, averaged, suffixes)
     latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
     shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
     if len(weighed):
         written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
-        note = COMPARED_CLAIMS_NOTE if weighed["difference"].notna().any() else ""
-        shown.append(ShownTable("What the paper says of these tasks", claims_table(weighed), note))
+        notes = [COMPARED_CLAIMS_NOTE] if weighed["difference"].notna().any() else []
+        notes += [FAILED_CLAIMS_NOTE] if weighed["failed"].any() else []
+        shown.append(ShownTable("What the paper says of these tasks", claims_table(weighed), " ".join(notes)))
     for i, costs in enumerate(bounds):
         which = f" (cost{suffixes[i]})" if suffixes[i] else ""
         if len(costs):
@@ -152,6 +161,7 @@ def _outcome_tables(
             table = table_formats.outcome_table(averaged, measure, suffixes)
             exact = bool(outcomes.loc[outcomes["measure"] == measure.value, "exact"].all())
             note = tolerance_sentence(exact=exact) + ("" if exact else f" {SAMPLED}")
+            note += f" {FAILED_NOTE}" if rows["failed"].any() else ""
             tables.append(ShownTable(_heading(measure), table, note, table_formats.row_kinds(rows)))
     return tables
 
@@ -167,7 +177,8 @@ def _comparison_tables(
             continue
         table = table_formats.comparison_table(rows, suffixes)
         marked = table["P(higher return)"].str.contains(table_formats.TOO_FEW).any()
-        note = f"{TIES} {FEW}" if marked else TIES
+        dashed = bool((rows["feasible_pairs"] < rows["pairs"]).any())
+        note = " ".join([TIES, *([FEW] if marked else []), *([NO_GAIN] if dashed else [])])
         tables.append(
             ShownTable(f"{_heading(measure)}, minus none", table, note, table_formats.row_kinds(rows))
         )

@@ -40,7 +40,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
     """Format return, costs, regret and fractions of feasible and solved seeds.
 
     The regret, J*(d_d) minus the return, is left out if a seed is infeasible, because its return may be above
-    J*(d_d).
+    J*(d_d). Failed trials are in the fractions, as neither feasible nor solved; n counts the others.
 
     Args:
         summary: of ``metrics.summary``.
@@ -49,9 +49,12 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
     """
     rows = summary[summary["measure"] == measure.value]
     costs = [name for name in map(str, rows) if f"{name}_se" in rows and name.startswith("cost_")]
+    any_failed = bool((rows["failed"] > 0).any())
     lines = []
     for _, row in rows.iterrows():
         line = names_of(row) | {"n": str(row["seeds"])}
+        if any_failed:
+            line["failed"] = str(row["failed"])
         for name in costs:
             which = _cost_suffix(suffixes, name, len(costs))
             line[f"cost{which}"] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
@@ -59,9 +62,10 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         line["optimum"] = number(row["optimal_return"])
         seeds, feasible = int(row["seeds"]), int(row["feasible_seeds"])
+        ended = seeds + int(row["failed"])
         line["regret"] = with_error(row["gap"], row["gap_se"]) if feasible == seeds else DASH
-        line["feasible"] = share_text(feasible, seeds, row["feasible_low"], row["feasible_high"])
-        found = share_text(int(row["optimal_seeds"]), seeds, row["optimal_low"], row["optimal_high"])
+        line["feasible"] = share_text(feasible, ended, row["feasible_low"], row["feasible_high"])
+        found = share_text(int(row["optimal_seeds"]), ended, row["optimal_low"], row["optimal_high"])
         line["solved"] = DASH if math.isnan(row["optimal_return"]) else found
         lines.append(line)
     return pd.DataFrame(lines)
@@ -97,7 +101,8 @@ def compared_rows(comparisons: pd.DataFrame, summary: pd.DataFrame, measure: Mea
 def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.DataFrame:
     """Format paired differences to the agent without a curriculum.
 
-    More return is no gain if every seed is infeasible: such a row has no gain, only its added cost.
+    More return is no gain if a policy of a pair is infeasible, with the curriculum or with none. Such a row
+    has no gain, only its added cost and the number of feasible pairs.
 
     Args:
         rows: of ``compared_rows``.
@@ -107,7 +112,8 @@ def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.Dat
     lines = []
     for _, row in rows.iterrows():
         line = names_of(row) | {"n": str(row["pairs"])}
-        no_gain = row["feasible_seeds"] == 0
+        no_gain = row["feasible_pairs"] < row["pairs"]
+        line["feasible pairs"] = f"{row['feasible_pairs']} of {row['pairs']}"
         line["return gained"] = DASH if no_gain else with_interval(row, "return_difference")
         for name in costs:
             title = f"cost{_cost_suffix(suffixes, name, len(costs))} added"

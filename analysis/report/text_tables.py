@@ -16,7 +16,10 @@ from recrl.orchestrator.files.trial_store import TrialStore
 
 
 def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
-    """Format the result of ``count_claims``: "mixed", "4 of 5 (38–96%)", "+1.2 (+0.3 to +2.1)", "+40%"."""
+    """Format the result of ``count_claims``: "mixed", "4 of 5 (38–96%)", "+1.2 (+0.3 to +2.1)", "+40%".
+
+    There is a column of failed trials if there are any.
+    """
     shares = zip(weighed["held"], weighed["trials"], weighed["share_low"], weighed["share_high"], strict=True)
     beside = zip(weighed["deployment_held"], weighed["deployment_trials"], strict=True)
     columns = {
@@ -32,7 +35,11 @@ def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
             f"{held} of {trials}" if trials else "" for held, trials in beside
         ],
     }
+    if (weighed["failed"] > 0).any():
+        columns["failed"] = weighed["failed"].astype(str)
     if weighed["difference"].notna().any():
+        pairs = zip(weighed["feasible_pairs"], weighed["trials"] - weighed["failed"], strict=True)
+        columns["feasible pairs"] = [f"{known} of {all_}" if pd.notna(known) else "" for known, all_ in pairs]
         columns["difference"] = [_difference_text(row) for _, row in weighed.iterrows()]
         relative = weighed["relative_difference"]
         columns["relative"] = [f"{value:+.0%}" if math.isfinite(value) else "" for value in relative]

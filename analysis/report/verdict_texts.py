@@ -14,10 +14,12 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report.table_formats import with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 from recrl.environments.registry import TASKS
+from recrl.orchestrator.spec import TrialState
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
 SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
+FAILED, PENDING, UNEVALUATED = "failed", "no result yet", "not evaluated"
 WARNINGS = {
     "no_curriculum": (
         "curriculum without effect",
@@ -31,6 +33,22 @@ WARNINGS = {
 ONE_SEED = "One seed (n = 1): no intervals, and another seed may give another verdict."
 SOME_LIMIT = "a limit"
 NO_VERDICT = "No trial is complete yet: no verdict."
+NOT_EVALUATED = "No final policy was evaluated: set run.evaluation_episodes."
+
+
+def no_verdict(sweep: Sweep) -> str:
+    """Say why there is no verdict.
+
+    Args:
+        sweep: without an evaluated final policy.
+    """
+    status = sweep.trials["status"]
+    if (status == TrialState.COMPLETE.value).any():
+        return NOT_EVALUATED
+    failed = int((status == TrialState.FAILED.value).sum())
+    if failed == len(status):
+        return f"No trial is complete: no verdict. All {failed} failed."
+    return f"{NO_VERDICT} {failed} of {len(status)} failed." if failed else NO_VERDICT
 
 
 def explanation(verdicts: pd.DataFrame) -> list[str]:
@@ -39,6 +57,12 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
+    evaluated = verdicts[verdicts["seeds"] > 0]
+    failed = (
+        "Failed: the trial has no final policy. It counts as neither solved nor feasible; the means are over "
+        "the n others."
+    )
+    pending = "No result yet: the trial waits, runs or is damaged. The verdicts may still change."
     several = bool((verdicts["seeds"] > 1).any())
     interval = ", with its 95% interval (Student's t)" if several else ""
     errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
@@ -47,9 +71,12 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         f"{measured_how(verdicts)}.",
         *errors,
         f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known.",
-        tolerance_sentence(exact=bool(verdicts["exact"].all())),
+        tolerance_sentence(exact=bool(evaluated["exact"].all())),
         "The return of an infeasible policy may be above the optimum: it is no success.",
-        f"The difference to none is a mean over equal seeds{interval}; infeasible rows have none.",
+        *([failed] if verdicts["failed"].any() else []),
+        *([pending] if verdicts["pending"].any() else []),
+        f"The difference to none is a mean over the seeds that both have{interval}. It is left out where one "
+        "of these policies is infeasible, with the curriculum or with none.",
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
         *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
     ]
@@ -61,6 +88,7 @@ def measured_how(verdicts: pd.DataFrame) -> str:
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
+    verdicts = verdicts[verdicts["seeds"] > 0]
     if verdicts["exact"].all():
         return "computed exactly from the recorded policies"
     sampled = f"means over {int(verdicts.loc[~verdicts['exact'], 'episodes'].min())} episodes"
@@ -89,7 +117,7 @@ def task_sentences(sweep: Sweep, verdicts: pd.DataFrame) -> list[str]:
     sentences = []
     for task in dict.fromkeys(verdicts["task"]):
         trials = sweep.trials[sweep.trials["task"] == task]
-        exact = bool(verdicts.loc[verdicts["task"] == task, "exact"].all())
+        exact = bool(verdicts.loc[(verdicts["task"] == task) & (verdicts["seeds"] > 0), "exact"].all())
         name = str(trials["task_name"].iloc[0])
         parts = [TASKS[name].summary] if name in TASKS else []
         for i in range(int(trials["num_costs"].max())):
@@ -115,10 +143,13 @@ def _allowed(limit: float, *, exact: bool) -> str:
 
 
 def _training_limits(trials: pd.DataFrame, i: int) -> str:
-    """Say which d_t the curricula of a task began with, and whether they measured it; empty if none has."""
+    """Say which finite d_t the curricula of a task began with, and whether they measured it; may be empty.
+
+    ``start_limit`` is there for a given d_t, too, so only ``train_limit`` says which one was measured.
+    """
     trials = trials[trials["method_name"] != BASELINE]  # without a curriculum the limit is d_d throughout
-    measured = trials[f"start_limit_{i}"].dropna()
-    given = trials.loc[trials[f"start_limit_{i}"].isna(), f"train_limit_{i}"]
+    given, start = trials[f"train_limit_{i}"], trials[f"start_limit_{i}"]
+    measured = start[np.isinf(given) & np.isfinite(start)]
     given = given[np.isfinite(given)]
     parts = [(measured, "measured at the start of training"), (given, "from the grid")]
     return ", and ".join(f"{_range(values)}, {how}" for values, how in parts if len(values))
@@ -160,8 +191,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
             line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         line["optimum"] = number(row["optimal_return"])
-        all_infeasible = row["infeasible"] == row["seeds"]  # more return is then no gain
-        line["difference to none"] = DASH if all_infeasible else with_interval(row, "return_difference")
+        line["difference to none"] = _difference_text(row)
         line["n"] = str(row["seeds"])
         earned = with_error(row["deployment_return"], row["deployment_return_se"])
         paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"], digits=3) for it in costs]
@@ -170,24 +200,41 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def _difference_text(row: pd.Series) -> str:
+    """Format the difference to none, with its n if that is not the row's; a dash where it is no gain."""
+    if pd.isna(row["pairs"]) or row["feasible_pairs"] < row["pairs"]:
+        return DASH
+    fewer = f" (n = {row['pairs']})" if row["pairs"] < row["seeds"] else ""
+    return with_interval(row, "return_difference") + fewer
+
+
 def verdict_kinds(verdicts: pd.DataFrame) -> list[str]:
-    """Return the worst verdict of each row: SOLVED, FEASIBLE or INFEASIBLE."""
+    """Return the kind of each row: INFEASIBLE or FAILED if any trial is, SOLVED if all are, else FEASIBLE."""
     return [
-        INFEASIBLE if row["infeasible"] else SOLVED if row["solved"] == row["seeds"] else FEASIBLE
+        INFEASIBLE
+        if row["infeasible"]
+        else FAILED
+        if row["failed"]
+        else SOLVED
+        if row["solved"] == row["planned"]
+        else FEASIBLE
         for _, row in verdicts.iterrows()
     ]
 
 
 def verdict_text(row: pd.Series) -> str:
-    """Format one row's verdict: counts of seeds, and the largest violation.
+    """Format one row's verdict: counts of its planned trials, and the largest violation.
 
     >>> counts = {"solved": 3, "feasible": 4, "seeds": 5, "worst_excess": 0.4, "worst_share": 0.08}
-    >>> verdict_text(pd.Series(counts | {"infeasible": 1}))
+    >>> counts |= {"infeasible": 1, "planned": 5, "failed": 0, "pending": 0}
+    >>> verdict_text(pd.Series(counts))
     'solved 3 of 5; feasible, not solved 1 of 5; infeasible 1 of 5, by up to 0.40 (8%)'
-    >>> verdict_text(pd.Series(counts | {"solved": 0, "feasible": 0, "infeasible": 1, "seeds": 1}))
+    >>> verdict_text(pd.Series(counts | {"solved": 0, "feasible": 0, "seeds": 1, "planned": 1}))
     'infeasible by 0.40 (8%)'
+    >>> verdict_text(pd.Series(counts | {"infeasible": 0, "planned": 9, "failed": 3, "pending": 1}))
+    'solved 3 of 9; feasible, not solved 1 of 9; failed 3 of 9; no result yet 1 of 9'
     """
-    seeds = int(row["seeds"])
+    planned = int(row["planned"])
     share = "" if math.isnan(row["worst_share"]) else f" ({row['worst_share']:.0%})"
     excess = f"{number(row['worst_excess'])}{share}"
     cost = row.get("worst_cost", "")
@@ -196,15 +243,27 @@ def verdict_text(row: pd.Series) -> str:
         SOLVED: int(row["solved"]),
         FEASIBLE: int(row["feasible"] - row["solved"]),
         INFEASIBLE: int(row["infeasible"]),
+        FAILED: int(row["failed"]),
+        PENDING: int(row["pending"]),
+        UNEVALUATED: _unevaluated(row),
     }
-    if counts[INFEASIBLE] == seeds:
+    if counts[INFEASIBLE] == planned:
         head = f"infeasible: {cost}" if cost else "infeasible"
-        return f"{head} by {'' if row['seeds'] == 1 else 'up to '}{excess}"
-    if seeds in (counts[SOLVED], counts[FEASIBLE]):
-        return SOLVED if counts[SOLVED] else FEASIBLE
+        return f"{head} by {'' if planned == 1 else 'up to '}{excess}"
+    if planned in counts.values():
+        return next(kind for kind, count in counts.items() if count)
     names = {FEASIBLE: "feasible, not solved" if counts[SOLVED] else FEASIBLE}
-    texts = [f"{names.get(kind, kind)} {count} of {seeds}" for kind, count in counts.items() if count]
-    return "; ".join(texts) + (f", {f'{cost} ' * bool(cost)}by up to {excess}" if counts[INFEASIBLE] else "")
+    ends = {INFEASIBLE: f", {f'{cost} ' * bool(cost)}by up to {excess}"}
+    return "; ".join(
+        f"{names.get(kind, kind)} {count} of {planned}{ends.get(kind, '')}"
+        for kind, count in counts.items()
+        if count
+    )
+
+
+def _unevaluated(row: pd.Series) -> int:
+    """Return how many trials are complete without an evaluation of their final policy."""
+    return int(row["planned"] - row["seeds"] - row["failed"] - row["pending"])
 
 
 def _label(verdicts: pd.DataFrame, i: str) -> str:
@@ -247,55 +306,94 @@ def _answer(task: str, rows: pd.DataFrame) -> str:
         if math.isnan(optimum)
         else (SOLVED, "solves it", "solve it")
     )
-    total, good = int(rows["seeds"].sum()), int(rows[column].sum())
-    policies = f"{total} final policies{_product(rows)}"
-    if good == total:
+    counts = rows[["planned", "seeds", "failed", "pending", column]].sum().astype(int)
+    planned, good = counts["planned"], counts[column]
+    if not counts["seeds"]:
+        return f"{task}: no verdict; {'; '.join(_without_policy(counts))}."
+    what = "final policies" if counts["seeds"] == planned else "trials"  # a failed trial has no policy
+    policies = f"{planned} {what}{_product(rows)}"
+    if good == planned:
         return f"{task}: all {policies} {many}."
     head = f"none of {policies} {one}" if not good else f"{good} of {policies} {many}"
-    parts = [head + (_best(rows, column) if good else ""), *_violations(rows, column)]
-    return f"{task}: {'; '.join(parts)}."
+    head += " so far" if counts["pending"] else ""
+    parts = [head + (_best(rows, column) if good else "")]
+    return f"{task}: {'; '.join([*parts, *_without_policy(counts), *_violations(rows, column)])}."
+
+
+def _without_policy(counts: pd.Series) -> list[str]:
+    """Say how many trials of a task have no evaluated final policy, and why.
+
+    >>> numbers = {"planned": 10, "seeds": 5, "failed": 3, "pending": 1}
+    >>> _without_policy(pd.Series(numbers))[:2]
+    ['3 failed', 'the sweep is incomplete: 1 trial has no result yet']
+    >>> _without_policy(pd.Series(numbers | {"seeds": 0, "failed": 10, "pending": 0}))
+    ['all 10 trials failed']
+    """
+    failed, pending, unevaluated = int(counts["failed"]), int(counts["pending"]), _unevaluated(counts)
+    parts = []
+    if failed:
+        parts.append(f"all {failed} trials failed" if failed == counts["planned"] else f"{failed} failed")
+    if pending:
+        have = "trial has" if pending == 1 else "trials have"
+        parts.append(f"the sweep is incomplete: {pending} {have} no result yet")
+    if unevaluated:
+        were = "final policy was" if unevaluated == 1 else "final policies were"
+        parts.append(f"{unevaluated} {were} not evaluated: set run.evaluation_episodes")
+    return parts
 
 
 def _product(rows: pd.DataFrame) -> str:
-    """Say what the final policies of a task are: one per agent, curriculum and seed.
+    """Say what the trials of a task are: one per agent, curriculum and seed.
 
-    >>> labels = {"agent": ["cpo", "cpo"], "method": ["none", "step"]}
-    >>> _product(pd.DataFrame(labels | {"seeds": [3, 3]})), _product(pd.DataFrame(labels | {"seeds": [3, 2]}))
+    >>> rows = pd.DataFrame({"agent": ["cpo", "cpo"], "method": ["none", "step"], "planned": [3, 3]})
+    >>> _product(rows), _product(rows.assign(planned=[3, 2]))
     (' (1 agent x 2 curricula x 3 seeds)', '')
     """
-    agents, methods, seeds = rows["agent"].nunique(), rows["method"].nunique(), int(rows["seeds"].max())
-    if agents * methods * seeds != rows["seeds"].sum():  # the sweep is not complete
+    agents, methods, seeds = rows["agent"].nunique(), rows["method"].nunique(), int(rows["planned"].max())
+    if agents * methods * seeds != rows["planned"].sum():  # not every combination is in the grid
         return ""
     numbers = ((agents, "agent", "agents"), (methods, "curriculum", "curricula"), (seeds, "seed", "seeds"))
     return f" ({' x '.join(f'{count} {one if count == 1 else many}' for count, one, many in numbers)})"
 
 
 def _best(rows: pd.DataFrame, column: str) -> str:
-    """Describe the best curricula, and ``none``."""
-    counts = rows.groupby("method", sort=False)[[column, "seeds"]].sum()
-    shares = counts[column] / counts["seeds"]
+    """Describe the best curricula, and ``none``, by their shares of the trials that have ended."""
+    counts = _by_method(rows)
+    counts = counts[counts["ended"] > 0]
+    shares = counts[column] / counts["ended"]
     best = [str(method) for method in counts.index[shares == shares.max()]]
     if len(best) == len(counts):
         return ""
     each = " each" if len(best) > 1 else ""
-    text = f", most often with {_listed(best)} ({_share(counts, best[0], column)}{each})"
+    if len({_share(counts, method, column) for method in best}) > 1:  # equal shares of unequal numbers
+        text = f", most often with {_listed([f'{it} ({_share(counts, it, column)})' for it in best])}"
+    else:
+        text = f", most often with {_listed(best)} ({_share(counts, best[0], column)}{each})"
     if BASELINE in counts.index and BASELINE not in best:
         text += f", against {_share(counts, BASELINE, column)} with {BASELINE}"
     return text
 
 
+def _by_method(rows: pd.DataFrame) -> pd.DataFrame:
+    """Sum the counts of a task's rows by curriculum; ``ended`` are the trials that are not pending."""
+    names = [SOLVED, FEASIBLE, INFEASIBLE, "seeds", "planned", "failed", "pending"]
+    counts = rows.groupby("method", sort=False)[names].sum()
+    return counts.assign(ended=counts["planned"] - counts["pending"])
+
+
 def _share(counts: pd.DataFrame, method: str, column: str) -> str:
-    return f"{int(counts[column][method])} of {int(counts['seeds'][method])}"
+    return f"{int(counts[column][method])} of {int(counts['ended'][method])}"
 
 
 def _violations(rows: pd.DataFrame, column: str) -> list[str]:
     """Name the curricula of which every policy is infeasible, then each one of which only some are."""
-    counts = rows.groupby("method", sort=False)[[column, "infeasible", "seeds"]].sum()
-    always = [str(method) for method in counts.index[counts["infeasible"] == counts["seeds"]]]
-    sometimes = counts[(counts["infeasible"] > 0) & (counts["infeasible"] < counts["seeds"])]
+    counts = _by_method(rows)
+    violating = counts["infeasible"] > 0
+    always = [str(method) for method in counts.index[violating & (counts["infeasible"] == counts["seeds"])]]
+    sometimes = counts[violating & (counts["infeasible"] < counts["seeds"])]
     parts, limit = [], _limit_text(rows)
     if always:
-        chosen = rows[rows["method"].isin(always)]
+        chosen = rows[rows["method"].isin(always) & (rows["infeasible"] > 0)]
         who = "every curriculum" if len(always) == len(counts) > 1 else _listed(always)
         total = int(chosen["seeds"].sum())
         verb = "exceed" if len(always) > 1 and who != "every curriculum" else "exceeds"
@@ -305,7 +403,7 @@ def _violations(rows: pd.DataFrame, column: str) -> list[str]:
     for method, count in sometimes.iterrows():
         chosen = rows[(rows["method"] == method) & (rows["infeasible"] > 0)]
         done = "solves" if column == SOLVED else "is feasible in"
-        bad, total = int(count["infeasible"]), int(count["seeds"])
+        bad, total = int(count["infeasible"]), int(count["ended"])
         others = "the other exceeds" if total == 2 and count[column] else f"{bad} exceed{'s' * (bad == 1)}"
         parts.append(
             f"{method} {done} {int(count[column])} of {total}, {others} {limit} by {_excess(chosen)}"

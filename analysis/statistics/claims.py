@@ -10,7 +10,8 @@ counted are which static curriculum is the best in how many tasks, and that the 
 ``dynamic`` and ``linear`` are comparable.
 
 The fraction of trials or seeds has Wilson's interval. Beside it is the count for the deployment phase, in
-which learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``.
+which learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``. A failed
+trial has no final policy: a claim does not hold in it, nor in a seed of which one of the two trials failed.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from recrl.analysis.statistics.intervals import (
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdicts import ROUNDING, solved, within_limits
 from recrl.environments.cmdp import Floats
+from recrl.orchestrator.spec import TrialState
 
 STATIC = ("linear", "cosine", "exponential")
 CURRICULA = (*STATIC, "dynamic")
@@ -139,19 +141,22 @@ CLAIMS = (
 )
 
 
-def count_claims(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
+def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     """Count the trials or seeds in which each claim holds, one row per claim and agent.
 
     Args:
         rows: of ``metrics.outcomes``.
         training: of ``metrics.training_totals``; costs of training are compared if there is one cost.
+        trials: of the sweep, complete or not.
 
     Returns:
-        section, claim, agent, trials (of a comparison: seeds with both trials), held, share, share_low,
-        share_high (95%); deployment_trials and deployment_held, the same for the deployment phase. Of a
-        comparison also difference, the mean over seeds, with Student's interval; relative_difference, where
-        the other curriculum's mean is above 0 beyond its interval; and the paper's range. No row without such
-        trials.
+        section, claim, agent, trials (complete and failed ones; of a comparison: seeds with both trials, or
+        with a failed one), failed (trials, or seeds with one), held, share, share_low, share_high (95%);
+        deployment_trials and deployment_held, the same for the deployment phase. Of a comparison also
+        difference, the mean over the seeds with both trials, with Student's interval; relative_difference,
+        where the other curriculum's mean is above 0 beyond its interval; and the paper's range. Of a
+        comparison of returns feasible_pairs, the seeds whose final policies are both feasible; the others
+        count, too. No row without such trials.
     """
     final, deployed = (
         rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
@@ -159,19 +164,25 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame) -> pd.DataFrame:
     costs = training.assign(**{TRAINING_COST: training["cost_0_total"] / training["episodes"]})
     if "cost_1_total" in training:
         costs = costs.iloc[:0]
+    failed = trials[trials["status"] == TrialState.FAILED.value]
     lines = []
     for claim in CLAIMS:
         of_training = isinstance(claim, Comparison) and claim.quantity == TRAINING_COST
-        chosen, beside = _about(costs if of_training else final, claim), _about(deployed, claim)
-        for agent, own in chosen.groupby("agent", observed=True, sort=False):
-            same = beside[beside["agent"] == agent]
+        chosen, beside, gone = (
+            _about(frame, claim) for frame in (costs if of_training else final, deployed, failed)
+        )
+        for agent in dict.fromkeys([*chosen["agent"], *gone["agent"]]):
+            own, same, lost = (frame[frame["agent"] == agent] for frame in (chosen, beside, gone))
             counted = (
-                _compared(own, same, claim) if isinstance(claim, Comparison) else _held(own, same, claim)
+                _compared(own, same, lost, claim)
+                if isinstance(claim, Comparison)
+                else _held(own, same, lost, claim)
             )
             if counted["trials"]:
                 named = {"section": claim.section, "claim": claim.text, "agent": str(agent)}
                 lines.append(named | counted)
-    return pd.DataFrame(lines)
+    table = pd.DataFrame(lines)
+    return table.astype({"feasible_pairs": "Int64"}) if lines else table
 
 
 def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
@@ -180,37 +191,47 @@ def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
     return rows[(rows["task"] == claim.task) & agents & rows["method"].isin(methods)]
 
 
-def _held(final: pd.DataFrame, deployed: pd.DataFrame, claim: Claim) -> dict[str, Any]:
+def _held(final: pd.DataFrame, deployed: pd.DataFrame, failed: pd.DataFrame, claim: Claim) -> dict[str, Any]:
     nothing = _ends(Interval(math.nan, math.nan, math.nan, 0, True))
-    counted = _counted(claim.holds(final), claim.holds(deployed))
-    return {**counted, **nothing, "relative_difference": math.nan, "paper": ""}
+    counted = _counted(claim.holds(final), claim.holds(deployed), failed=len(failed))
+    return {**counted, **nothing, "relative_difference": math.nan, "paper": "", "feasible_pairs": None}
 
 
-def _compared(final: pd.DataFrame, deployed: pd.DataFrame, claim: Comparison) -> dict[str, Any]:
+def _compared(
+    final: pd.DataFrame, deployed: pd.DataFrame, failed: pd.DataFrame, claim: Comparison
+) -> dict[str, Any]:
     differences, base = _differences(final, claim)
+    feasible_pairs = None
     if claim.quantity == TRAINING_COST:
         deployed = deployed.iloc[:0]
+    else:
+        infeasible = final.loc[~within_limits(final), "seed"]
+        feasible_pairs = int((~differences.index.isin(infeasible)).sum())
+    without_pair = set(failed["seed"]) - set(differences.index)
     beside = _differences(deployed.assign(**{claim.quantity: deployed[RETURN]}), claim)[0]
     interval, ground = mean_interval(_numbers(differences)), mean_interval(_numbers(base))
     relative = interval.estimate / ground.estimate if ground.low > 0.0 else math.nan
     return {
-        **_counted(differences > ROUNDING, beside > ROUNDING),
+        **_counted(differences > ROUNDING, beside > ROUNDING, failed=len(without_pair)),
         **_ends(interval),
         "relative_difference": relative,
         "paper": claim.paper,
+        "feasible_pairs": feasible_pairs,
     }
 
 
-def _counted(held: pd.Series[bool], deployed: pd.Series[bool]) -> dict[str, Any]:
-    count = int(held.sum())
-    share = wilson_interval(count, len(held))
+def _counted(held: pd.Series[bool], deployed: pd.Series[bool], *, failed: int) -> dict[str, Any]:
+    """Count where a claim holds; a failed trial or seed is one where it does not."""
+    count, trials = int(held.sum()), len(held) + failed
+    share = wilson_interval(count, trials)
     return {
-        "trials": len(held),
+        "trials": trials,
+        "failed": failed,
         "held": count,
         "share": share.estimate,
         "share_low": share.low,
         "share_high": share.high,
-        "deployment_trials": len(deployed),
+        "deployment_trials": len(deployed) + failed if len(deployed) else 0,
         "deployment_held": int(deployed.sum()),
     }
 

@@ -111,11 +111,6 @@ def interquartile_mean(scores: Floats) -> Floats:
     return np.asarray(np.mean(flat[..., cut : flat.shape[-1] - cut], axis=-1))
 
 
-def mean_of_tasks(scores: Floats) -> Floats:
-    """Return the mean over runs and tasks, [..., n, m] -> [...]."""
-    return np.asarray(np.mean(scores, axis=(-2, -1)))
-
-
 def performance_profile(scores: Floats, thresholds: Floats) -> Floats:
     """Return the fraction of runs above each threshold, averaged over tasks: F(tau) = mean 1[x > tau].
 

@@ -97,46 +97,68 @@ def training_totals(sweep: Sweep) -> pd.DataFrame:
     return rows
 
 
-def summary(rows: pd.DataFrame) -> pd.DataFrame:
+def summary(rows: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     """Average outcomes over seeds: one row per task, agent, method and measure.
+
+    A failed trial has no return and no cost, so the means are over the complete trials, feasible or not. In
+    the fractions it counts as neither feasible nor solved. Otherwise an agent that diverges on bad seeds
+    would have the higher success rate.
 
     Args:
         rows: of ``outcomes``.
+        trials: of the sweep, complete or not.
 
     Returns:
-        GROUP, measure, seeds, then mean and standard error (``_se``) of episode_return, cost_i and gap,
-        deploy_limit_i, optimal_return, feasible_seeds, feasible_share with Wilson's 95% interval
-        (feasible_low, feasible_high), and optimal_seeds with Wilson's interval of their share (optimal_low,
-        optimal_high).
+        GROUP, measure, seeds (complete trials), failed (failed trials), then mean and standard error
+        (``_se``) of episode_return, cost_i and gap, deploy_limit_i, optimal_return; feasible_seeds and their
+        share of the complete and failed trials, feasible_share, with Wilson's 95% interval (feasible_low,
+        feasible_high); optimal_seeds with Wilson's interval of their share (optimal_low, optimal_high).
+        Groups without a complete or failed trial are left out.
     """
     names = [str(name) for name in rows]
     averaged = [name for name in names if name in ("episode_return", "gap") or is_cost(name)]
     constant = [name for name in names if name.startswith("deploy_limit_") or name == "optimal_return"]
+    found = dict(iter(rows.groupby([*GROUP, "measure"], observed=True, sort=False)))
+    measures = [measure.value for measure in Measure if (rows["measure"] == measure.value).any()]
     lines = []
-    for group, chosen in rows.groupby([*GROUP, "measure"], observed=True, sort=False):
-        line: dict[str, Any] = dict(zip((*GROUP, "measure"), group, strict=True))
-        line["seeds"] = len(chosen)
-        for name in averaged:
-            line[name], line[f"{name}_se"] = mean_and_standard_error(chosen[name].to_numpy(np.float64))
-        line |= {name: chosen[name].iloc[0] for name in constant}
-        share, best = (
-            wilson_interval(int(chosen[name].sum()), len(chosen)) for name in ("feasible", "optimal")
-        )
-        line |= {
-            "feasible_seeds": int(chosen["feasible"].sum()),
-            "feasible_share": share.estimate,
-            "feasible_low": share.low,
-            "feasible_high": share.high,
-            "optimal_seeds": int(chosen["optimal"].sum()),
-            "optimal_low": best.low,
-            "optimal_high": best.high,
-        }
-        lines.append(line)
+    for group, planned in trials.groupby(list(GROUP), observed=True, sort=False):
+        failed = int((planned["status"] == TrialState.FAILED.value).sum())
+        for measure in measures:
+            chosen = found.get((*group, measure), rows.iloc[:0])
+            if not len(chosen) + failed:
+                continue
+            line: dict[str, Any] = dict(zip((*GROUP, "measure"), (*group, measure), strict=True))
+            line |= {"seeds": len(chosen), "failed": failed}
+            for name in averaged:
+                line[name], line[f"{name}_se"] = mean_and_standard_error(chosen[name].to_numpy(np.float64))
+            line |= {name: planned[name].iloc[0] for name in constant}
+            lines.append(line | _shares(chosen, len(chosen) + failed))
     return pd.DataFrame(lines)
+
+
+def _shares(chosen: pd.DataFrame, ended: int) -> dict[str, float]:
+    """Return the numbers of feasible and solved trials, with Wilson's intervals of their shares.
+
+    Args:
+        chosen: outcomes of the complete trials.
+        ended: number of complete and failed trials.
+    """
+    share, best = (wilson_interval(int(chosen[name].sum()), ended) for name in ("feasible", "optimal"))
+    return {
+        "feasible_seeds": int(chosen["feasible"].sum()),
+        "feasible_share": share.estimate,
+        "feasible_low": share.low,
+        "feasible_high": share.high,
+        "optimal_seeds": int(chosen["optimal"].sum()),
+        "optimal_low": best.low,
+        "optimal_high": best.high,
+    }
 
 
 def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.DataFrame:
     """Return interquartile means of the return with 95% bootstrap intervals: one row per GROUP and measure.
+
+    They are over all complete trials, feasible or not: an infeasible policy may return more than is allowed.
 
     Args:
         rows: of ``outcomes``.
@@ -161,7 +183,9 @@ def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.Dat
 def comparisons(
     rows: pd.DataFrame, generator: np.random.Generator, *, baseline: str = "none"
 ) -> pd.DataFrame:
-    """Compare every method with the baseline: one row per other GROUP and measure.
+    """Compare every method with the baseline: one row per other GROUP and measure with a common seed.
+
+    All pairs count, feasible or not. More return is a gain only where feasible_pairs equals pairs.
 
     Args:
         rows: of ``outcomes``.
@@ -169,11 +193,11 @@ def comparisons(
         baseline: the method for comparison.
 
     Returns:
-        GROUP, measure, pairs (seeds that both have), then mean paired differences to the baseline with
-        Student's 95% interval: return_difference, _low, _high, and the same for cost_i_difference; then
-        improvement, the probability that a run returns more than a run of the baseline (ties count half:
-        ``verdicts.tie``), with its bootstrap interval _low, _high; and too_few_seeds (that interval is
-        then too short).
+        GROUP, measure, pairs (seeds that both have), feasible_pairs (those whose trials are both feasible);
+        mean paired differences to the baseline with Student's 95% interval: return_difference, _low, _high,
+        and the same for cost_i_difference; then improvement, the probability that a run returns more
+        than a run of the baseline (of these seeds; ties count half: ``verdicts.tie``), with its bootstrap
+        interval _low, _high; and too_few_seeds (that interval is then too short).
     """
     costs = [str(name) for name in rows if is_cost(str(name))]
     lines = []
@@ -185,16 +209,21 @@ def comparisons(
         if method == baseline or not len(others):
             continue
         pairs = chosen.merge(others, on="seed", suffixes=("", "_base"))
+        if not len(pairs):
+            continue
         line: dict[str, Any] = {"task": task, "agent": agent, "method": method, "measure": measure}
-        line["pairs"] = len(pairs)
+        line |= {
+            "pairs": len(pairs),
+            "feasible_pairs": int((pairs["feasible"] & pairs["feasible_base"]).sum()),
+        }
         for name, column in (("return", "episode_return"), *((cost, cost) for cost in costs)):
             difference = paired_difference(
                 pairs[column].to_numpy(np.float64), pairs[f"{column}_base"].to_numpy(np.float64)
             )
             line |= _ends(f"{name}_difference", difference)
         improvement = improvement_interval(
-            chosen["episode_return"].to_numpy(np.float64)[:, None],
-            others["episode_return"].to_numpy(np.float64)[:, None],
+            pairs["episode_return"].to_numpy(np.float64)[:, None],
+            pairs["episode_return_base"].to_numpy(np.float64)[:, None],
             generator,
             tie=tie(float(chosen["optimal_return"].iloc[0])),
         )

@@ -22,14 +22,18 @@ def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:
     """Return the results as text, one row per task, agent and method; empty without evaluations.
 
     Args:
-        sweep: its complete trials are used.
+        sweep: its complete trials are averaged; failed ones and those without a result are counted.
 
     Returns:
         The table, and its caption.
     """
     if sweep.evaluations.empty:
         return pd.DataFrame(), ""
-    rows = count_verdicts(outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), cost_names(sweep))
+    rows = count_verdicts(
+        outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), sweep.trials, cost_names(sweep)
+    )
+    if not len(rows):  # the evaluated trials are not complete
+        return pd.DataFrame(), ""
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
     return pd.DataFrame([_line(row, suffixes) for _, row in rows.iterrows()]), caption(rows)
 
@@ -41,7 +45,7 @@ def caption(rows: pd.DataFrame) -> str:
         rows: of ``verdict_counts.count_verdicts``.
     """
     several = int(rows["seeds"].max()) > 1
-    exact = bool(rows["exact"].all())
+    exact = bool(rows.loc[rows["seeds"] > 0, "exact"].all())
     means = "means over n seeds, returns ± standard error" if several else "one seed (n = 1): no intervals"
     return (
         f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"

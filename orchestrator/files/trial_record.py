@@ -30,7 +30,8 @@ class TrialRecord:
         committed: lengths in bytes of the files, by their names, as of the last commit.
         digests: SHA-256 of the committed bytes of each.
         checkpoint: name of the checkpoint of the last commit, or empty.
-        start_limits: the training limits d_t that the curriculum measured, or None.
+        start_limits: the training limits d_t with which the curriculum started, measured or as given, [k],
+            or None.
         error: one line with the reason of a failure or the damage, or empty.
         claims: for a damaged trial, the status in its files, or None; not stored.
     """

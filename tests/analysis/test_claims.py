@@ -12,8 +12,11 @@ from recrl.analysis.statistics import claims
 NO_TRAINING = pd.DataFrame(columns=["task", "agent", "method", "seed", "episodes", "cost_0_total"])
 
 
-def counted(rows: pd.DataFrame, training: pd.DataFrame = NO_TRAINING) -> pd.DataFrame:
-    return claims.count_claims(rows, training)
+def counted(
+    rows: pd.DataFrame, training: pd.DataFrame = NO_TRAINING, failed: pd.DataFrame | None = None
+) -> pd.DataFrame:
+    trials = (rows if failed is None else failed).assign(status="complete" if failed is None else "failed")
+    return claims.count_claims(rows, training, trials)
 
 
 def outcome(task: str, method: str, episode_return: float, cost: float) -> dict[str, object]:
@@ -111,6 +114,27 @@ def test_a_comparison_counts_seeds_with_their_paired_difference_and_the_papers_r
     assert shown["difference"] == "+1.00 (-1.48 to +3.48)"
     assert shown["deployment phase (learning goes on)"] == "1 of 3"
     assert (shown["relative"], shown["paper, over its three tasks"]) == ("+33%", "20% to 600%")
+
+
+def test_a_claim_does_not_hold_in_a_failed_trial() -> None:
+    rows = pd.DataFrame([outcome("rivergrid-1b", "dynamic", 9.1, 1.0)])
+    lost = [outcome("rivergrid-1b", "dynamic", 0.0, 0.0), outcome("rivergrid-1b", "none", 0.0, 0.0)]
+    weighed = counted(rows, failed=pd.DataFrame(lost)).set_index("claim")
+    columns = ["held", "trials", "failed"]
+    assert list(weighed.loc["the dynamic curriculum finds the optimum on 1b", columns]) == [1, 2, 1]
+    assert list(weighed.loc["the plain agent finds the optimum on 1b", columns]) == [0, 1, 1]
+    assert claims_table(weighed.reset_index())["failed"].tolist() == ["1", "1"]
+
+
+def test_a_seed_with_a_failed_trial_is_no_gain_and_infeasible_pairs_are_counted_beside() -> None:
+    rows = [trial("none", seed, 3.0, 30.0 if seed == 1 else 20.0) for seed in range(3)]
+    rows += [trial("linear", seed, 4.0) for seed in range(2)]
+    weighed = counted(pd.DataFrame(rows), failed=pd.DataFrame([trial("linear", 2, 0.0)]))
+    line = weighed.set_index("claim").loc["linear returns more than none on CarGoal2"]
+    assert list(line[["held", "trials", "failed", "feasible_pairs"]]) == [2, 3, 1, 1]
+    assert line["difference"] == 1.0
+    shown = claims_table(weighed).set_index("claim").loc["linear returns more than none on CarGoal2"]
+    assert (shown["holds in"], shown["failed"], shown["feasible pairs"]) == ("2 of 3", "1", "1 of 2")
 
 
 def test_dynamic_is_compared_with_each_static_curriculum_of_its_agent() -> None:

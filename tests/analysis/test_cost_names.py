@@ -50,7 +50,7 @@ def test_one_cost_needs_no_name(finished: Sweep) -> None:
 def test_titles_of_tables_have_the_names(two: Sweep) -> None:
     sweep = named(two, ["fuel", "noise"])
     assert {"cost fuel", "limit fuel", "cost noise", "limit noise"} <= set(result_table(sweep)[0])
-    summary = metrics.summary(metrics.outcomes(sweep))
+    summary = metrics.summary(metrics.outcomes(sweep), sweep.trials)
     table = table_formats.outcome_table(summary, Measure.STOCHASTIC, (" fuel", " noise"))
     assert {"cost fuel", "limit noise"} <= set(table)
     assert {"cost 0", "limit 1"} <= set(table_formats.outcome_table(summary, Measure.STOCHASTIC))
@@ -68,6 +68,7 @@ def test_a_verdict_names_the_cost_that_is_over_its_limit(
     cost: str, seeds: int, infeasible: int, text: str
 ) -> None:
     row = {"seeds": seeds, "solved": 0, "feasible": seeds - infeasible, "infeasible": infeasible}
+    row |= {"planned": seeds, "failed": 0, "pending": 0}
     worst = {"worst_excess": 0.22, "worst_share": 0.11, "worst_cost": cost}
     assert verdict_texts.verdict_text(pd.Series(row | worst)) == text
 

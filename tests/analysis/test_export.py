@@ -1,5 +1,6 @@
 """A finished sweep in one file: what comes back, and what it leaves out."""
 
+import dataclasses
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from PIL import Image
 from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.sweep_data import Sweep, drawn_columns
 from recrl.analysis.figures import styles
+from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.report import drawing, table_files
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -72,6 +74,18 @@ def test_figures_and_tables_are_drawn_from_it(
     for path in written:
         if path.name != "bounds.csv":  # sums over rounded updates
             assert path.read_bytes() == (tmp_path / "compact" / path.name).read_bytes(), path.name
+
+
+def test_diagnostics_have_the_same_panels(made_up_sweep: Callable[..., SweepStore], tmp_path: Path) -> None:
+    sweep = sweep_data.load(made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none"]))
+    explained = {f"explained_variance_{signal}": 0.5 for signal in ("reward", "cost_0")}
+    sweep = dataclasses.replace(sweep, updates=sweep.updates.assign(**explained))
+    small = export.load(export.save(sweep, tmp_path / "sweep.zip"))
+    labels = [
+        [axes.get_ylabel() for axes in curriculum_diagnostics(it, "a", "cpo").axes] for it in (sweep, small)
+    ]
+    assert "explained\nvariance, reward" in labels[0]
+    assert labels[0] == labels[1]
 
 
 def test_what_is_no_compact_file_is_named(tmp_path: Path) -> None:

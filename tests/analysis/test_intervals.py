@@ -1,6 +1,7 @@
 """Estimators over few seeds: literals by hand, laws, other implementations' numbers, and coverage."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,13 +16,13 @@ from recrl.analysis.statistics.intervals import (
     interquartile_mean,
     mean_and_standard_error,
     mean_interval,
-    mean_of_tasks,
     paired_difference,
     performance_profile,
     probability_of_improvement,
     stratified_bootstrap,
     wilson_interval,
 )
+from tests.benchmarks.interval_statistics import mean_of_tasks
 
 # Two tables of scores, [5, 3] and [7, 3], and what rliable 1.2.0 says of them (arch 7.2.0).
 SCORES = np.array(
@@ -201,6 +202,16 @@ def test_bootstrap_covers_as_often_as_the_docstring_says(
         interval = stratified_bootstrap(numbers.normal(size=(runs, 1)), statistic, numbers, replications=400)
         covered += interval.low <= 0.0 <= interval.high
     assert covered / repeats == pytest.approx(expected, abs=0.03)  # three standard errors
+
+
+def test_the_page_shows_every_simulated_share() -> None:
+    root = Path(__file__).parents[2]
+    simulated = (root / "results" / "statistics" / "intervals.txt").read_text().splitlines()
+    rows = [line.rsplit(maxsplit=3) for line in simulated if line.startswith("share of")]
+    page = (root / "docs" / "explanation" / "statistics.md").read_text()
+    assert len(rows) == 3
+    for name, *shares in rows:
+        assert f"| {name} | {' | '.join(share.removeprefix('0') for share in shares)} |" in page
 
 
 def test_student_covers_what_it_promises_at_five_runs() -> None:

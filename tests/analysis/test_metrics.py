@@ -93,9 +93,9 @@ def test_a_summary_counts_the_seeds_at_the_optimum(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     rows.loc[rows["measure"] == "stochastic", ["gap", "cost_0"]] = [0.1, 4.0]
     rows["optimal"], rows["feasible"] = verdicts.solved(rows), verdicts.within_limits(rows)
-    found = metrics.summary(rows).set_index("measure").loc["stochastic"]
+    found = metrics.summary(rows, finished.trials).set_index("measure").loc["stochastic"]
     assert (found["optimal_seeds"] == found["seeds"]).all()
-    table = table_formats.outcome_table(metrics.summary(rows), metrics.Measure.STOCHASTIC)
+    table = table_formats.outcome_table(metrics.summary(rows, finished.trials), metrics.Measure.STOCHASTIC)
     seeds = int(found["seeds"].iloc[0])
     assert (table["solved"] == f"{seeds} of {seeds}").all()  # three seeds: no interval
 
@@ -138,7 +138,7 @@ def test_training_totals_by_hand(finished: Sweep, finished_sweep: SweepStore) ->
 
 
 def test_summary_averages_over_seeds(finished: Sweep) -> None:
-    summary = metrics.summary(metrics.outcomes(finished))
+    summary = metrics.summary(metrics.outcomes(finished), finished.trials)
     row = only(summary, task="river-a", agent="cpo", method="none", measure="stochastic")
     # seed 0 returns 8, seeds 1 and 2 return -15: mean -22/3, standard error 23/3
     assert row["seeds"] == 3
@@ -146,6 +146,34 @@ def test_summary_averages_over_seeds(finished: Sweep) -> None:
     assert row["episode_return_se"] == pytest.approx(23 / 3)
     assert row["feasible_seeds"] == 3
     assert row["feasible_low"] == pytest.approx(1.0 / (1.0 + 1.959964**2 / 3.0), abs=1e-6)
+
+
+def test_failed_trials_are_in_the_fractions_and_in_no_mean(finished: Sweep) -> None:
+    broken = (finished.trials["method"] == "linear") & (finished.trials["seed"] > 0)
+    broken |= finished.trials["method"] == "dynamic"
+    trials = finished.trials.assign(status=finished.trials["status"].mask(broken, "failed"))
+    summary = metrics.summary(metrics.outcomes(dataclasses.replace(finished, trials=trials)), trials)
+    row = only(summary, task="river-a", agent="cpo", method="linear", measure="stochastic")
+    assert (row["seeds"], row["failed"], row["feasible_seeds"]) == (1, 2, 1)
+    assert row["feasible_share"] == pytest.approx(1 / 3)
+    assert row["episode_return"] == 8.0
+    gone = only(summary, task="river-a", agent="cpo", method="dynamic", measure="stochastic")
+    assert (gone["seeds"], gone["failed"], gone["feasible_share"]) == (0, 3, 0.0)
+    table = table_formats.outcome_table(summary, metrics.Measure.STOCHASTIC)
+    shown = table[(table["task"] == "river-a") & (table["agent"] == "cpo")].set_index("curriculum")
+    assert shown["failed"].to_dict() == {"none": "0", "linear": "2", "dynamic": "3"}
+    assert shown["feasible"].to_dict() == {"none": "3 of 3", "linear": "1 of 3", "dynamic": "0 of 3"}
+    assert shown["return"]["dynamic"] == "–"
+
+
+def test_comparisons_use_the_seeds_that_both_have(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    same = rows[(rows["method"] == "none") | (rows["seed"] == 1)]
+    compared = metrics.comparisons(same, np.random.default_rng(0))
+    row = only(compared, task="river-a", agent="cpo", method="linear", measure="stochastic")
+    assert (row["pairs"], row["feasible_pairs"], row["improvement"]) == (1, 1, 1.0)
+    apart = rows[(rows["method"] == "none") == (rows["seed"] == 0)]
+    assert not len(metrics.comparisons(apart, np.random.default_rng(0)))
 
 
 def test_comparisons_pair_equal_seeds(finished: Sweep) -> None:

@@ -38,6 +38,23 @@ def test_infeasible_runs_count_as_the_worst(finished: Sweep) -> None:
     assert all(np.asarray(line.get_ydata()).max() == 0.0 for line in methods)
 
 
+def test_failed_trials_count_as_the_worst(finished: Sweep) -> None:
+    broken = (finished.trials["method"] == "none") & (finished.trials["seed"] > 0)
+    broken |= finished.trials["method"] == "dynamic"
+    trials = finished.trials.assign(status=finished.trials["status"].mask(broken, "failed"))
+    figure = performance_profiles(dataclasses.replace(finished, trials=trials), Measure.STOCHASTIC)
+    assert figure is not None
+    highest = {
+        method: max(
+            np.asarray(line.get_ydata()).max()
+            for line in figure.axes[0].get_lines()
+            if line.get_color() == STYLES[method].colour
+        )
+        for method in ("none", "linear", "dynamic")
+    }
+    assert highest == pytest.approx({"none": 1 / 3, "linear": 1.0, "dynamic": 0.0})
+
+
 def test_without_a_complete_trial_there_is_no_profile(finished: Sweep) -> None:
     trials = finished.trials.assign(status="running")
     assert performance_profiles(dataclasses.replace(finished, trials=trials), Measure.STOCHASTIC) is None

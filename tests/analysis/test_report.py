@@ -10,7 +10,7 @@ import pytest
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report import drawing, table_files
+from recrl.analysis.report import drawing, table_files, verdict_texts
 from recrl.analysis.report.drawing import NothingToDrawError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.faults.committing import commit_file
@@ -53,7 +53,11 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "outcomes.tex",
     ]
     text = written[1].read_text().splitlines()
-    assert text[2] == "- river-a: none of 2 final policies (1 agent x 1 curriculum x 2 seeds) solves it."
+    assert text[2] == (
+        "- river-a: none of 4 trials (1 agent x 2 curricula x 2 seeds) solves it so far; 1 failed; the sweep "
+        "is incomplete: 1 trial has no result yet."
+    )
+    assert any("| linear | **failed 1 of 2; no result yet 1 of 2** | " in line for line in text)
     assert text[6].startswith("| river-a | my cpo | none | feasible | ")
     assert "4 trials: 1 running, 2 complete, 1 failed." in text
     assert text.index("## Trials and warnings") < text.index("## Figures") < text.index("## Provenance")
@@ -61,6 +65,10 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
     )
     assert "- river-a my cpo linear seed 0: still running, 50% of its steps done" in text
+    assert (
+        "- 2 seeds: bootstrap intervals are too short below 10 seeds (marked †); Student's hold for normal "
+        "data, Wilson's cover within about 3 points of 95%"
+    ) in text
     again = drawing.draw(sweep_data.load(store), tmp_path / "second")
     assert [path.read_bytes() for path in written] == [path.read_bytes() for path in again]
 
@@ -98,6 +106,27 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     assert text.count("another seed may give another verdict") == 1  # the answers say so, the warnings do not
 
 
+def test_labels_that_differ_only_in_other_signs_have_figures_of_their_own(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(
+        seeds=1, tasks=["a_1", "a 1"], agents=["β=0.1", "λ=0.1"], methods=["none"], updates=10
+    )
+    figures = drawing.drawings(sweep_data.load(store))
+    captions = {stem: it.caption.split(":")[0] for stem, it in figures.items() if it.kind == "diagnostics"}
+    assert captions == {
+        "diagnostics_a-1_-0.1": "a 1, β=0.1",
+        "diagnostics_a-1_-0.1-2": "a 1, λ=0.1",
+        "diagnostics_a-1_-0.1-3": "a_1, β=0.1",
+        "diagnostics_a-1_-0.1-4": "a_1, λ=0.1",
+    }
+    names = [path.name for path in drawing.sketch(sweep_data.load(store), tmp_path)]
+    assert {"learning-curves_-0.1.png", "learning-curves_-0.1-2.png"} <= set(names)
+    text = (tmp_path / "report.md").read_text()
+    assert "\nβ=0.1: Return and cost while training" in text
+    assert "\nλ=0.1: Return and cost while training" in text
+
+
 def test_tables_of_outcomes_say_their_tolerance(finished: Sweep, tmp_path: Path) -> None:
     notes = {it.heading: it.note for it in table_files.write_tables(finished, tmp_path)[1].shown}
     tolerance = "no mean cost exceeds its limit by more than 1% or, where it is sampled, one standard error"
@@ -109,6 +138,21 @@ def test_outcomes_alone_are_those_of_the_tables(finished: Sweep, tmp_path: Path)
     (alone,) = table_files.write_outcomes(finished, tmp_path / "alone")
     table_files.write_tables(finished, tmp_path)
     assert alone.read_bytes() == (tmp_path / "outcomes.csv").read_bytes()
+
+
+def test_trials_without_an_evaluation_are_not_said_to_be_incomplete(finished: Sweep, tmp_path: Path) -> None:
+    unevaluated = dataclasses.replace(finished, evaluations=finished.evaluations.iloc[:0])
+    _, tables = table_files.write_tables(unevaluated, tmp_path)
+    assert not len(tables.verdicts)
+    assert verdict_texts.no_verdict(unevaluated) == (
+        "No final policy was evaluated: set run.evaluation_episodes."
+    )
+    for status, sentence in (
+        ("failed", "No trial is complete: no verdict. All 36 failed."),
+        ("running", "No trial is complete yet: no verdict."),
+    ):
+        trials = finished.trials.assign(status=status)
+        assert verdict_texts.no_verdict(dataclasses.replace(finished, trials=trials)) == sentence
 
 
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from recrl.analysis.statistics.metrics import Measure
 
 
 def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
-    table = table_formats.outcome_table(metrics.summary(metrics.outcomes(finished)), Measure.STOCHASTIC)
+    summary = metrics.summary(metrics.outcomes(finished), finished.trials)
+    table = table_formats.outcome_table(summary, Measure.STOCHASTIC)
     assert len(table) == 2 * 2 * 3
     assert table.iloc[0].to_dict() == {
         "task": "river-a",
@@ -30,7 +31,8 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
 
 
 def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(finished: Sweep) -> None:
-    summary = metrics.summary(metrics.outcomes(finished)).assign(seeds=5, feasible_seeds=4, optimal_seeds=5)
+    summary = metrics.summary(metrics.outcomes(finished), finished.trials)
+    summary = summary.assign(seeds=5, feasible_seeds=4, optimal_seeds=5)
     row = table_formats.outcome_table(summary, Measure.STOCHASTIC).iloc[0]
     assert row["regret"] == "–"
     assert row["solved"].startswith("5 of 5 (")
@@ -39,7 +41,7 @@ def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(fini
 def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     compared = metrics.comparisons(rows, np.random.default_rng(0))
-    chosen = table_formats.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
+    chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
     table = table_formats.comparison_table(chosen)
     assert table["P(higher return)"].str.endswith("†").all()
     assert table["return gained"].iloc[0].startswith("15.33 [-17.65, 48.32]")
@@ -49,12 +51,13 @@ def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark
     rows = metrics.outcomes(finished)
     rows = rows[rows["seed"] == 0]
     compared = metrics.comparisons(rows, np.random.default_rng(0))
-    chosen = table_formats.compared_rows(compared, metrics.summary(rows), Measure.STOCHASTIC)
+    chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
     assert table_formats.row_kinds(chosen) == [""] * len(chosen)
-    chosen.loc[0, "feasible_seeds"] = 0
+    chosen.loc[0, ["feasible_seeds", "feasible_pairs"]] = 0
     table = table_formats.comparison_table(chosen)
     assert table_formats.row_kinds(chosen)[:2] == ["infeasible", ""]
     assert list(table[["return gained", "P(higher return)"]].iloc[0]) == ["–", "–"]
+    assert table["feasible pairs"].tolist()[:2] == ["0 of 1", "1 of 1"]
     assert "–" not in list(table.iloc[1])
     assert not table["P(higher return)"].str.contains("†").any()
 

@@ -1,14 +1,17 @@
 """A report's first lines: verdicts, counted and in words."""
 
+import dataclasses
 import math
 from html import unescape
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import html_page, verdict_texts
+from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 
 NONE_COMPARED = pd.DataFrame()
@@ -47,11 +50,19 @@ ROWS = [
 ]
 
 
-def judged(rows: list[dict[str, object]]) -> pd.DataFrame:
-    flags = pd.DataFrame(rows)[[*KEY, "measure"]].query("measure == 'stochastic'")[list(KEY)]
-    return count_verdicts(
-        pd.DataFrame(rows), NONE_COMPARED, flags.assign(no_curriculum=False, hard_landing=False)
-    )
+def trials_of(rows: list[dict[str, object]], **states: list[dict[str, object]]) -> pd.DataFrame:
+    """The trials of these outcomes, and others that have none, by their status."""
+    columns = [*KEY, "deploy_limit_0", "optimal_return"]
+    columns += ["deploy_limit_1"] * ("deploy_limit_1" in rows[0])
+    found = pd.DataFrame(rows).drop_duplicates(list(KEY))[columns].assign(status="complete")
+    others = [pd.DataFrame(made)[columns].assign(status=status) for status, made in states.items()]
+    return pd.concat([found, *others], ignore_index=True)
+
+
+def judged(rows: list[dict[str, object]], **states: list[dict[str, object]]) -> pd.DataFrame:
+    trials = trials_of(rows, **states)
+    flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
+    return count_verdicts(pd.DataFrame(rows), NONE_COMPARED, flags, trials)
 
 
 def test_seeds_are_counted_by_the_final_policy_only() -> None:
@@ -134,6 +145,101 @@ def test_a_sentence_a_task(rows: list[dict[str, object]], sentence: str) -> None
     assert verdict_texts.answers(judged(rows)) == [sentence]
 
 
+FAILED = [outcome("none", seed, 0.0, 0.0) for seed in (2, 3, 4)]
+FAILED += [outcome("dynamic", seed, 0.0, 0.0) for seed in (2, 3, 4)]
+
+
+def test_failed_trials_are_neither_solved_nor_left_out() -> None:
+    table = judged([*ROWS[4:6], *(row | {"method": "none"} for row in ROWS[4:6])], failed=FAILED)
+    assert verdict_texts.verdict_table(table)["verdict"].tolist() == ["solved 2 of 5; failed 3 of 5"] * 2
+    assert verdict_texts.verdict_table(table)["n"].tolist() == ["2", "2"]
+    assert verdict_texts.verdict_kinds(table) == ["failed", "failed"]
+    assert verdict_texts.answers(table) == [
+        "river: 4 of 10 trials (1 agent x 2 curricula x 5 seeds) solve it; 6 failed."
+    ]
+    assert any(sentence.startswith("Failed: ") for sentence in verdict_texts.explanation(table))
+
+
+def test_the_best_curriculum_is_that_with_the_most_successes_of_all_its_trials() -> None:
+    rows = [*(outcome("none", seed, 9.5, 5.0) for seed in range(3)), outcome("none", 3, 9.6, 6.0)]
+    rows.append(outcome("dynamic", 0, 9.5, 5.0))
+    failed = [outcome("dynamic", seed, 0.0, 0.0) for seed in (1, 2, 3)]
+    assert verdict_texts.answers(judged(rows, failed=failed)) == [
+        "river: 4 of 8 trials (1 agent x 2 curricula x 4 seeds) solve it, most often with none (3 of 4); 3 "
+        "failed; none solves 3 of 4, 1 exceeds the limit of 5 by 1.00."
+    ]
+
+
+def test_a_curriculum_of_which_every_trial_failed_has_a_row() -> None:
+    table = judged(ROWS[4:6], failed=FAILED[:3])
+    assert table["method"].tolist() == ["dynamic", "none"]
+    assert verdict_texts.verdict_table(table)["verdict"].tolist() == ["solved", "failed"]
+    assert verdict_texts.verdict_table(table)["return"].tolist() == ["9.45 ± 0.05", "–"]
+    assert "computed exactly" in verdict_texts.explanation(table)[0]
+
+
+def test_an_incomplete_sweep_says_so_and_counts_what_waits_neither_way() -> None:
+    waiting = [outcome("dynamic", seed, 0.0, 0.0) for seed in (2, 3)]
+    table = judged(ROWS[4:6], waiting=waiting[:1], running=waiting[1:])
+    assert verdict_texts.answers(table) == [
+        "river: 2 of 4 trials (1 agent x 1 curriculum x 4 seeds) solve it so far; the sweep is incomplete: 2 "
+        "trials have no result yet."
+    ]
+    assert verdict_texts.verdict_table(table)["verdict"].tolist() == ["solved 2 of 4; no result yet 2 of 4"]
+    assert verdict_texts.verdict_kinds(table) == ["feasible"]
+
+
+@pytest.mark.parametrize(
+    ("states", "sentence"),
+    [
+        ({"failed": [1, 2]}, "other: no verdict; all 2 trials failed."),
+        (
+            {"failed": [1], "damaged": [2]},
+            "other: no verdict; 1 failed; the sweep is incomplete: 1 trial has no result yet.",
+        ),
+        (
+            {"complete": [1, 2]},
+            "other: no verdict; 2 final policies were not evaluated: set run.evaluation_episodes.",
+        ),
+    ],
+)
+def test_a_task_without_a_final_policy_says_why(states: dict[str, list[int]], sentence: str) -> None:
+    other = {
+        status: [outcome("none", seed, 0.0, 0.0, task="other") for seed in seeds]
+        for status, seeds in states.items()
+    }
+    assert verdict_texts.answers(judged(ROWS[4:6], **other))[1] == sentence
+
+
+def test_a_difference_to_none_needs_feasible_policies_on_both_sides() -> None:
+    rows = [
+        *(outcome("none", seed, 9.0, 6.0 if seed == 1 else 5.0) for seed in range(3)),
+        *(outcome("linear", seed, 9.5, 5.0) for seed in range(3)),
+    ]
+    trials = trials_of(rows)
+    flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
+    for none, shown in (
+        (rows[:3], "–"),
+        ([row | {"feasible": True} for row in rows[:3]], "0.50 [0.50, 0.50]"),
+    ):
+        made = pd.DataFrame([*none, *rows[3:]])
+        compared = metrics.comparisons(made, np.random.default_rng(0))
+        table = verdict_texts.verdict_table(count_verdicts(made, compared, flags, trials))
+        assert table["difference to none"].tolist() == ["–", shown]
+        assert compared["feasible_pairs"].tolist() == [2 if shown == "–" else 3]
+        assert compared["return_difference"].tolist() == pytest.approx([0.5])
+
+
+def test_a_difference_over_fewer_seeds_has_its_own_number() -> None:
+    rows = [outcome("none", 0, 9.0, 5.0), *(outcome("linear", seed, 9.5, 5.0) for seed in range(3))]
+    trials = trials_of(rows)
+    flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
+    compared = metrics.comparisons(pd.DataFrame(rows), np.random.default_rng(0))
+    table = verdict_texts.verdict_table(count_verdicts(pd.DataFrame(rows), compared, flags, trials))
+    assert table["difference to none"].tolist() == ["–", "0.50 (n = 1)"]
+    assert table["n"].tolist() == ["1", "3"]
+
+
 def test_each_curriculum_that_violates_is_named_with_its_excess() -> None:
     """One seed, two agents: linear and cosine always violate, dynamic with one agent of two."""
     rows = [
@@ -161,6 +267,33 @@ def test_each_task_says_what_its_limits_mean(finished: Sweep) -> None:
         "river-a: A camp and a mine, one cost, closed-form optimum: for testing learners. Limit: 5 per "
         "episode, allowed 5.05 (1%, exact). Training limit d_t: 100.0, from the grid."
     )
+
+
+@pytest.mark.parametrize(
+    ("train_limits", "start_limits", "said"),
+    [
+        ([60.0, 60.0], [60.0, 60.0], " Training limit d_t: 60.00, from the grid."),
+        (
+            [math.inf, math.inf],
+            [61.52, math.inf],
+            " Training limit d_t: 61.52, measured at the start of training.",
+        ),
+        (
+            [math.inf, 60.0],
+            [61.52, 60.0],
+            " Training limit d_t: 61.52, measured at the start of training, and 60.00, from the grid.",
+        ),
+        ([math.inf, math.inf], [math.inf, math.nan], ""),
+    ],
+)
+def test_only_a_measured_training_limit_is_said_to_be_measured(
+    finished: Sweep, train_limits: list[float], start_limits: list[float], said: str
+) -> None:
+    chosen = (finished.trials["task"] == "river-a") & (finished.trials["method"] == "linear")
+    trials = finished.trials[chosen].head(2).assign(train_limit_0=train_limits, start_limit_0=start_limits)
+    table = judged([outcome("linear", 0, 9.5, 5.0, task="river-a")])
+    (sentence,) = verdict_texts.task_sentences(dataclasses.replace(finished, trials=trials), table)
+    assert sentence.endswith(f"allowed 5.05 (1%, exact).{said}")
 
 
 def test_violators_are_marked_by_text_and_colour() -> None:

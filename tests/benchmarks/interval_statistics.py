@@ -22,17 +22,22 @@ from recrl.analysis.statistics.intervals import (
     improvement_interval,
     interquartile_mean,
     mean_interval,
-    mean_of_tasks,
     paired_difference,
     performance_profile,
     probability_of_improvement,
     stratified_bootstrap,
     wilson_interval,
 )
+from recrl.environments.cmdp import Floats
 
 RUNS = (5, 10, 20)
 SHARES = (0.5, 0.8, 0.95)
 TABLES = 500
+
+
+def mean_of_tasks(scores: Floats) -> Floats:
+    """The mean over runs and tasks, [..., n, m] -> [...]."""
+    return np.asarray(np.mean(scores, axis=(-2, -1)))
 
 
 def intervals(generator: np.random.Generator) -> dict[str, tuple[Callable[[int], Interval], float]]:
