@@ -124,8 +124,8 @@ def test_an_optimum_is_unknown_here_only_where_it_is_known_elsewhere(foreign: Pa
         seed=0,
     )
     with refuse_import_paths():
-        assert optima_of([spec], finite=())[1] == ["spy:TASK: no optimum is known"]
-        (note,) = optima_of([spec], finite={"spy:TASK"})[1]
+        assert optima_of([spec], ["spy:TASK"], finite=())[1] == ["spy:TASK: no optimum is known"]
+        (note,) = optima_of([spec], ["spy:TASK"], finite={"spy:TASK"})[1]
     assert note == f"spy:TASK: the optimum is unknown here, because 'spy:TASK' was not imported, {REFUSED}"
 
 
