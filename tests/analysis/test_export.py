@@ -1,7 +1,9 @@
 """A finished sweep in one file: what comes back, and what it leaves out."""
 
+import subprocess
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +15,14 @@ from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.sweep_data import Sweep, drawn_columns
 from recrl.analysis.figures import styles
 from recrl.analysis.report import drawing, table_files
+from recrl.analysis.statistics import metrics
+from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from tests.faults.committing import commit_file
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +80,59 @@ def test_figures_and_tables_are_drawn_from_it(
     for path in written:
         if path.name != "bounds.csv":  # sums over rounded updates
             assert path.read_bytes() == (tmp_path / "compact" / path.name).read_bytes(), path.name
+
+
+def committed() -> list[str]:
+    """The compact files that the repository has."""
+    listed = ["git", "-C", str(ROOT), "ls-files", "results/*.zip"]
+    return subprocess.run(listed, capture_output=True, text=True, check=True).stdout.split()
+
+
+@pytest.mark.parametrize("path", committed())
+def test_every_committed_file_can_be_read_and_tabulated(path: str, tmp_path: Path) -> None:
+    sweep = export.load(ROOT / path)
+    assert sweep.notes == ()
+    assert len(metrics.outcomes(sweep))
+    assert table_files.write_tables(sweep, tmp_path)
+
+
+@pytest.fixture
+def of_another_version(made_up_sweep: Callable[..., SweepStore]) -> Sweep:
+    """A sweep whose task has an option that is no more; every trial has the table of its final policy."""
+    store = made_up_sweep(seeds=2, tasks=["a"], agents=["cpo"], methods=["none", "linear"])
+    for trial in store.trials():
+        commit_file(trial, "policy.csv", "action_0,action_1\n0.0,1.0\n0.6,0.4\n")
+    sweep = sweep_data.load(store)
+    facts = []
+    for it in sweep.facts:
+        task = replace(it.spec.task, options={**it.spec.task.options, "out_of_range": "clip"})
+        facts.append(replace(it, spec=replace(it.spec, task=task)))
+    return sweep_data.assemble(sweep.name, facts, {name: sweep.rows(name) for name in sweep_data.ROWS})
+
+
+def test_options_of_another_version_cost_no_more_than_what_is_computed_from_them(
+    of_another_version: Sweep, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    note = (
+        "a: the optimum is unknown here, because this version cannot read its options: out_of_range: unknown "
+        "key"
+    )
+    path = export.save(of_another_version, tmp_path / "sweep.zip")
+    sweep = export.load(path)
+    assert of_another_version.notes == sweep.notes == (note,)
+    rows = metrics.outcomes(sweep)
+    assert not rows["exact"].any()
+    assert rows["optimal_return"].isna().all()
+    assert main(["figures", str(path), "--to", str(tmp_path / "figures")]) == ExitCode.OK
+    assert note in (tmp_path / "figures" / "report.md").read_text().replace("\\", "")
+    assert main(["bound", str(path)]) == ExitCode.OK
+    assert capsys.readouterr().err == ""
+
+
+def test_notes_that_hold_no_more_are_left_out(finished: Sweep, tmp_path: Path) -> None:
+    notes = ("kept", "river-a: the optimum is unknown here, because it was not installed")
+    path = export.save(replace(finished, notes=notes), tmp_path / "sweep.zip")
+    assert export.load(path).notes == ("kept",)
 
 
 def test_what_is_no_compact_file_is_named(tmp_path: Path) -> None:
