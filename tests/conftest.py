@@ -34,6 +34,7 @@ class MadeUpSweep:
     Attributes:
         tasks: label of each, all of them the task ``two-state``, the optimum of which is known.
         num_costs: k; above 1 the task is ``two-state-2``.
+        horizon: of the tasks.
         updates: policy updates of a trial; the last 5% at least one, are the deployment phase.
         unfinished: titles of trials that are left running after half of their updates.
         failed: titles of trials that failed there.
@@ -45,6 +46,7 @@ class MadeUpSweep:
     methods: Sequence[str] = ("none", "linear", "cosine", "exponential", "dynamic")
     seeds: int = 3
     num_costs: int = 1
+    horizon: int = 10
     deploy_limit: float = 5.0
     updates: int = 40
     unfinished: Sequence[str] = field(default=())
@@ -56,7 +58,9 @@ class MadeUpSweep:
         total = self.updates * STEPS_PER_UPDATE
         deploy = max(1, round(0.05 * self.updates)) * STEPS_PER_UPDATE
         return TrialSpec(
-            task=Choice("two-state" if self.num_costs == 1 else "two-state-2", {"horizon": 10}, task),
+            task=Choice(
+                "two-state" if self.num_costs == 1 else "two-state-2", {"horizon": self.horizon}, task
+            ),
             agent=Choice(agent),
             method=Choice(method),
             train_limits=CostLimits((FIRST_COST,) * self.num_costs),

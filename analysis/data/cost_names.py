@@ -23,8 +23,8 @@ INDEX = re.compile("[0-9]{1,6}")
 def cost_names(sweep: Sweep) -> Mapping[str, tuple[str, ...]]:
     """Return the names of the k costs of each task with k > 1, by the task's label; numbers if unknown."""
     names: dict[str, tuple[str, ...]] = {}
-    for trial in sweep.facts:
-        label, num_costs = trial.spec.task.label, len(trial.spec.deploy_limits)
+    for label, trial in zip(sweep.task_labels, sweep.facts, strict=True):
+        num_costs = len(trial.spec.deploy_limits)
         if num_costs > 1 and not _is_named(names.get(label, ())):
             numbers = tuple(str(i) for i in range(num_costs))
             names[label] = _recorded(trial, num_costs) or names.get(label, numbers)
@@ -40,11 +40,11 @@ def cost_suffix(sweep: Sweep, i: int, task: str | None = None) -> str:
         task: label of the task that is shown; None for all tasks, which may name cost i differently: then
             the number is used.
     """
-    shown = [it.spec for it in sweep.facts if task in (None, it.spec.task.label)]
-    if max((len(spec.deploy_limits) for spec in shown), default=1) == 1:
+    number_of = {label: number for label, number in _numbers_of_costs(sweep).items() if task in (None, label)}
+    if max(number_of.values(), default=1) == 1:
         return ""
     names = cost_names(sweep)
-    labels = {spec.task.label for spec in shown if len(spec.deploy_limits) > i}
+    labels = {label for label, number in number_of.items() if number > i}
     found = {names[label][i] if label in names else str(i) for label in labels}
     return f" {found.pop()}" if len(found) == 1 else f" {i}"
 
@@ -63,7 +63,7 @@ def indices_of_cost(sweep: Sweep, wanted: str) -> Mapping[str, int]:
     Raises:
         ValueError: no task of the sweep has the cost.
     """
-    names = {it.spec.task.label: ("",) * len(it.spec.deploy_limits) for it in sweep.facts}
+    names = {label: ("",) * number for label, number in _numbers_of_costs(sweep).items()}
     names |= cost_names(sweep)
     if INDEX.fullmatch(wanted):
         found = {task: int(wanted) for task, each in names.items() if int(wanted) < len(each)}
@@ -76,6 +76,13 @@ def indices_of_cost(sweep: Sweep, wanted: str) -> Mapping[str, int]:
         hint = nearest(wanted, [name for called in costs for name in called])
         raise ValueError(f"{sweep.name} has {has} {', '.join(texts)}, got {wanted!r}{hint}")
     return found
+
+
+def _numbers_of_costs(sweep: Sweep) -> dict[str, int]:
+    """Return k of each task, by the task's label."""
+    return {
+        label: len(it.spec.deploy_limits) for label, it in zip(sweep.task_labels, sweep.facts, strict=True)
+    }
 
 
 def _is_name(text: str) -> bool:

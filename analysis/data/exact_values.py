@@ -17,8 +17,8 @@ from recrl.analysis.data.labels import KEY
 from recrl.environments.cmdp import Floats
 from recrl.environments.finite.exact_solver import evaluate_policy
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.environments.registry import find_task, make_vector, task_options
+from recrl.orchestrator.errors import USERS_ERRORS
 
 STOCHASTIC, DETERMINISTIC = "stochastic", "deterministic"
 
@@ -28,7 +28,7 @@ def exact_values(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]
 
     Args:
         policies: of a ``Sweep``.
-        models: of each task, by its label; None if the task is not finite or not installed.
+        models: of each task, by its label; None if the task is not finite or cannot be built here.
 
     Returns:
         KEY, policy (STOCHASTIC or DETERMINISTIC), episode_return, cost_i. Tables that do not fit their
@@ -51,7 +51,8 @@ def exact_values(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]
 def finite_model(name: str, options: Mapping[str, Any]) -> FiniteCMDP | None:
     """Return the tables of a task with a known optimum, or None.
 
-    Other tasks are not built: they can be slow to build, and few of them are finite.
+    Other tasks are not built: they can be slow to build, and few of them are finite. A task that is not
+    installed, or whose options this version cannot read, has none: ``optima_of`` makes a note of it.
 
     Args:
         name: of the task.
@@ -60,9 +61,9 @@ def finite_model(name: str, options: Mapping[str, Any]) -> FiniteCMDP | None:
     try:
         if find_task(name).optimum is None:
             return None
-    except (UnknownNameError, UntrustedNameError):  # not installed here
+        return _model(name, task_options(name, options).model_dump_json())
+    except USERS_ERRORS:
         return None
-    return _model(name, task_options(name, options).model_dump_json())
 
 
 @functools.lru_cache(maxsize=256)

@@ -29,15 +29,21 @@ def load(uri: str, name: str | None = None) -> Sweep:
         name: of the sweep; optional if MLflow has only one.
 
     Raises:
-        TrackingError: MLflow cannot be reached, has no such sweep, or its export file is damaged.
+        TrackingError: MLflow cannot be reached, has no such sweep, or its export file is damaged or of
+            another version.
     """
     for tries_left in range(TRIES - 1, -1, -1):
         with downloaded_export(uri, name) as download:
             try:
                 sweep = export.load(download.path)
             except RecrlError as error:
+                reason = str(error).removeprefix(f"{download.path}: ")
+                if isinstance(error, export.OtherVersionError):  # an upload of the same sweep is no cure
+                    raise TrackingError(
+                        f"MLflow at {redacted(uri)}: this version of recrl cannot read the sweep's export "
+                        f"file ({reason}); the version that uploaded it can"
+                    ) from error
                 if not tries_left:
-                    reason = str(error).removeprefix(f"{download.path}: ")
                     raise TrackingError(
                         f"MLflow at {redacted(uri)}: the sweep's export file is damaged ({reason}); "
                         "recrl-sweep sync --rebuild uploads it again"

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +30,11 @@ METHOD_ORDER = (
     "unconstrained",
 )
 TRIAL = "trial"  # in rows for ``assemble``: the position of their trial
-DOUBLES = "groups of trials have these labels but different settings"
+DOUBLES = "but different settings; they are kept apart as"
+SHOWN = 3  # largest number of meanings of a label in a note, and of settings of each
+LONGEST_VALUE = 40  # characters of a setting in a note
+
+Settings = Mapping[str, Any]
 
 
 def ordered(labels: Collection[str], first: Sequence[str]) -> list[str]:
@@ -89,33 +96,83 @@ class Keys:
 def keys_of(specs: Sequence[TrialSpec]) -> tuple[Keys, list[str]]:
     """Return the trials' labels, and notes on labels that had to be made unique.
 
-    Two groups of trials may have the same labels but different settings (for example budgets). They must not
-    be averaged, so the group is appended to the method's label.
+    In a grid, a label has one meaning. In merged sweeps it may have several: a task with another horizon,
+    limit or budget, or an agent or a curriculum with other options. Their trials must not be averaged or
+    compared. So a digest of the settings is appended to such a label.
     """
-    groups: dict[tuple[str, ...], set[str]] = {}
-    identities = [spec.group for spec in specs]
-    for spec, group in zip(specs, identities, strict=True):
-        groups.setdefault(_labels(spec), set()).add(group)
-    notes = [
-        f"{' '.join(labels)}: {len(found)} {DOUBLES}; they are kept apart as {labels[2]} [...]"
-        for labels, found in sorted(groups.items())
-        if len(found) > 1
-    ]
-    methods = [
-        f"{spec.method.label} [{group}]" if len(groups[_labels(spec)]) > 1 else spec.method.label
-        for spec, group in zip(specs, identities, strict=True)
-    ]
-    columns: dict[str, tuple[list[str], Sequence[str]]] = {
-        "task": ([spec.task.label for spec in specs], ()),
-        "agent": ([spec.agent.label for spec in specs], AGENT_ORDER),
-        "method": (methods, METHOD_ORDER),
-    }
-    labels = {
-        name: pd.Categorical(values, categories=ordered(values, first), ordered=True)
-        for name, (values, first) in columns.items()
-    }
+    meanings = [_meanings(spec) for spec in specs]
+    labels, notes = {}, []
+    for name, (nouns, first) in {
+        "task": ("tasks", ()),
+        "agent": ("agents", AGENT_ORDER),
+        "method": ("curricula", METHOD_ORDER),
+    }.items():
+        values, found = _told_apart([meaning[name] for meaning in meanings], nouns)
+        labels[name] = pd.Categorical(values, categories=ordered(values, first), ordered=True)
+        notes += found
     return Keys(labels, np.array([spec.seed for spec in specs], dtype=np.int64)), notes
 
 
-def _labels(spec: TrialSpec) -> tuple[str, str, str]:
-    return (spec.task.label, spec.agent.label, spec.method.label)
+def _meanings(spec: TrialSpec) -> dict[str, Settings]:
+    """Return the settings behind the labels of a trial's task, agent and curriculum.
+
+    Limits and run settings belong to the task: a grid has them once for each task.
+    """
+    values = spec.to_json()
+    agent, method = values.pop("agent"), values.pop("method")
+    return {
+        "task": {**values.pop("task"), **{name: it for name, it in values.items() if name != "seed"}},
+        "agent": agent,
+        "method": method,
+    }
+
+
+def _told_apart(meanings: Sequence[Settings], nouns: str) -> tuple[list[str], list[str]]:
+    """Return a label for every trial, unique to its settings, and a note for each label that was not.
+
+    Args:
+        meanings: the settings behind the label of each trial, ``label`` included.
+        nouns: for the notes, for example ``tasks``.
+    """
+    texts = [json.dumps(meaning, sort_keys=True) for meaning in meanings]
+    by_label: dict[str, dict[str, Settings]] = {}
+    for text, meaning in zip(texts, meanings, strict=True):
+        by_label.setdefault(meaning["label"], {})[text] = meaning
+    unique: dict[str, str] = {}
+    notes = []
+    for label, found in sorted(by_label.items()):
+        several = len(found) > 1
+        unique |= {text: f"{label} [{_digest(text)}]" if several else label for text in found}
+        if several:
+            different = _differences(list(found.values()))
+            kept = [f"{unique[text]} ({it})" for text, it in zip(found, different, strict=True)]
+            notes.append(f"{len(found)} {nouns} have the label {label} {DOUBLES} {_listed(kept)}")
+    return [unique[text] for text in texts], notes
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def _differences(meanings: Sequence[Settings]) -> list[str]:
+    """Describe each of several meanings by the settings that are not the same in all: ``horizon 12``."""
+    flat: list[dict[tuple[str, str], str]] = [
+        {("", name): json.dumps(value) for name, value in it.items() if name != "options"}
+        | {("options", name): json.dumps(value) for name, value in it["options"].items()}
+        for it in meanings
+    ]
+    names = dict.fromkeys(name for each in flat for name in each)
+    differing = [name for name in names if len({each.get(name) for each in flat}) > 1]
+    return [_listed([_setting(name[1], each.get(name)) for name in differing]) for each in flat]
+
+
+def _setting(name: str, value: str | None) -> str:
+    if value is None:
+        return f"no {name}"
+    return f"{name} {value if len(value) <= LONGEST_VALUE else value[:LONGEST_VALUE] + '...'}"
+
+
+def _listed(texts: Sequence[str]) -> str:
+    """Return the first SHOWN texts with commas, and the number of the others."""
+    more = f" and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
+    return f"{', '.join(texts[:SHOWN])}{more}"

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.labels import TRIAL
-from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble, is_made_again
+from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble
 from recrl.orchestrator.spec import TrialState
 
 OUTCOMES = ("phases", "evaluations")  # data frames that every source has unrounded
@@ -41,7 +41,7 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
         trial_id: max(numbers, key=lambda number: _reached(trials[number][trial_id]))
         for trial_id, numbers in having.items()
     }
-    notes = [note for part in parts for note in part.notes if not is_made_again(note)]
+    notes = [note for part in parts for note in part.notes]
     if len({part.grid for part in parts if part.grid}) > 1:
         notes.append("the parts have different grid files; the first part's is kept")
     return assemble(

@@ -47,7 +47,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.exact_values import exact_values, finite_model
-from recrl.analysis.data.labels import DOUBLES, KEY, TRIAL, keys_of
+from recrl.analysis.data.labels import DOUBLES, GROUP, KEY, TRIAL, keys_of
 from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.analysis.data.phase_totals import phase_totals
 from recrl.environments.cmdp import Phase
@@ -155,22 +155,37 @@ class Sweep:
         return int(self.trials["num_costs"].max()) if len(self.trials) else 0
 
     @cached_property
+    def groups(self) -> Sequence[tuple[str, str, str]]:
+        """GROUP of every trial, in the order of ``facts``; a label of its spec may have a digest appended."""
+        keys, _ = keys_of([it.spec for it in self.facts])
+        task, agent, method = (keys.labels[name].tolist() for name in GROUP)
+        return list(zip(task, agent, method, strict=True))
+
+    @property
+    def task_labels(self) -> Sequence[str]:
+        """Label of every trial's task in the data frames, in the order of ``facts``."""
+        return [task for task, _, _ in self.groups]
+
+    @cached_property
     def task_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """The options of every task, by its label."""
-        return {it.spec.task.label: it.spec.task.options for it in self.facts}
+        """The options of every task, by its label in the data frames."""
+        return {label: it.spec.task.options for label, it in zip(self.task_labels, self.facts, strict=True)}
 
     @cached_property
     def exact(self) -> pd.DataFrame:
         """Exact values of the final policies of finite tasks, from ``exact_values``."""
-        tasks = {str(label) for label in self.policies["task"].unique()}
-        choices = {it.spec.task.label: it.spec.task for it in self.facts if it.spec.task.label in tasks}
-        models = {label: finite_model(it.name, it.options) for label, it in choices.items()}
+        tabulated = {str(label) for label in self.policies["task"].unique()}
+        tasks = dict(zip(self.task_labels, (it.spec.task for it in self.facts), strict=True))
+        models = {
+            label: finite_model(it.name, it.options) for label, it in tasks.items() if label in tabulated
+        }
         return exact_values(self.policies, models)
 
     @cached_property
     def agent_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """The options of every agent, by its label."""
-        return {it.spec.agent.label: it.spec.agent.options for it in self.facts}
+        """The options of every agent, by its label in the data frames."""
+        agents = [agent for _, agent, _ in self.groups]
+        return {label: it.spec.agent.options for label, it in zip(agents, self.facts, strict=True)}
 
     def rows(self, name: str) -> pd.DataFrame:
         """Return one of the data frames ROWS for ``assemble``: with TRIAL instead of KEY."""
@@ -182,9 +197,11 @@ class Sweep:
 
     @cached_property
     def _positions(self) -> Mapping[tuple[Any, ...], int]:
-        """Return every trial's position in ``facts``, by its KEY; a label may include the group."""
-        keys = {row[0]: row[1:] for row in self.trials[["trial_id", *KEY]].itertuples(index=False, name=None)}
-        return {keys[it.spec.trial_id]: position for position, it in enumerate(self.facts)}
+        """Return every trial's position in ``facts``, by its KEY."""
+        return {
+            (*group, it.spec.seed): position
+            for position, (group, it) in enumerate(zip(self.groups, self.facts, strict=True))
+        }
 
 
 def load(store: SweepStore) -> Sweep:
@@ -253,7 +270,7 @@ def assemble(
         facts: its trials, in the order of the grid.
         rows: the tables ROWS, in order for each trial, with a column TRIAL instead of KEY.
         grid: the grid file, or empty.
-        notes: of the source.
+        notes: of the source; those of ``is_made_again`` are left out.
     """
     keys, doubles = keys_of([it.spec for it in facts])
     try:
@@ -261,8 +278,8 @@ def assemble(
     except ValueError as error:
         raise RecrlError(str(error)) from error
     tabulated = rows["policies"][TRIAL].unique() if len(rows["policies"]) else ()
-    finite = {facts[int(i)].spec.task.label for i in tabulated}
-    optima, unknown = optima_of([it.spec for it in facts], finite=finite)
+    labels = keys.labels["task"].tolist()
+    optima, unknown = optima_of([it.spec for it in facts], labels, finite={labels[int(i)] for i in tabulated})
     costs = range(max((len(it.spec.deploy_limits) for it in facts), default=0))
     cost_columns, limit_columns = [f"cost_{i}" for i in costs], [f"limit_{i}" for i in costs]
     phase_columns = [f"{kind}_{i}{end}" for i in costs for kind, end in PHASE_COST_COLUMNS]
@@ -280,7 +297,7 @@ def assemble(
         policies=keys.put_before(rows["policies"], ("state",)),
         facts=tuple(facts),
         grid=grid,
-        notes=tuple(dict.fromkeys((*notes, *doubles, *unknown))),
+        notes=tuple(dict.fromkeys((*(it for it in notes if not is_made_again(it)), *doubles, *unknown))),
     )
 
 

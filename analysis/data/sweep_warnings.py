@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -11,12 +12,17 @@ from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
 from recrl.orchestrator.files.curriculum_warnings import (
     HARD_LANDING,
+    NAMED,
     hard_landing_sentence,
     landed_hard,
     no_curriculum_sentence,
 )
 from recrl.orchestrator.provenance.code_changes import other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
+
+BASELINE = "none"  # of ``metrics.comparisons``
+
+_Codes = Mapping[str, set[str]]  # digests, by the name of the package
 
 
 def damages(sweep: Sweep) -> list[str]:
@@ -25,11 +31,53 @@ def damages(sweep: Sweep) -> list[str]:
 
 
 def doubts(sweep: Sweep) -> list[str]:
-    """Return sentences on trials that ran other code than is installed now, and on ineffective curricula."""
+    """Return sentences on trials of other code than is installed, on mixed code and ineffective curricula."""
     changed = [it for it in sweep.facts if other_code(attempts(it), it.spec)]
     complete = sum(it.status is TrialState.COMPLETE for it in changed)
     code = other_code_sentence(complete, len(changed) - complete)
-    return [*([code] if code else []), *curriculum_warnings(sweep)]
+    return [*filter(None, (code, mixed_code_sentence(sweep))), *curriculum_warnings(sweep)]
+
+
+def mixed_code_sentence(sweep: Sweep) -> str:
+    """Name cells whose seeds are averaged, or that are compared with none, but ran different code.
+
+    The code of a trial is that of its last attempt: recrl's, and that of each plug-in. Trials without a
+    record of it do not count.
+
+    Returns:
+        One sentence; empty if there are no such cells.
+    """
+    codes: dict[tuple[str, str, str], _Codes] = {}
+    for group, trial in zip(sweep.groups, sweep.facts, strict=True):
+        for last in attempts(trial)[-1:]:
+            code = {name: {str(digest)} for name, digest in last["code"].items()}
+            codes[group] = _joined(codes.get(group, {}), code)
+    averaged = [group for group, found in codes.items() if _is_mixed(found)]
+    compared = []
+    for (task, agent, method), found in codes.items():
+        baseline = codes.get((task, agent, BASELINE), {})
+        if not _is_mixed(found) and not _is_mixed(baseline) and _is_mixed(_joined(found, baseline)):
+            compared.append((task, agent, method))
+    parts = [
+        *([f"between seeds that are averaged ({_cells(averaged)})"] if averaged else []),
+        *([f"between {BASELINE} and curricula compared with it ({_cells(compared)})"] if compared else []),
+    ]
+    remedy = "launch --rerun-changed makes it that of the installed version"
+    return f"the code that trials ran differs {' and '.join(parts)}; {remedy}" if parts else ""
+
+
+def _joined(one: _Codes, other: _Codes) -> _Codes:
+    return {name: one.get(name, set()) | other.get(name, set()) for name in {**one, **other}}
+
+
+def _is_mixed(codes: _Codes) -> bool:
+    return any(len(digests) > 1 for digests in codes.values())
+
+
+def _cells(groups: Sequence[tuple[str, str, str]]) -> str:
+    """Return the first cells as text, and the number of the others."""
+    more = f" and {len(groups) - NAMED} more" if len(groups) > NAMED else ""
+    return f"{', '.join(map(' '.join, groups[:NAMED]))}{more}"
 
 
 def curriculum_warnings(sweep: Sweep) -> list[str]:
@@ -72,4 +120,4 @@ def attempts(trial: TrialFacts) -> list[dict[str, Any]]:
         attempts = json.loads(trial.provenance).get("attempts", [])
     except (ValueError, AttributeError):
         return []
-    return [attempt for attempt in attempts if isinstance(attempt, dict) and "code" in attempt]
+    return [it for it in attempts if isinstance(it, dict) and isinstance(it.get("code"), dict)]

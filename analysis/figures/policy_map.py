@@ -38,6 +38,7 @@ from recrl.environments.rivergrid.grid_world import (
     task_map,
 )
 from recrl.environments.rivergrid.maps import GOAL, MUD, RIVER, STEPS, WALL, RiverMap
+from recrl.orchestrator.errors import USERS_ERRORS
 
 TILE_COLOURS = {WALL: "#4a4a4a", RIVER: "#b9dcf2", MUD: "#d9c29a", GOAL: "#a8dba8"}
 DRY_COLOUR = "#f6f1e4"
@@ -120,14 +121,17 @@ def _layout(num_maps: int, num_methods: int) -> tuple[int, int, int]:
 
 
 def river_task(sweep: Sweep, task: str) -> tuple[RiverMap, RiverGridOptions] | None:
-    """Return the map and the settings of a task, if it is a RiverGrid."""
+    """Return the map and the settings of a task, if it is a RiverGrid that can be built here."""
     name = str(sweep.trials.loc[sweep.trials["task"] == task, "task_name"].iloc[0])
     if name.partition("-")[0] != "rivergrid":
         return None
-    options = task_options(name, sweep.task_options[task])
-    if not isinstance(options, RiverGridOptions | RiverGridMapOptions):
+    try:
+        options = task_options(name, sweep.task_options[task])
+        if not isinstance(options, RiverGridOptions | RiverGridMapOptions):
+            return None
+        return task_map(name, options), options
+    except USERS_ERRORS:  # options of another version: the sweep has a note of it
         return None
-    return task_map(name, options), options
 
 
 def mean_behaviour(policies: pd.DataFrame, river_map: RiverMap, options: RiverGridOptions) -> MeanBehaviour:

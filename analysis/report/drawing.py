@@ -412,13 +412,13 @@ def _opening(sweep: Sweep, judged: pd.DataFrame) -> str:
 
 def _settings(sweep: Sweep) -> str:
     """Return every task, agent and curriculum with its options, one line each."""
-    settings = {
-        f"{kind} {choice['label']}": choice
+    lines = [
+        f"{kind} {choice['label']}: {json.dumps(choice)}"
         for trial in sweep.facts
         for kind, choice in trial.spec.to_json().items()
         if kind in ("task", "agent", "method")
-    }
-    return "\n".join(f"{it}: {json.dumps(settings[it])}" for it in settings)
+    ]
+    return "\n".join(dict.fromkeys(lines))
 
 
 def _provenance(sweep: Sweep) -> list[str]:

@@ -133,7 +133,7 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
 class _DeterministicPolicy:
     """One vertex of the set of attainable (return, costs); ``actions`` is [H, S]."""
 
-    actions: npt.NDArray[np.int8]
+    actions: npt.NDArray[np.intp]
     episode_return: float
     costs: Floats
 
@@ -150,7 +150,7 @@ def _backward_induction(
     immediate = np.concatenate([model.rewards[:, :, None], model.costs], axis=2)
     going_on = ~model.terminal[:, None]
     values = np.zeros((model.num_states, 1 + model.num_costs))
-    actions = np.zeros((model.horizon, model.num_states), np.int8)
+    actions = np.zeros((model.horizon, model.num_states), np.intp)
     state = np.arange(model.num_states)
     for step in reversed(range(model.horizon)):
         future = np.einsum("sam,samc->sac", model.probabilities, (values * going_on)[model.successors])

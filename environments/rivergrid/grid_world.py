@@ -9,8 +9,8 @@ Optional are ``turns``, 1 for every turn, and ``mud``, 1 for every time step tha
 optimum is exact with two and three constraints, too.
 Termination: at a goal; truncated after ``horizon`` steps (200).
 Source: the paper's section 5 for the idea, the limits and the cost (time steps in the water). Maps, rewards
-and horizon are ours, because the paper's text does not give them. With them every statement of the paper
-about the two instances holds.
+and horizon are ours, because the paper's text does not give them. All were chosen so that the paper's
+statements can hold; not all of them do.
 
 Deterministic: a seed changes nothing. ``RiverGridVectorEnv`` steps tables.
 ``recrl.environments.rivergrid.minigrid_env`` is the same CMDP on MiniGrid; a test compares them step by step.

@@ -1,5 +1,6 @@
 """Final policies of finite tasks are worth what theory and their own episodes say."""
 
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from recrl.analysis.data import export
 from recrl.analysis.data.exact_values import exact_values, finite_model
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics import metrics
+from recrl.environments import plugins
 
 RIVERGRID = Path(__file__).parents[2] / "results" / "rivergrid" / "rivergrid.zip"
 KEYS = ["task", "agent", "method", "seed"]
@@ -41,8 +43,15 @@ def test_rounded_tables_sum_to_one_again() -> None:
     assert values.loc["stochastic", "cost_0"] == pytest.approx(9 * 0.4000002 / 1.0000005, rel=1e-12)
 
 
-@pytest.mark.parametrize(("name", "options"), [("nobody:provides", {}), ("CarGoal2", {})])
-def test_tasks_that_are_not_finite_or_not_here_have_no_model(name: str, options: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("nobody:provides", {}), ("CarGoal2", {}), ("two-state", {"hats": 3}), ("broken", {})],
+)
+def test_tasks_that_are_not_finite_or_not_here_have_no_model(
+    name: str, options: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = EntryPoint("broken", "no_such_module:TASK", "recrl.tasks")
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [broken] if group == broken.group else [])
     assert finite_model(name, options) is None
     assert exact_values(two_state((0.0, 1.0), (1.0, 0.0)), {"mine": finite_model(name, options)}).empty
 

@@ -1,8 +1,9 @@
 """A finished sweep in one file: what comes back, and what it leaves out."""
 
-import dataclasses
+import subprocess
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,14 @@ from recrl.analysis.data.sweep_data import Sweep, drawn_columns
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.report import drawing, table_files
+from recrl.analysis.statistics import metrics
+from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from tests.faults.committing import commit_file
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -79,13 +86,66 @@ def test_figures_and_tables_are_drawn_from_it(
 def test_diagnostics_have_the_same_panels(made_up_sweep: Callable[..., SweepStore], tmp_path: Path) -> None:
     sweep = sweep_data.load(made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none"]))
     explained = {f"explained_variance_{signal}": 0.5 for signal in ("reward", "cost_0")}
-    sweep = dataclasses.replace(sweep, updates=sweep.updates.assign(**explained))
+    sweep = replace(sweep, updates=sweep.updates.assign(**explained))
     small = export.load(export.save(sweep, tmp_path / "sweep.zip"))
     labels = [
         [axes.get_ylabel() for axes in curriculum_diagnostics(it, "a", "cpo").axes] for it in (sweep, small)
     ]
     assert "explained\nvariance, reward" in labels[0]
     assert labels[0] == labels[1]
+
+
+def committed() -> list[str]:
+    """The compact files that the repository has."""
+    listed = ["git", "-C", str(ROOT), "ls-files", "results/*.zip"]
+    return subprocess.run(listed, capture_output=True, text=True, check=True).stdout.split()
+
+
+@pytest.mark.parametrize("path", committed())
+def test_every_committed_file_can_be_read_and_tabulated(path: str, tmp_path: Path) -> None:
+    sweep = export.load(ROOT / path)
+    assert sweep.notes == ()
+    assert len(metrics.outcomes(sweep))
+    assert table_files.write_tables(sweep, tmp_path)
+
+
+@pytest.fixture
+def of_another_version(made_up_sweep: Callable[..., SweepStore]) -> Sweep:
+    """A sweep whose task has an option that is no more; every trial has the table of its final policy."""
+    store = made_up_sweep(seeds=2, tasks=["a"], agents=["cpo"], methods=["none", "linear"])
+    for trial in store.trials():
+        commit_file(trial, "policy.csv", "action_0,action_1\n0.0,1.0\n0.6,0.4\n")
+    sweep = sweep_data.load(store)
+    facts = []
+    for it in sweep.facts:
+        task = replace(it.spec.task, options={**it.spec.task.options, "out_of_range": "clip"})
+        facts.append(replace(it, spec=replace(it.spec, task=task)))
+    return sweep_data.assemble(sweep.name, facts, {name: sweep.rows(name) for name in sweep_data.ROWS})
+
+
+def test_options_of_another_version_cost_no_more_than_what_is_computed_from_them(
+    of_another_version: Sweep, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    note = (
+        "a: the optimum is unknown here, because this version cannot read its options: out_of_range: unknown "
+        "key"
+    )
+    path = export.save(of_another_version, tmp_path / "sweep.zip")
+    sweep = export.load(path)
+    assert of_another_version.notes == sweep.notes == (note,)
+    rows = metrics.outcomes(sweep)
+    assert not rows["exact"].any()
+    assert rows["optimal_return"].isna().all()
+    assert main(["figures", str(path), "--to", str(tmp_path / "figures")]) == ExitCode.OK
+    assert note in (tmp_path / "figures" / "report.md").read_text().replace("\\", "")
+    assert main(["bound", str(path)]) == ExitCode.OK
+    assert capsys.readouterr().err == ""
+
+
+def test_notes_that_hold_no_more_are_left_out(finished: Sweep, tmp_path: Path) -> None:
+    notes = ("kept", "river-a: the optimum is unknown here, because it was not installed")
+    path = export.save(replace(finished, notes=notes), tmp_path / "sweep.zip")
+    assert export.load(path).notes == ("kept",)
 
 
 def test_what_is_no_compact_file_is_named(tmp_path: Path) -> None:

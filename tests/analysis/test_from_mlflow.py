@@ -208,6 +208,26 @@ def test_a_file_that_stays_damaged_is_named(sweep: SweepStore, monkeypatch: pyte
     assert str(caught.value).endswith("recrl-sweep sync --rebuild uploads it again")
 
 
+def test_a_file_of_another_version_is_named_at_once(
+    sweep: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = artifact(sweep)
+    whole = path.read_bytes()
+    monkeypatch.setattr(export, "FORMAT", 3)
+    export.save(sweep_data.load(sweep), path)
+    monkeypatch.undo()
+    monkeypatch.setattr(from_mlflow, "pause", lambda: pytest.fail("waited for a file that is whole"))
+    try:
+        with pytest.raises(TrackingError) as caught:
+            from_mlflow.load(tracking_uri(sweep, None), "made-up")
+    finally:
+        path.write_bytes(whole)
+    assert str(caught.value).endswith(
+        "this version of recrl cannot read the sweep's export file (its format must be 2, got 3; export the "
+        "sweep again); the version that uploaded it can"
+    )
+
+
 def test_a_server_that_is_away_is_named() -> None:
     with pytest.raises(TrackingError, match=r"MLflow at http://127\.0\.0\.1:9 cannot be read: .*refused"):
         from_mlflow.load("http://127.0.0.1:9")

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -11,11 +12,15 @@ from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.merging import merge
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts
 from recrl.analysis.report import drawing
+from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import TrialState
 from tests.conftest import MadeUpSweep
+from tests.faults.committing import commit_file
 
 SMALL: Mapping[str, object] = {"tasks": ("a",), "methods": ("none", "dynamic"), "seeds": 2, "updates": 20}
 TITLES = [f"a {agent} {method} seed {seed}" for agent in ("cpo", "ppo-lag") for method in ("dynamic", "none")
@@ -71,10 +76,98 @@ def test_the_part_that_got_furthest_is_taken(part: Part) -> None:
         assert all(trial.status is TrialState.COMPLETE for trial in merged.facts)
 
 
-def test_trials_of_other_limits_stay_apart(part: Part) -> None:
+def with_options(sweep: Sweep, kind: str, options: Mapping[str, object]) -> Sweep:
+    """The part, had its grid these options of every task, agent or method."""
+    facts = []
+    for it in sweep.facts:
+        choice = dataclasses.replace(getattr(it.spec, kind), options=options)
+        facts.append(dataclasses.replace(it, spec=dataclasses.replace(it.spec, **{kind: choice})))
+    return sweep_data.assemble(sweep.name, facts, {name: sweep.rows(name) for name in ROWS})
+
+
+def by_hand(store: SweepStore) -> Sweep:
+    """The sweep, where every final policy leaves the camp at once, and then is hasty in 4 of 10 steps."""
+    for trial in store.trials():
+        commit_file(trial, "policy.csv", "action_0,action_1\n0.0,1.0\n0.6,0.4\n")
+    return sweep_data.load(store)
+
+
+def test_trials_of_other_limits_stay_apart_and_are_compared_with_their_own_baseline(part: Part) -> None:
     merged = merge([part("loose", deploy_limit=5.0), part("tight", deploy_limit=4.0)])
     assert len(merged.facts) == 2 * len(TITLES)
-    assert "2 groups of trials have these labels but different settings" in merged.notes[0]
+    labels = merged.trials["task"].cat.categories
+    assert [label.partition(" [")[0] for label in labels] == ["a", "a"]
+    assert merged.notes[0].startswith("2 tasks have the label a but different settings; they are kept apart ")
+    assert "(deploy_limits [5.0])" in merged.notes[0]
+    compared = metrics.comparisons(metrics.outcomes(merged), np.random.default_rng(0))
+    assert set(compared["task"]) == set(labels)
+    assert set(compared["method"]) == {"dynamic"}
+
+
+def test_methods_on_other_limits_and_budgets_are_not_compared(part: Part) -> None:
+    parts = [
+        part("none", methods=("none",), deploy_limit=1.0),
+        part("linear", methods=("linear",), deploy_limit=5.0, updates=40),
+    ]
+    merged = merge(parts)
+    assert metrics.comparisons(metrics.outcomes(merged), np.random.default_rng(0)).empty
+    assert set(merged.trials["method"]) == {"none", "linear"}
+    (note,) = merged.notes
+    assert note.startswith("2 tasks have the label a but different settings")
+    assert "(deploy_limits [1.0], train_steps 7600, deploy_steps 400)" in note
+    same = merge([parts[0], part("like-it", methods=("linear",), deploy_limit=1.0)])
+    assert same.notes == ()
+    assert len(metrics.comparisons(metrics.outcomes(same), np.random.default_rng(0)))
+
+
+def test_policies_are_evaluated_on_their_own_task(tmp_path: Path) -> None:
+    few = {**SMALL, "methods": ("none",), "agents": ("cpo",), "seeds": 1}
+    parts = [
+        by_hand(MadeUpSweep(**few, horizon=horizon).write(tmp_path, f"horizon-{horizon}"))  # type: ignore[arg-type]
+        for horizon in (10, 12)
+    ]
+    for merged in (merge(parts), merge(parts[::-1])):
+        assert "(horizon 10)" in merged.notes[0]
+        label = {options["horizon"]: task for task, options in merged.task_options.items()}
+        rows = metrics.outcomes(merged).query("measure == 'stochastic'").set_index("task")
+        for horizon, value, cost in ((10, 12.6, 3.6), (12, 15.4, 4.4)):
+            assert rows["exact"].all()
+            found = rows.loc[label[horizon], ["episode_return", "cost_0"]]
+            assert list(found) == pytest.approx([value, cost])
+        sums = cumulative_costs(merged).set_index("task")["ceiling_sum"].to_dict()
+        assert sums[label[12]] / sums[label[10]] == pytest.approx(12 / 10)
+
+
+@pytest.mark.parametrize(("kind", "nouns"), [("agent", "agents"), ("method", "curricula")])
+def test_other_options_of_one_label_stay_apart(part: Part, kind: str, nouns: str) -> None:
+    few = {"methods": ("dynamic",), "agents": ("cpo",)}
+    merged = merge([with_options(part(**few), kind, {"discount": value}) for value in (0.9, 0.99)])
+    label = few[f"{kind}s"][0]
+    assert all(str(it).startswith(f"{label} [") for it in merged.trials[kind].cat.categories)
+    assert merged.trials[kind].nunique() == 2
+    (note,) = merged.notes
+    assert note.startswith(f"2 {nouns} have the label {label} but different settings")
+    assert "(discount 0.9), " in note
+
+
+def test_each_agent_has_its_own_discount_in_the_bounds(part: Part) -> None:
+    few = {"methods": ("none",), "agents": ("cpo",), "seeds": 1}
+    parts = [with_options(part(**few), "agent", {"discount": value}) for value in (0.5, 0.9)]
+    alone = [cumulative_costs(it)["discounted_bound"].iloc[0] for it in parts]
+    together = cumulative_costs(merge(parts))["discounted_bound"].tolist()
+    assert sorted(together) == sorted(alone)
+    assert alone[0] != alone[1]
+
+
+def test_a_task_of_another_number_of_costs_under_one_label_is_drawn(part: Part, tmp_path: Path) -> None:
+    merged = merge([part("two", num_costs=2), part("one")])
+    numbers = merged.trials.groupby("task", observed=True)["num_costs"].unique()
+    assert sorted(map(list, numbers)) == [[1], [2]]
+    assert drawing.draw(merged, tmp_path / "figures")
+    report = (tmp_path / "figures" / "report.html").read_text()
+    assert all(
+        f"task a: {{&quot;name&quot;: &quot;{name}&quot;" in report for name in ("two-state", "two-state-2")
+    )
 
 
 def test_parts_of_other_numbers_of_costs_join(part: Part) -> None:
@@ -106,8 +199,8 @@ def test_figures_need_no_row_of_the_trials_with_most_costs(part: Part, tmp_path:
 def test_notes_that_are_no_longer_true_are_left_out(part: Part) -> None:
     parts = [part(f"limit-{limit}", deploy_limit=limit) for limit in (3.0, 4.0, 5.0)]
     notes = merge([merge(parts[:2]), parts[2]]).notes
-    assert {note.split(": ")[1].split()[0] for note in notes} == {"3"}
-    assert len(notes) == 4  # one an agent and method
+    (note,) = notes
+    assert note.startswith("3 tasks have the label a ")
 
 
 def test_parts_of_different_grids_are_named(part: Part) -> None:

@@ -81,6 +81,17 @@ def test_other_finite_tasks_have_no_map(finished: Sweep) -> None:
     assert policy_maps(finished, "cpo") is None
 
 
+def test_a_task_whose_options_are_of_another_version_has_no_map(river_sweep: Sweep) -> None:
+    facts = [
+        dataclasses.replace(
+            it,
+            spec=dataclasses.replace(it.spec, task=dataclasses.replace(it.spec.task, options={"ice": True})),
+        )
+        for it in river_sweep.facts
+    ]
+    assert policy_maps(dataclasses.replace(river_sweep, facts=tuple(facts)), "cpo") is None
+
+
 def test_maps_of_one_method_lie_side_by_side(river_sweep: Sweep) -> None:
     other = river_sweep.policies.assign(
         task=pd.Categorical(

@@ -77,6 +77,21 @@ def test_both_solvers_agree_on_rivergrid(name: str, limit: float) -> None:
     assert by_lagrangian.episode_return == pytest.approx(by_program.episode_return, abs=1e-6)
 
 
+def test_an_action_may_have_any_index() -> None:
+    model = FiniteCMDP(
+        successors=np.zeros((1, 200, 1), np.int64),
+        probabilities=np.ones((1, 200, 1)),
+        rewards=np.arange(200.0)[None],
+        costs=np.arange(200.0)[None, :, None],
+        terminal=np.zeros(1, np.bool_),
+        start=np.ones(1),
+        horizon=1,
+        cost_names=("cost",),
+    )
+    for limit, best in ((math.inf, 199.0), (150.5, 150.5)):
+        assert solve_by_lagrangian(model, CostLimits((limit,))).episode_return == pytest.approx(best)
+
+
 def test_both_solvers_agree_on_rivergrid_with_two_constraints_of_which_both_bind() -> None:
     model = river_cmdp(parse_map(MAPS["1b"]), costs=("river", "turns"), horizon=15)
     limits = CostLimits((1.0, 1.5))

@@ -1,0 +1,63 @@
+"""Results of trials that ran different code are averaged and compared, but not without a remark."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+
+import pytest
+
+from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.data.sweep_warnings import doubts, mixed_code_sentence
+from recrl.analysis.report import drawing
+
+REMEDY = "launch --rerun-changed makes it that of the installed version"
+
+
+def with_code(sweep: Sweep, codes: Mapping[str, str], *, others: str = "new") -> Sweep:
+    """The sweep, had its trials run these digests of recrl: by the beginning of their title."""
+    facts = []
+    for it in sweep.facts:
+        code = next((code for title, code in codes.items() if it.spec.title.startswith(title)), others)
+        attempts = [{"code": {"recrl": "first"}}, {"code": {"recrl": code, "mine": "same"}}]
+        facts.append(dataclasses.replace(it, provenance=json.dumps({"attempts": attempts})))
+    return dataclasses.replace(sweep, facts=tuple(facts))
+
+
+def test_one_code_needs_no_remark(finished: Sweep) -> None:
+    assert mixed_code_sentence(finished) == ""
+    assert mixed_code_sentence(with_code(finished, {})) == ""
+
+
+def test_seeds_of_a_cell_that_ran_different_code_are_one_sentence(finished: Sweep) -> None:
+    sweep = with_code(finished, {"river-a cpo linear seed 1": "old", "river-b cpo none seed 0": "old"})
+    sentence = (
+        "the code that trials ran differs between seeds that are averaged (river-a cpo linear, river-b cpo "
+        f"none); {REMEDY}"
+    )
+    assert mixed_code_sentence(sweep) == sentence
+    assert doubts(sweep)[1:] == [sentence]  # after that on code which is not installed
+    assert sentence in drawing.missing(sweep)
+
+
+def test_code_that_differs_from_that_of_the_baseline_is_named(finished: Sweep) -> None:
+    assert mixed_code_sentence(with_code(finished, {"river-a cpo linear": "old"})) == (
+        "the code that trials ran differs between none and curricula compared with it (river-a cpo linear); "
+        f"{REMEDY}"
+    )
+    both = {"river-a cpo none": "old", "river-b cpo none seed 2": "old"}
+    assert mixed_code_sentence(with_code(finished, both)) == (
+        "the code that trials ran differs between seeds that are averaged (river-b cpo none) and "
+        f"between none and curricula compared with it (river-a cpo dynamic, river-a cpo linear); {REMEDY}"
+    )
+
+
+def test_many_cells_are_counted(finished: Sweep) -> None:
+    old = {it.spec.title: "old" for it in finished.facts if it.spec.seed == 0}
+    assert "and 7 more); launch" in mixed_code_sentence(with_code(finished, old))
+
+
+@pytest.mark.parametrize("code", [[], "text", {"recrl": ["a list"]}])
+def test_a_record_of_the_wrong_form_is_no_error(finished: Sweep, code: object) -> None:
+    text = json.dumps({"attempts": [{"code": code}]})
+    facts = tuple(dataclasses.replace(it, provenance=text) for it in finished.facts)
+    assert mixed_code_sentence(dataclasses.replace(finished, facts=facts)) == ""
