@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
@@ -82,7 +83,7 @@ class SweepSync:
             {status: counts[status] for status in DisplayStatus},
             list(summaries),
             charts=f"#{charts_page(self._runs.experiment_id)}",
-            verdicts=verdict_lines(self._outcomes.all()),
+            verdicts=verdict_lines(self._outcomes.all(), self._failed(records)),
             report=self._report(),
         )
         if position.shown.get("note") != text:
@@ -91,6 +92,14 @@ class SweepSync:
             last = max((record.heartbeat for record in records.values()), default=0.0)
             self._runs.set_status(position.run_id, status, last or time.time())
         return replace(position, shown={**position.shown, "note": text, "status": status})
+
+    def _failed(self, records: Mapping[str, TrialRecord]) -> Mapping[tuple[str, str, str], int]:
+        """Return the number of failed trials by task, agent and curriculum."""
+        return Counter(
+            (spec.task.label, spec.agent.label, spec.method.label)
+            for spec in self._store.specs()
+            if records[spec.folder_name].status is TrialState.FAILED
+        )
 
     def _report(self) -> str:
         """Return the address of the report in MLflow, or empty before it is drawn."""

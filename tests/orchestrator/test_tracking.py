@@ -30,6 +30,7 @@ from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import tracking_uri
+from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, verdict_lines
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.run_content import (
     Summary,
@@ -632,6 +633,19 @@ def test_sync_measures_the_final_policies_that_no_report_has(
     written = (store.figures_folder / "outcomes.csv").stat().st_mtime_ns
     assert main(["sync", "small"]) == ExitCode.OK
     assert (store.figures_folder / "outcomes.csv").stat().st_mtime_ns == written
+
+
+def test_failed_trials_are_in_the_table_of_verdicts() -> None:
+    group, other = ("map", "cpo", "none"), ("map", "cpo", "linear")
+    outcomes = [
+        FinalOutcome(str(seed), group, 4.0, (1.0,), (1.0,), is_feasible=True, is_solved=not seed, exact=True)
+        for seed in range(2)
+    ]
+    assert verdict_lines(outcomes, {group: 3, other: 2})[2:] == [
+        "| map | cpo | none | solved 1 of 5, feasible 1 of 5, failed 3 of 5 | 1.000 | 1.00 | 4.00 | 2 |",
+        "| map | cpo | linear | failed |  |  |  | 0 |",
+    ]
+    assert verdict_lines(outcomes)[2].split(" | ")[3] == "solved 1 of 2, feasible 1 of 2"
 
 
 def test_a_long_table_of_verdicts_leaves_room_for_the_rest() -> None:
