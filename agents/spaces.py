@@ -76,17 +76,15 @@ def action_size(space: gymnasium.Space[Any]) -> int:
 def action_range(space: Box) -> tuple[Floats, Floats]:
     """Return the middle of each action component's range and half its length, [m] each.
 
-    They are the agent's zero and unit. A component without two bounds has 0 and 1. A bound of ``UNBOUNDED``
-    or beyond, such as the largest number of a type, counts as none.
+    They are the agent's zero and unit. A component without two bounds counts as one from -1 to 1. A bound of
+    ``UNBOUNDED`` or beyond, such as the largest number of a type, is none.
 
     >>> action_range(Box(np.float32([10.0, -np.inf]), np.float32([20.0, 5.0])))
     (array([15.,  0.]), array([5., 1.]))
     """
     low, high = (np.asarray(bound, np.float64).reshape(-1) for bound in (space.low, space.high))
-    bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
-    middle = np.where(bounded, 0.5 * (np.where(bounded, high, 0.0) + np.where(bounded, low, 0.0)), 0.0)
-    half = np.where(bounded, 0.5 * (np.where(bounded, high, 0.0) - np.where(bounded, low, 0.0)), 1.0)
-    return middle, half
+    low, high = np.where((low > -UNBOUNDED) & (high < UNBOUNDED), [low, high], [[-1.0], [1.0]])
+    return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -16,7 +16,7 @@ Notation: N samples, k costs, P parameters, delta the trust region's size, H its
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -53,14 +53,24 @@ class LocalModel:
     """
 
     def __init__(self, policy: StochasticPolicy, experience: Experience, advantages: Floats) -> None:
-        self.policy, self._experience = policy, experience
+        self._policy, self._experience = policy, experience
         self._advantages = experience.batch.per_pair(advantages)
 
-    def gradients(self) -> Tensor:
-        """Return the gradients of all surrogates at the policy's present parameters, [1 + k, P]."""
-        now = self.policy.evaluate(self._experience.batch.unique_observations)
+    def gradients(self, lowered: Sequence[int] = ()) -> Tensor:
+        """Return the gradients of all surrogates at the policy's present parameters, [1 + k, P].
+
+        A standard deviation at its bound is held, so its derivatives are 0, if raising the reward or lowering
+        one of some costs would lower it.
+
+        Args:
+            lowered: the costs that the step is to lower, indices below k.
+        """
+        now = self._policy.evaluate(self._experience.batch.unique_observations)
         surrogates = self._surrogates(now.distribution)
-        return torch.stack([now.gradient(each, retain_graph=True).clone() for each in surrogates.unbind()])
+        found = torch.stack([now.gradient(each, retain_graph=True).clone() for each in surrogates.unbind()])
+        ascents = torch.cat([found[:1], -found[[1 + cost for cost in lowered]]])
+        self._policy.hold_bounded_std(found, ascents)
+        return found
 
     def metric(self, config: TrustRegionConfig, generator: np.random.Generator) -> FisherMetric:
         """Return the Hessian of the divergence at the policy's present parameters, plus damping.
@@ -69,7 +79,7 @@ class LocalModel:
         the direction has a cosine of 0.998 with the full one and takes a tenth of the time.
         """
         rows, weights = self._experience.batch.thinned(config.metric_samples, generator)
-        return FisherMetric(self.policy, rows, weights, config.damping)
+        return FisherMetric(self._policy, rows, weights, config.damping)
 
     def _surrogates(self, distribution: Distribution) -> Tensor:
         return surrogate(self._experience.ratios(distribution), self._advantages)
@@ -82,7 +92,7 @@ class LocalModel:
     def measure(self) -> tuple[npt.NDArray[np.floating], float]:
         """Return the surrogates [1 + k] and the mean KL at the present parameters, in nats."""
         batch = self._experience.batch
-        distribution = self.policy.distribution(batch.unique_observations)
+        distribution = self._policy.distribution(batch.unique_observations)
         divergence = mean_divergence(self._experience.old, distribution, batch.observation_weights)
         return self._surrogates(distribution).numpy(force=True), float(divergence)
 
@@ -91,10 +101,8 @@ def linearise(
     model: LocalModel, active: ActiveConstraints, metric: FisherMetric, config: TrustRegionConfig
 ) -> tuple[StepProblem, Tensor]:
     """Return the step's problem reduced to products, and H^-1 g, H^-1 b_1, ..., H^-1 b_j, [1 + j, P]."""
-    gradients = model.gradients()
+    gradients = model.gradients(lowered=active.index[active.violations > 0.0].tolist())
     chosen = torch.cat([-gradients[:1], gradients[1 + torch.as_tensor(active.index)]])
-    wanted = torch.as_tensor(np.concatenate([[True], active.violations > 0.0]))
-    model.policy.hold_bounded_std(chosen, -chosen[wanted])
     solved = torch.stack(
         [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in chosen]
     )

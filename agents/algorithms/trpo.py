@@ -55,9 +55,7 @@ def trust_region_step(
     """
     model = LocalModel(policy, experience, objective[:, None])
     metric = model.metric(config, generator)
-    gradients = model.gradients()
-    policy.hold_bounded_std(gradients, gradients)
-    gradient = gradients[0]
+    gradient = model.gradients()[0]
     direction = conjugate_gradient(metric, gradient, iterations=config.conjugate_gradient_steps)
     squared = float(torch.dot(direction, metric(direction)))
     require_finite("the squared length of the trust region's direction", squared)

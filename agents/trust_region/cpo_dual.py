@@ -52,9 +52,8 @@ NO_INFLUENCE = 1e-12
 NO_GRADIENT = 1e-10
 # Tolerance of a constraint for rounding, as a fraction of what the trust region can change.
 FEASIBILITY_TOLERANCE = 1e-9
-# A constraint that a solved step should meet may be violated by this fraction of what the trust region can
-# change.
-ROUNDING = 1e-6
+# Likewise, of a binding constraint: the error of a nearly dependent system of them, see NO_GRADIENT.
+BINDING_TOLERANCE = 1e-6
 
 
 class StepCase(IntEnum):
@@ -97,7 +96,9 @@ class StepProblem:
     def unmet(self, solution: DualSolution) -> npt.NDArray[np.bool_]:
         """Return which violated constraints a step leaves violated, to first order, [k]."""
         reach = np.sqrt(2.0 * self.radius * np.maximum(np.diag(self.gram), 0.0))
-        left: npt.NDArray[np.bool_] = (self.violations > 0.0) & (self.after(solution) > ROUNDING * reach)
+        left: npt.NDArray[np.bool_] = (self.violations > 0.0) & (
+            self.after(solution) > BINDING_TOLERANCE * reach
+        )
         return left
 
 

@@ -38,6 +38,7 @@ from recrl.environments.registry import task_options
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
 from recrl.orchestrator.grid.building import BuildError, build_own, cmdp_of
 from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
+from recrl.orchestrator.grid.curriculum_checks import unsuitable
 from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, SweepName, TaskEntry
 from recrl.orchestrator.grid.problem_list import TASK_MARK, ProblemList
 from recrl.orchestrator.located_yaml import Place, Problem, parse
@@ -200,34 +201,14 @@ class _Check:
         self._check_curricula(grid)
 
     def _check_curricula(self, grid: GridSpec) -> None:
-        """Check that each agent's constraint and each task's limits suit the curriculum of its trials."""
-        places: dict[tuple[str, str], Place] = {
-            (key, entry.label): (key, index)
-            for key, entries in (("agents", grid.agents), ("methods", grid.methods))
-            for index, entry in enumerate(entries)
-        }
+        """Check that the curriculum of each trial suits its agent and limits; one sentence per entry."""
         found: dict[Place, str] = {}
         for trial in grid.trials():
-            task, agent, method = trial.task.label, trial.agent, trial.method
-            is_measured = not all(map(math.isfinite, trial.train_limits))
-            if agent.options.get("constraint") == "cvar" and method.name not in ("none", "unconstrained"):
-                place = places["agents", agent.label]
-                if method.name == "dynamic":
-                    found[place] = (
-                        "constraint: cvar does not suit the method dynamic, which compares mean costs with "
-                        "the limits; use constraint: mean, or exclude the pair"
-                    )
-                elif is_measured:
-                    found.setdefault(
-                        place,
-                        f"constraint: cvar does not suit the train_limits of {task}, which are measured as "
-                        "mean costs; give them as numbers",
-                    )
-            if method.name == "cooling" and not any(trial.deploy_limits):
-                found[places["methods", method.label]] = (
-                    f"cooling relaxes a limit in proportion to it, so the deploy_limits of {task}, 0, are "
-                    "never relaxed; use another method, or limits above 0"
+            for section, sentence in unsuitable(trial):
+                entries, entry = (
+                    (grid.agents, trial.agent) if section == "agents" else (grid.methods, trial.method)
                 )
+                found.setdefault((section, entries.index(entry)), sentence)
         for place, sentence in found.items():
             self.problems.add(place, sentence)
 

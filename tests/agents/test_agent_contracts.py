@@ -324,16 +324,13 @@ def test_no_update_lets_a_standard_deviation_fall_below_its_bound(agent: str) ->
 
 
 @pytest.mark.parametrize("agent", ["cpo", "pcpo", "crpo", "trpo", "trpo-lag"])
-def test_a_trust_region_step_at_the_bound_of_the_standard_deviations_is_what_was_accepted(agent: str) -> None:
+def test_a_standard_deviation_at_its_bound_takes_nothing_of_the_trust_region(agent: str) -> None:
     lessons = Lessons(agent, "continuous-bandit", {"min_std": 0.6, "target_kl": 0.005})
     for _ in range(8):
         lessons.update()
-    # Without a binding limit, the accepted surrogate does not fall.
-    for _ in range(4):
+    for _ in range(4):  # without a limit the whole trust region is used
         metrics = lessons.update(math.inf)
-        assert metrics["policy_steps"] == 1.0
-        assert 0.0 < metrics["kl"] <= 0.005
-        assert metrics["surrogate_reward"] >= -1e-6
+        assert 0.98 * 0.005 < metrics["kl"] <= 0.005
 
 
 @pytest.mark.parametrize("activation", ["relu", "elu", "gelu", "silu"])

@@ -1,12 +1,18 @@
 """Conjugate gradients and the line search."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
 
+from recrl.agents.algorithms.own_options import TRPOConfig
+from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.networks.architecture import NetworkForm, orthogonal
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
-from recrl.agents.trust_region.line_search import backtrack
+from recrl.agents.trust_region.line_search import backtrack, line_search
 
 
 def test_conjugate_gradients_solve_a_system_in_as_many_steps_as_it_has_unknowns() -> None:
@@ -41,6 +47,42 @@ def test_the_longest_acceptable_step_is_taken() -> None:
     )
     assert shortened == 2
     assert parameters.values.item() == pytest.approx(3.0)
+
+
+def test_a_step_is_projected_before_it_is_checked() -> None:
+    parameters, checked = parameters_at(1.0), []
+
+    def project() -> None:
+        parameters.values.clamp_(min=-5.0)
+
+    def is_acceptable() -> bool:
+        checked.append(parameters.values.item())
+        return len(checked) == 2
+
+    shortened = backtrack(
+        parameters,
+        torch.tensor([-8.0]),
+        is_acceptable,
+        ratio=0.5,
+        tries=5,
+        project=project,
+    )
+    assert (shortened, checked, parameters.values.item()) == (1, [-5.0, -3.0], -3.0)
+
+
+def test_the_line_search_checks_policies_with_their_standard_deviations_at_the_bound() -> None:
+    policy = StochasticPolicy(
+        3, Box(-1.0, 1.0, (2,)), NetworkForm((4,), orthogonal), 1.0, torch.Generator(), min_std=0.5
+    )
+    step, checked = torch.zeros_like(policy.parameters.values), []
+    step[-2:] = torch.tensor([-9.0, 0.25])
+
+    def is_acceptable() -> bool:
+        checked.append(policy.log_std.exp().tolist())
+        return True
+
+    line_search(policy, step, is_acceptable, TRPOConfig())
+    assert checked == [pytest.approx([0.5, math.exp(-0.25)])]
 
 
 def test_where_nothing_is_acceptable_the_old_parameters_stand() -> None:

@@ -195,7 +195,7 @@ def test_a_curriculum_of_mean_costs_does_not_go_with_limits_on_a_cvar() -> None:
     (problem,) = _problems(worst)
     assert problem == (
         "grid.yaml:3: agents.1: constraint: cvar does not suit the train_limits of two-state, which are "
-        "measured as mean costs; give them as numbers"
+        "measured as mean costs; give them as numbers, or exclude the pair"
     )
     given_limits = worst.replace("deploy_limits: 2", "deploy_limits: 2, train_limits: 6")
     assert len(_grid(given_limits).trials()) == 8

@@ -1,0 +1,38 @@
+"""Checks that a trial's curriculum suits its agent's constraint and its task's limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from recrl.orchestrator.spec import TrialSpec
+
+# Methods that measure nothing, whatever d_t is.
+MEASURING_NOTHING = ("none", "unconstrained")
+
+
+def unsuitable(trial: TrialSpec) -> Iterator[tuple[str, str]]:
+    """Yield what does not suit: the section of the grid to change, ``agents`` or ``methods``, and a sentence.
+
+    Curricula measure mean costs. An agent that bounds a CVaR compares another value with the same limits.
+    """
+    method, task = trial.method.name, trial.task.label
+    if trial.agent.options.get("constraint") == "cvar":
+        if method == "dynamic":
+            yield (
+                "agents",
+                "constraint: cvar does not suit the method dynamic, which compares mean costs with the "
+                "limits; use constraint: mean, or exclude the pair",
+            )
+        elif method not in MEASURING_NOTHING and not all(map(math.isfinite, trial.train_limits)):
+            yield (
+                "agents",
+                f"constraint: cvar does not suit the train_limits of {task}, which are measured as mean "
+                "costs; give them as numbers, or exclude the pair",
+            )
+    if method == "cooling" and not any(trial.deploy_limits):
+        yield (
+            "methods",
+            f"cooling relaxes a limit in proportion to it, so the deploy_limits of {task}, 0, are never "
+            "relaxed; use another method, or limits above 0",
+        )
