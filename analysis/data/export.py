@@ -134,9 +134,7 @@ def load(path: Path) -> Sweep:
         raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({reason})") from error
     found = told.get("format") if isinstance(told, dict) else None
     if found != FORMAT:
-        raise OtherVersionError(
-            f"{path}: its format must be {FORMAT}, got {found!r:.60}; export the sweep again"
-        )
+        raise OtherVersionError(f"{path}: {OTHER_VERSION}: its format must be {FORMAT}, got {found!r:.60}")
     try:
         checked = _SweepFile.model_validate(told)
         for name, data in zip(names[1:], frames, strict=True):

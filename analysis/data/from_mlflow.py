@@ -41,7 +41,7 @@ def load(uri: str, name: str | None = None) -> Sweep:
                 if isinstance(error, export.OtherVersionError):  # an upload of the same sweep is no cure
                     raise TrackingError(
                         f"MLflow at {redacted(uri)}: this version of recrl cannot read the sweep's export "
-                        f"file ({reason}); the version that uploaded it can"
+                        f"file ({reason})"
                     ) from error
                 if not tries_left:
                     raise TrackingError(

@@ -97,19 +97,27 @@ def keys_of(specs: Sequence[TrialSpec]) -> tuple[Keys, list[str]]:
     """Return the trials' labels, and notes on labels that had to be made unique.
 
     In a grid, a label has one meaning. In merged sweeps it may have several: a task with another horizon,
-    limit or budget, or an agent or a curriculum with other options. Their trials must not be averaged or
-    compared. So a digest of the settings is appended to such a label.
+    limit or budget, or an agent or a curriculum of one task with other options. Their trials must not be
+    averaged or compared. So a digest of the settings is appended to such a label.
     """
     meanings = [_meanings(spec) for spec in specs]
     labels, notes = {}, []
+    within = [""] * len(specs)  # trials of different tasks are never averaged or compared
     for name, (nouns, first) in {
         "task": ("tasks", ()),
         "agent": ("agents", AGENT_ORDER),
         "method": ("curricula", METHOD_ORDER),
     }.items():
-        values, found = _told_apart([meaning[name] for meaning in meanings], nouns)
-        labels[name] = pd.Categorical(values, categories=ordered(values, first), ordered=True)
+        of_name = [meaning[name] for meaning in meanings]
+        values, found = _told_apart(of_name, within, nouns)
+        variants: dict[str, set[str]] = {}
+        for meaning, value in zip(of_name, values, strict=True):
+            variants.setdefault(meaning["label"], set()).add(value)
+        categories = [value for label in ordered(variants, first) for value in sorted(variants[label])]
+        labels[name] = pd.Categorical(values, categories=categories, ordered=True)
         notes += found
+        if name == "task":
+            within = values
     return Keys(labels, np.array([spec.seed for spec in specs], dtype=np.int64)), notes
 
 
@@ -127,27 +135,33 @@ def _meanings(spec: TrialSpec) -> dict[str, Settings]:
     }
 
 
-def _told_apart(meanings: Sequence[Settings], nouns: str) -> tuple[list[str], list[str]]:
+def _told_apart(
+    meanings: Sequence[Settings], within: Sequence[str], nouns: str
+) -> tuple[list[str], list[str]]:
     """Return a label for every trial, unique to its settings, and a note for each label that was not.
 
     Args:
         meanings: the settings behind the label of each trial, ``label`` included.
+        within: the task of each trial in which its label is to be unique; empty for all trials.
         nouns: for the notes, for example ``tasks``.
     """
     texts = [json.dumps(meaning, sort_keys=True) for meaning in meanings]
-    by_label: dict[str, dict[str, Settings]] = {}
-    for text, meaning in zip(texts, meanings, strict=True):
-        by_label.setdefault(meaning["label"], {})[text] = meaning
-    unique: dict[str, str] = {}
+    by_label: dict[tuple[str, str], dict[str, Settings]] = {}
+    for text, task, meaning in zip(texts, within, meanings, strict=True):
+        by_label.setdefault((task, meaning["label"]), {})[text] = meaning
+    unique: dict[tuple[str, str], str] = {}
     notes = []
-    for label, found in sorted(by_label.items()):
+    for (task, label), found in sorted(by_label.items()):
         several = len(found) > 1
-        unique |= {text: f"{label} [{_digest(text)}]" if several else label for text in found}
+        unique |= {(task, text): f"{label} [{_digest(text)}]" if several else label for text in found}
         if several:
             different = _differences(list(found.values()))
-            kept = [f"{unique[text]} ({it})" for text, it in zip(found, different, strict=True)]
-            notes.append(f"{len(found)} {nouns} have the label {label} {DOUBLES} {_listed(kept)}")
-    return [unique[text] for text in texts], notes
+            kept = [f"{unique[task, text]} ({it})" for text, it in zip(found, different, strict=True)]
+            where = f" on {task}" if task else ""
+            notes.append(
+                f"{len(found)} {nouns} have the label {label}{where} {DOUBLES} {listed(kept, SHOWN)}"
+            )
+    return [unique[task, text] for task, text in zip(within, texts, strict=True)], notes
 
 
 def _digest(text: str) -> str:
@@ -163,7 +177,7 @@ def _differences(meanings: Sequence[Settings]) -> list[str]:
     ]
     names = dict.fromkeys(name for each in flat for name in each)
     differing = [name for name in names if len({each.get(name) for each in flat}) > 1]
-    return [_listed([_setting(name[1], each.get(name)) for name in differing]) for each in flat]
+    return [listed([_setting(name[1], each.get(name)) for name in differing], SHOWN) for each in flat]
 
 
 def _setting(name: str, value: str | None) -> str:
@@ -172,7 +186,11 @@ def _setting(name: str, value: str | None) -> str:
     return f"{name} {value if len(value) <= LONGEST_VALUE else value[:LONGEST_VALUE] + '...'}"
 
 
-def _listed(texts: Sequence[str]) -> str:
-    """Return the first SHOWN texts with commas, and the number of the others."""
-    more = f" and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
-    return f"{', '.join(texts[:SHOWN])}{more}"
+def listed(texts: Sequence[str], most: int) -> str:
+    """Return the first texts with commas, and the number of the others.
+
+    >>> listed(["a", "b", "c", "d"], 2)
+    'a, b and 2 more'
+    """
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return f"{', '.join(texts[:most])}{more}"

@@ -182,10 +182,12 @@ class Sweep:
         return exact_values(self.policies, models)
 
     @cached_property
-    def agent_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """The options of every agent, by its label in the data frames."""
-        agents = [agent for _, agent, _ in self.groups]
-        return {label: it.spec.agent.options for label, it in zip(agents, self.facts, strict=True)}
+    def agent_options(self) -> Mapping[tuple[str, str], Mapping[str, Any]]:
+        """The options of every agent, by the labels of its task and itself in the data frames."""
+        return {
+            (task, agent): it.spec.agent.options
+            for (task, agent, _), it in zip(self.groups, self.facts, strict=True)
+        }
 
     def rows(self, name: str) -> pd.DataFrame:
         """Return one of the data frames ROWS for ``assemble``: with TRIAL instead of KEY."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from recrl.analysis.data.labels import KEY
+from recrl.analysis.data.labels import KEY, listed
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
 from recrl.orchestrator.files.curriculum_warnings import (
     HARD_LANDING,
@@ -62,7 +62,7 @@ def mixed_code_sentence(sweep: Sweep) -> str:
         *([f"between seeds that are averaged ({_cells(averaged)})"] if averaged else []),
         *([f"between {BASELINE} and curricula compared with it ({_cells(compared)})"] if compared else []),
     ]
-    remedy = "launch --rerun-changed makes it that of the installed version"
+    remedy = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
     return f"the code that trials ran differs {' and '.join(parts)}; {remedy}" if parts else ""
 
 
@@ -75,9 +75,7 @@ def _is_mixed(codes: _Codes) -> bool:
 
 
 def _cells(groups: Sequence[tuple[str, str, str]]) -> str:
-    """Return the first cells as text, and the number of the others."""
-    more = f" and {len(groups) - NAMED} more" if len(groups) > NAMED else ""
-    return f"{', '.join(map(' '.join, groups[:NAMED]))}{more}"
+    return listed([" ".join(group) for group in groups], NAMED)
 
 
 def curriculum_warnings(sweep: Sweep) -> list[str]:

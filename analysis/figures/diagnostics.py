@@ -70,7 +70,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     )
     rows = [quantities[0], *(name for name in quantities[1:] if _known(updates, name))]
     limit = float(trials[f"deploy_limit_{cost}"].iloc[0])
-    target = _target(sweep, agent)
+    target = _target(sweep, task, agent)
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 1.15 * len(rows) + 0.85), layout="constrained")
         grid = figure.subplots(len(rows), len(methods), squeeze=False, sharex=True, sharey="row")
@@ -107,9 +107,9 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     return figure
 
 
-def _target(sweep: Sweep, agent: str) -> float | None:
+def _target(sweep: Sweep, task: str, agent: str) -> float | None:
     """Return the KL divergence that the agent's updates aim at or end at; None if it has none."""
-    target = sweep.agent_options[agent].get("target_kl")
+    target = sweep.agent_options[task, agent].get("target_kl")
     return float(target) if isinstance(target, int | float) else None
 
 

@@ -44,6 +44,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     failed = sweep.trials[sweep.trials["status"] == TrialState.FAILED.value]
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     tasks, agents = occurring(rows["task"]), occurring(rows["agent"])
+    drawn = set()
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 1.5 * len(tasks) + 0.9), layout="constrained")
         grid = figure.subplots(len(tasks), len(agents), squeeze=False, sharex="row", sharey=True)
@@ -51,13 +52,15 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
             chosen = rows[rows["task"] == task]
             thresholds = _thresholds(chosen)
             for axes, agent in zip(line, agents, strict=True):
+                complete, lost = panels.rows_of(rows, task, agent), panels.rows_of(failed, task, agent)
                 for method, style in look.items():
-                    runs, lost = (
-                        frame[frame["method"] == method]
-                        for frame in (panels.rows_of(it, task, agent) for it in (rows, failed))
+                    runs, num_failed = (
+                        complete[complete["method"] == method],
+                        (lost["method"] == method).sum(),
                     )
-                    if len(runs) + len(lost):
-                        shares = performance_profile(feasible_scores(runs, failed=len(lost)), thresholds)
+                    if len(runs) + num_failed:
+                        drawn.add(method)
+                        shares = performance_profile(feasible_scores(runs, failed=num_failed), thresholds)
                         axes.plot(thresholds, shares, **style.line, zorder=3.0 + bool(style.dashes))
                 for optimum in sorted(set(chosen["optimal_return"].dropna())):
                     axes.axvline(optimum, color=OPTIMUM_COLOUR, linewidth=0.7, zorder=1.0)
@@ -66,8 +69,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
             line[0].set_ylabel("fraction of runs")
         for axes in grid[-1]:
             axes.set_xlabel("return")
-        ended = {*rows["method"], *failed["method"]}
-        present = [method for method in look if method in ended]
+        present = [method for method in look if method in drawn]
         panels.legend_above(
             figure,
             [Line2D([], [], **look[method].line, label=method) for method in present],

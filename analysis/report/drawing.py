@@ -98,10 +98,6 @@ class Drawing:
     make: Callable[[], Figure | None]
     about: tuple[str, ...] = ()
 
-    def __call__(self) -> Figure | None:
-        """Draw the figure; None without data."""
-        return self.make()
-
     @property
     def caption(self) -> str:
         """The caption: the labels as in the grid, and what the figure shows."""
@@ -132,7 +128,7 @@ def draw(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[
     figures = drawings(sweep, averaging=averaging)
     for stem, drawing in figures.items():
         with mistakes.kept(stem):
-            if (figure := drawing()) is not None:
+            if (figure := drawing.make()) is not None:
                 drawn += styles.save(figure, folder, stem)
     written = _with_pages(_noted(sweep, mistakes.notes), folder, drawn, figures)
     mistakes.raise_first()
@@ -151,7 +147,7 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> lis
     figures = drawings(sweep, averaging=averaging)
     for stem, drawing in figures.items():
         with mistakes.kept(stem):
-            if drawing.kind in SKETCHED and (figure := drawing()) is not None:
+            if drawing.kind in SKETCHED and (figure := drawing.make()) is not None:
                 drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
     written = _with_pages(_noted(sweep, [*mistakes.notes, UNFINISHED]), folder, drawn, figures)
     mistakes.raise_first()
@@ -411,12 +407,11 @@ def _opening(sweep: Sweep, judged: pd.DataFrame) -> str:
 
 
 def _settings(sweep: Sweep) -> str:
-    """Return every task, agent and curriculum with its options, one line each."""
+    """Return every task, agent and curriculum with its options, one line each, under the tables' labels."""
     lines = [
-        f"{kind} {choice['label']}: {json.dumps(choice)}"
-        for trial in sweep.facts
-        for kind, choice in trial.spec.to_json().items()
-        if kind in ("task", "agent", "method")
+        f"{kind} {label}: {json.dumps(trial.spec.to_json()[kind])}"
+        for group, trial in zip(sweep.groups, sweep.facts, strict=True)
+        for kind, label in zip(GROUP, group, strict=True)
     ]
     return "\n".join(dict.fromkeys(lines))
 

@@ -105,11 +105,11 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
         return written, Tables()
     generator = np.random.default_rng(BOOTSTRAP_SEED)
     averaged = metrics.summary(rows, sweep.trials)
-    robust = metrics.robust_summary(rows, generator).drop(columns="seeds")
+    robust = metrics.robust_summary(rows, generator).drop(columns=["seeds", "too_few_seeds"])
     compared = metrics.comparisons(rows, generator)
     weighed = claims.count_claims(rows, totals, sweep.trials)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], how="left", sort=False)
-    whole["too_few_seeds"] = whole["too_few_seeds"].ne(False)  # nor are there enough without a seed
+    whole["too_few_seeds"] = whole["seeds"] < ENOUGH_RUNS
     judged = count_verdicts(rows, compared, curriculum_flags(sweep), sweep.trials, cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
     outcomes = _outcome_tables(rows, averaged, suffixes)

@@ -31,6 +31,7 @@ WARNINGS = {
     ),
 }
 ONE_SEED = "One seed (n = 1): no intervals, and another seed may give another verdict."
+ONE_RESULT = "No row has more than one final policy: no intervals."
 SOME_LIMIT = "a limit"
 NO_VERDICT = "No trial is complete yet: no verdict."
 NOT_EVALUATED = "No final policy was evaluated: set run.evaluation_episodes."
@@ -47,8 +48,19 @@ def no_verdict(sweep: Sweep) -> str:
         return NOT_EVALUATED
     failed = int((status == TrialState.FAILED.value).sum())
     if failed == len(status):
-        return f"No trial is complete: no verdict. All {failed} failed."
+        all_trials = f"all {failed} trials" if failed > 1 else "the only trial"
+        return f"No verdict: {all_trials} failed."
     return f"{NO_VERDICT} {failed} of {len(status)} failed." if failed else NO_VERDICT
+
+
+def all_exact(verdicts: pd.DataFrame) -> bool:
+    """Whether there are final policies, and the numbers of all of them were computed, not sampled.
+
+    Args:
+        verdicts: of ``verdict_counts.count_verdicts``.
+    """
+    evaluated = verdicts[verdicts["seeds"] > 0]
+    return bool(len(evaluated) and evaluated["exact"].all())
 
 
 def explanation(verdicts: pd.DataFrame) -> list[str]:
@@ -57,7 +69,6 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
-    evaluated = verdicts[verdicts["seeds"] > 0]
     failed = (
         "Failed: the trial has no final policy. It counts as neither solved nor feasible; the means are over "
         "the n others."
@@ -71,7 +82,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         f"{measured_how(verdicts)}.",
         *errors,
         f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known.",
-        tolerance_sentence(exact=bool(evaluated["exact"].all())),
+        tolerance_sentence(exact=all_exact(verdicts)),
         "The return of an infeasible policy may be above the optimum: it is no success.",
         *([failed] if verdicts["failed"].any() else []),
         *([pending] if verdicts["pending"].any() else []),
@@ -88,9 +99,9 @@ def measured_how(verdicts: pd.DataFrame) -> str:
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
-    verdicts = verdicts[verdicts["seeds"] > 0]
-    if verdicts["exact"].all():
+    if all_exact(verdicts):
         return "computed exactly from the recorded policies"
+    verdicts = verdicts[verdicts["seeds"] > 0]
     sampled = f"means over {int(verdicts.loc[~verdicts['exact'], 'episodes'].min())} episodes"
     tasks = [str(task) for task in dict.fromkeys(verdicts.loc[verdicts["exact"], "task"])]
     return f"{sampled}, but computed exactly on {_listed(tasks)}" if tasks else sampled
@@ -117,7 +128,7 @@ def task_sentences(sweep: Sweep, verdicts: pd.DataFrame) -> list[str]:
     sentences = []
     for task in dict.fromkeys(verdicts["task"]):
         trials = sweep.trials[sweep.trials["task"] == task]
-        exact = bool(verdicts.loc[(verdicts["task"] == task) & (verdicts["seeds"] > 0), "exact"].all())
+        exact = all_exact(verdicts[verdicts["task"] == task])
         name = str(trials["task_name"].iloc[0])
         parts = [TASKS[name].summary] if name in TASKS else []
         for i in range(int(trials["num_costs"].max())):
@@ -293,7 +304,9 @@ def answers(verdicts: pd.DataFrame) -> list[str]:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
     tasks = dict.fromkeys(verdicts["task"])
-    first = [ONE_SEED] if len(verdicts) and verdicts["seeds"].max() == 1 else []
+    first = []
+    if len(verdicts) and verdicts["seeds"].max() == 1:
+        first = [ONE_SEED if verdicts["planned"].max() == 1 else ONE_RESULT]
     return [*first, *(_answer(task, verdicts[verdicts["task"] == task]) for task in tasks)]
 
 

@@ -162,21 +162,20 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFram
         rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     )
     costs = training.assign(**{TRAINING_COST: training["cost_0_total"] / training["episodes"]})
-    if "cost_1_total" in training:
-        costs = costs.iloc[:0]
-    failed = trials[trials["status"] == TrialState.FAILED.value]
     lines = []
     for claim in CLAIMS:
         of_training = isinstance(claim, Comparison) and claim.quantity == TRAINING_COST
-        chosen, beside, gone = (
-            _about(frame, claim) for frame in (costs if of_training else final, deployed, failed)
+        if of_training and "cost_1_total" in training:
+            continue
+        chosen, beside, planned = (
+            _about(frame, claim) for frame in (costs if of_training else final, deployed, trials)
         )
-        for agent in dict.fromkeys([*chosen["agent"], *gone["agent"]]):
-            own, same, lost = (frame[frame["agent"] == agent] for frame in (chosen, beside, gone))
+        for agent in dict.fromkeys(planned["agent"]):
+            own, same, its = (frame[frame["agent"] == agent] for frame in (chosen, beside, planned))
             counted = (
-                _compared(own, same, lost, claim)
+                _compared(own, same, its, claim)
                 if isinstance(claim, Comparison)
-                else _held(own, same, lost, claim)
+                else _held(own, same, its, claim)
             )
             if counted["trials"]:
                 named = {"section": claim.section, "claim": claim.text, "agent": str(agent)}
@@ -191,23 +190,28 @@ def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
     return rows[(rows["task"] == claim.task) & agents & rows["method"].isin(methods)]
 
 
-def _held(final: pd.DataFrame, deployed: pd.DataFrame, failed: pd.DataFrame, claim: Claim) -> dict[str, Any]:
+def _held(final: pd.DataFrame, deployed: pd.DataFrame, trials: pd.DataFrame, claim: Claim) -> dict[str, Any]:
     nothing = _ends(Interval(math.nan, math.nan, math.nan, 0, True))
-    counted = _counted(claim.holds(final), claim.holds(deployed), failed=len(failed))
+    failed = int((trials["status"] == TrialState.FAILED.value).sum())
+    counted = _counted(claim.holds(final), claim.holds(deployed), failed=failed)
     return {**counted, **nothing, "relative_difference": math.nan, "paper": "", "feasible_pairs": None}
 
 
 def _compared(
-    final: pd.DataFrame, deployed: pd.DataFrame, failed: pd.DataFrame, claim: Comparison
+    final: pd.DataFrame, deployed: pd.DataFrame, trials: pd.DataFrame, claim: Comparison
 ) -> dict[str, Any]:
     differences, base = _differences(final, claim)
     feasible_pairs = None
     if claim.quantity == TRAINING_COST:
         deployed = deployed.iloc[:0]
     else:
-        infeasible = final.loc[~within_limits(final), "seed"]
+        infeasible = final.loc[~final["feasible"].astype(bool), "seed"]
         feasible_pairs = int((~differences.index.isin(infeasible)).sum())
-    without_pair = set(failed["seed"]) - set(differences.index)
+    failed = set(trials.loc[trials["status"] == TrialState.FAILED.value, "seed"])
+    both = set.intersection(
+        *(set(trials.loc[trials["method"] == name, "seed"]) for name in (claim.method, claim.against))
+    )
+    without_pair = (failed & both) - set(differences.index)
     beside = _differences(deployed.assign(**{claim.quantity: deployed[RETURN]}), claim)[0]
     interval, ground = mean_interval(_numbers(differences)), mean_interval(_numbers(base))
     relative = interval.estimate / ground.estimate if ground.low > 0.0 else math.nan

@@ -234,7 +234,7 @@ def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | 
 
 def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
     """Return the discount gamma of a CPO agent, None for others: Lemma 1 is not about them."""
-    options = sweep.agent_options[str(trial["agent"])]
+    options = sweep.agent_options[str(trial["task"]), str(trial["agent"])]
     discount = options.get("discount", math.nan)
     if trial["agent_name"] != "cpo":
         return None

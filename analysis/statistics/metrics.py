@@ -119,11 +119,12 @@ def summary(rows: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     averaged = [name for name in names if name in ("episode_return", "gap") or is_cost(name)]
     constant = [name for name in names if name.startswith("deploy_limit_") or name == "optimal_return"]
     found = dict(iter(rows.groupby([*GROUP, "measure"], observed=True, sort=False)))
-    measures = [measure.value for measure in Measure if (rows["measure"] == measure.value).any()]
+    measured = rows.groupby("task", observed=True)["measure"].agg(set).to_dict()
     lines = []
     for group, planned in trials.groupby(list(GROUP), observed=True, sort=False):
         failed = int((planned["status"] == TrialState.FAILED.value).sum())
-        for measure in measures:
+        of_task = measured.get(group[0], {Measure.STOCHASTIC.value})  # none: every trial of the task failed
+        for measure in (it.value for it in Measure if it.value in of_task):
             chosen = found.get((*group, measure), rows.iloc[:0])
             if not len(chosen) + failed:
                 continue

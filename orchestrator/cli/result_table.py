@@ -12,7 +12,7 @@ from recrl.analysis.data.number_texts import number, with_error
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report.table_formats import names_of
-from recrl.analysis.report.verdict_texts import measured_how, tolerance_sentence, verdict_text
+from recrl.analysis.report.verdict_texts import all_exact, measured_how, tolerance_sentence, verdict_text
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
@@ -45,12 +45,11 @@ def caption(rows: pd.DataFrame) -> str:
         rows: of ``verdict_counts.count_verdicts``.
     """
     several = int(rows["seeds"].max()) > 1
-    exact = bool(rows.loc[rows["seeds"] > 0, "exact"].all())
     means = "means over n seeds, returns ± standard error" if several else "one seed (n = 1): no intervals"
     return (
         f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"
         f"Verdicts: solved (feasible, and within {SOLVED_GAP} of the optimum), feasible, or infeasible by "
-        f"how much. {tolerance_sentence(exact=exact)}"
+        f"how much. {tolerance_sentence(exact=all_exact(rows))}"
     )
 
 

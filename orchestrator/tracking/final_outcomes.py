@@ -135,35 +135,34 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
 
 
 def verdict_lines(
-    outcomes: Sequence[FinalOutcome], failed: Mapping[tuple[str, str, str], int] | None = None
+    outcomes: Sequence[FinalOutcome], states: Mapping[tuple[str, str, str], Sequence[TrialState]]
 ) -> list[str]:
     """Return the table of verdicts in Markdown, one row per task, agent and curriculum.
 
     Args:
         outcomes: of all complete trials.
-        failed: number of failed trials by group; they count as neither solved nor feasible.
+        states: of all trials of the grid, by group.
     """
-    failed = failed or {}
-    groups: dict[tuple[str, str, str], list[FinalOutcome]] = {}
+    if not outcomes:
+        return []
+    groups: dict[tuple[str, str, str], list[FinalOutcome]] = {group: [] for group in states}
     for outcome in outcomes:
         groups.setdefault(outcome.group, []).append(outcome)
-    if not groups:
-        return []
-    groups |= {group: [] for group in failed if group not in groups}
     heads = ("task", "agent", "curriculum", "verdict", "cost", "limit", "return", "n")
     lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for group, seeds in groups.items():
         costs = [_mean(values) for values in zip(*(it.costs for it in seeds), strict=True)]
-        verdicts = _verdicts(seeds, failed.get(group, 0))
+        verdicts = _verdicts(seeds, states.get(group, ()))
         cells = (verdicts, _listed(costs, digits=3), _listed(seeds[0].limits if seeds else ()))
         earned = _text(_mean([it.episode_return for it in seeds])) if seeds else ""
         lines.append("| " + " | ".join([*group, *cells, earned, str(len(seeds))]) + " |")
     return lines
 
 
-def _verdicts(seeds: Sequence[FinalOutcome], failed: int) -> str:
+def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialState]) -> str:
     """Count a group's verdicts: ``solved 2 of 5, infeasible 2 of 5 by up to 0.28, failed 1 of 5``."""
-    total = len(seeds) + failed
+    failed = states.count(TrialState.FAILED)
+    total = max(len(states), len(seeds))  # outcomes may be those of an earlier, larger grid
     parts = []
     for verdict in (SOLVED, FEASIBLE, INFEASIBLE):
         chosen = [it for it in seeds if it.verdict == verdict]
@@ -172,8 +171,10 @@ def _verdicts(seeds: Sequence[FinalOutcome], failed: int) -> str:
             up_to = "up to " if len(chosen) > 1 else ""
             by = f" by {up_to}{_text(max(it.excess for it in chosen))}" if verdict == INFEASIBLE else ""
             parts.append(f"{verdict}{count}{by}")
-    if failed:
-        parts.append(f"failed {failed} of {total}" if seeds else "failed")
+    without = {"failed": failed, "no result yet": total - len(seeds) - failed}
+    for name, number in without.items():
+        if number > 0:
+            parts.append(f"{name} {number} of {total}" if number < total else name)
     return ", ".join(parts)
 
 

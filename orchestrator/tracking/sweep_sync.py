@@ -83,7 +83,7 @@ class SweepSync:
             {status: counts[status] for status in DisplayStatus},
             list(summaries),
             charts=f"#{charts_page(self._runs.experiment_id)}",
-            verdicts=verdict_lines(self._outcomes.all(), self._failed(records)),
+            verdicts=verdict_lines(self._outcomes.all(), self._states(records)),
             report=self._report(),
         )
         if position.shown.get("note") != text:
@@ -93,13 +93,13 @@ class SweepSync:
             self._runs.set_status(position.run_id, status, last or time.time())
         return replace(position, shown={**position.shown, "note": text, "status": status})
 
-    def _failed(self, records: Mapping[str, TrialRecord]) -> Mapping[tuple[str, str, str], int]:
-        """Return the number of failed trials by task, agent and curriculum."""
-        return Counter(
-            (spec.task.label, spec.agent.label, spec.method.label)
-            for spec in self._store.specs()
-            if records[spec.folder_name].status is TrialState.FAILED
-        )
+    def _states(self, records: Mapping[str, TrialRecord]) -> Mapping[tuple[str, str, str], list[TrialState]]:
+        """Return the states of all trials by task, agent and curriculum."""
+        states: dict[tuple[str, str, str], list[TrialState]] = {}
+        for spec in self._store.specs():
+            group = (spec.task.label, spec.agent.label, spec.method.label)
+            states.setdefault(group, []).append(records[spec.folder_name].status)
+        return states
 
     def _report(self) -> str:
         """Return the address of the report in MLflow, or empty before it is drawn."""

@@ -15,7 +15,10 @@ NO_TRAINING = pd.DataFrame(columns=["task", "agent", "method", "seed", "episodes
 def counted(
     rows: pd.DataFrame, training: pd.DataFrame = NO_TRAINING, failed: pd.DataFrame | None = None
 ) -> pd.DataFrame:
-    trials = (rows if failed is None else failed).assign(status="complete" if failed is None else "failed")
+    rows = rows.assign(feasible=rows["cost_0"] <= 1.01 * rows["deploy_limit_0"])
+    trials = pd.concat([rows.assign(status="complete"), training.assign(status="complete")])
+    if failed is not None:
+        trials = pd.concat([trials, failed.assign(status="failed")])
     return claims.count_claims(rows, training, trials)
 
 
@@ -135,6 +138,21 @@ def test_a_seed_with_a_failed_trial_is_no_gain_and_infeasible_pairs_are_counted_
     assert line["difference"] == 1.0
     shown = claims_table(weighed).set_index("claim").loc["linear returns more than none on CarGoal2"]
     assert (shown["holds in"], shown["failed"], shown["feasible pairs"]) == ("2 of 3", "1", "1 of 2")
+
+
+def test_a_failed_trial_makes_no_comparison_that_the_sweep_does_not_have() -> None:
+    weighed = counted(pd.DataFrame([trial("none", 0, 3.0)]), failed=pd.DataFrame([trial("linear", 0, 0.0)]))
+    compared = weighed[weighed["paper"] != ""]["claim"].tolist()
+    assert compared == ["linear returns more than none on CarGoal2"]
+    alone = counted(pd.DataFrame([trial("linear", 0, 3.0)]), failed=pd.DataFrame([trial("linear", 1, 0.0)]))
+    assert alone["claim"].tolist() == ["ppo-lag keeps d_d on CarGoal2"]
+
+
+def test_a_failed_trial_revives_no_comparison_of_training_with_several_costs() -> None:
+    training = NO_TRAINING.assign(cost_1_total=[])
+    lost = pd.DataFrame([trial(method, 0, 0.0) for method in ("linear", "exponential")])
+    weighed = counted(pd.DataFrame([trial("none", 0, 3.0)]), training, failed=lost)
+    assert not weighed["claim"].str.contains("costs more in training").any()
 
 
 def test_dynamic_is_compared_with_each_static_curriculum_of_its_agent() -> None:

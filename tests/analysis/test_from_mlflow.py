@@ -223,8 +223,8 @@ def test_a_file_of_another_version_is_named_at_once(
     finally:
         path.write_bytes(whole)
     assert str(caught.value).endswith(
-        "this version of recrl cannot read the sweep's export file (its format must be 2, got 3; export the "
-        "sweep again); the version that uploaded it can"
+        "this version of recrl cannot read the sweep's export file (is a compact file of another version of "
+        "recrl, or was changed: its format must be 2, got 3)"
     )
 
 

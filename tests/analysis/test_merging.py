@@ -146,7 +146,7 @@ def test_other_options_of_one_label_stay_apart(part: Part, kind: str, nouns: str
     assert all(str(it).startswith(f"{label} [") for it in merged.trials[kind].cat.categories)
     assert merged.trials[kind].nunique() == 2
     (note,) = merged.notes
-    assert note.startswith(f"2 {nouns} have the label {label} but different settings")
+    assert note.startswith(f"2 {nouns} have the label {label} on a but different settings")
     assert "(discount 0.9), " in note
 
 
@@ -165,9 +165,25 @@ def test_a_task_of_another_number_of_costs_under_one_label_is_drawn(part: Part, 
     assert sorted(map(list, numbers)) == [[1], [2]]
     assert drawing.draw(merged, tmp_path / "figures")
     report = (tmp_path / "figures" / "report.html").read_text()
-    assert all(
-        f"task a: {{&quot;name&quot;: &quot;{name}&quot;" in report for name in ("two-state", "two-state-2")
-    )
+    for label, name in dict(zip(merged.trials["task"], merged.trials["task_name"], strict=True)).items():
+        assert f"task {label}: {{&quot;name&quot;: &quot;{name}&quot;" in report
+
+
+def test_labels_of_different_tasks_need_no_digest(part: Part) -> None:
+    few = {"methods": ("none", "dynamic"), "agents": ("cpo",), "seeds": 1}
+    first, second = part(**few), part("other", tasks=("b",), **few)
+    merged = merge([first, with_options(second, "agent", {"discount": 0.9})])
+    assert merged.notes == ()
+    assert merged.trials["agent"].unique().tolist() == ["cpo"]
+    assert merged.agent_options["b", "cpo"]["discount"] == 0.9
+    assert merged.agent_options["a", "cpo"].get("discount") != 0.9
+
+
+def test_variants_of_a_label_keep_its_place_in_the_order(part: Part) -> None:
+    few = {"methods": ("none", "linear", "dynamic"), "agents": ("cpo",), "seeds": 1}
+    merged = merge([with_options(part(**few), "method", {"discount": value}) for value in (0.9, 0.99)])
+    bare = [str(label).split(" ")[0] for label in merged.trials["method"].cat.categories]
+    assert bare == ["none", "none", "linear", "linear", "dynamic", "dynamic"]
 
 
 def test_parts_of_other_numbers_of_costs_join(part: Part) -> None:

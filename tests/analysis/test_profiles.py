@@ -53,6 +53,8 @@ def test_failed_trials_count_as_the_worst(finished: Sweep) -> None:
         for method in ("none", "linear", "dynamic")
     }
     assert highest == pytest.approx({"none": 1 / 3, "linear": 1.0, "dynamic": 0.0})
+    (legend,) = figure.legends
+    assert {text.get_text() for text in legend.get_texts()} == {"none", "linear", "dynamic"}
 
 
 def test_without_a_complete_trial_there_is_no_profile(finished: Sweep) -> None:

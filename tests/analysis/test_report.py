@@ -85,7 +85,7 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
     assert "outcomes.csv" not in names
     assert "No trial is complete yet: no verdict." in (tmp_path / "report.md").read_text()
     for stem in ("bounds_cpo", "return-against-cost", "performance-profiles"):
-        assert drawing.drawings(sweep)[stem]() is None
+        assert drawing.drawings(sweep)[stem].make() is None
 
 
 def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
@@ -148,11 +148,18 @@ def test_trials_without_an_evaluation_are_not_said_to_be_incomplete(finished: Sw
         "No final policy was evaluated: set run.evaluation_episodes."
     )
     for status, sentence in (
-        ("failed", "No trial is complete: no verdict. All 36 failed."),
+        ("failed", "No verdict: all 36 trials failed."),
         ("running", "No trial is complete yet: no verdict."),
     ):
         trials = finished.trials.assign(status=status)
         assert verdict_texts.no_verdict(dataclasses.replace(finished, trials=trials)) == sentence
+
+
+def test_a_report_of_failed_trials_alone_says_so(finished: Sweep, tmp_path: Path) -> None:
+    failed = dataclasses.replace(finished, trials=finished.trials.assign(status="failed"))
+    drawing.draw(failed, tmp_path)
+    for name in ("report.md", "report.html"):
+        assert "No verdict: all 36 trials failed." in (tmp_path / name).read_text()
 
 
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def rivergrid() -> Sweep:
     "stem", ["learning-curves_cpo", "curricula", "policies_ppo-lag", "return-against-cost"]
 )
 def test_figures_are_redrawn_pixel_by_pixel(rivergrid: Sweep, tmp_path: Path, stem: str) -> None:
-    figure = drawing.drawings(rivergrid)[stem]()
+    figure = drawing.drawings(rivergrid)[stem].make()
     assert figure is not None
     redrawn = styles.save_png(figure, tmp_path / "figure.png")
     with Image.open(redrawn) as one, Image.open(RESULTS / "figures" / f"{stem}.png") as other:

@@ -10,7 +10,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import doubts, mixed_code_sentence
 from recrl.analysis.report import drawing
 
-REMEDY = "launch --rerun-changed makes it that of the installed version"
+REMEDY = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
 
 
 def with_code(sweep: Sweep, codes: Mapping[str, str], *, others: str = "new") -> Sweep:
@@ -53,7 +53,7 @@ def test_code_that_differs_from_that_of_the_baseline_is_named(finished: Sweep) -
 
 def test_many_cells_are_counted(finished: Sweep) -> None:
     old = {it.spec.title: "old" for it in finished.facts if it.spec.seed == 0}
-    assert "and 7 more); launch" in mixed_code_sentence(with_code(finished, old))
+    assert "and 7 more); in a sweep" in mixed_code_sentence(with_code(finished, old))
 
 
 @pytest.mark.parametrize("code", [[], "text", {"recrl": ["a list"]}])

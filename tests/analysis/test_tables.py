@@ -1,12 +1,14 @@
 """Tables say what the frames hold, in digits that people read."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report import table_formats
+from recrl.analysis.report import table_files, table_formats
 from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.metrics import Measure
 
@@ -60,6 +62,48 @@ def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark
     assert table["feasible pairs"].tolist()[:2] == ["0 of 1", "1 of 1"]
     assert "–" not in list(table.iloc[1])
     assert not table["P(higher return)"].str.contains("†").any()
+
+
+def with_failures(sweep: Sweep) -> Sweep:
+    """All trials of ``dynamic``, and all but one of ``none``, failed."""
+    trials = sweep.trials
+    failed = (trials["method"] == "dynamic") | ((trials["method"] == "none") & (trials["seed"] > 0))
+    return replace(sweep, trials=trials.assign(status=trials["status"].mask(failed, "failed")))
+
+
+def test_failed_trials_are_in_every_table(finished: Sweep, tmp_path: Path) -> None:
+    written, tables = table_files.write_tables(with_failures(finished), tmp_path)
+    by_name = {path.name: pd.read_csv(path) for path in written if path.suffix == ".csv"}
+    summary = by_name["summary.csv"].query("task == 'river-a' and agent == 'cpo' and measure == 'stochastic'")
+    lost, found = (summary[summary["method"] == method].iloc[0] for method in ("dynamic", "linear"))
+    assert list(lost[["seeds", "failed", "feasible_share", "too_few_seeds"]]) == [0, 3, 0.0, True]
+    assert list(found[["seeds", "failed", "too_few_seeds"]]) == [3, 0, True]
+    assert math.isnan(lost["iqm"]) and math.isfinite(found["iqm"])
+    verdicts = tables.verdicts.query("task == 'river-a' and agent == 'cpo' and method == 'dynamic'")
+    assert verdicts[["failed", "no_curriculum", "hard_landing"]].to_numpy().tolist() == [[3, 0, 0]]
+    assert tables.verdicts[["no_curriculum", "hard_landing"]].dtypes.tolist() == [np.dtype(int)] * 2
+    notes = [it.note for it in tables.shown]
+    assert any(table_files.FAILED_NOTE in note for note in notes)
+    _, whole = table_files.write_tables(finished, tmp_path)
+    assert not any(table_files.FAILED_NOTE in it.note for it in whole.shown)
+
+
+def test_a_dash_in_place_of_a_gain_is_explained_where_there_is_one(finished: Sweep, tmp_path: Path) -> None:
+    def explained(cost: float) -> list[str]:
+        sweep = replace(finished, evaluations=finished.evaluations.assign(cost_0=cost))
+        shown = table_files.write_tables(sweep, tmp_path)[1].shown
+        return [it.heading for it in shown if table_files.NO_GAIN in it.note]
+
+    assert not all("deployment" in heading for heading in explained(100.0))
+    assert all("deployment" in heading for heading in explained(0.0))
+
+
+def test_a_task_has_rows_of_its_own_measures_only(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    rows = rows[(rows["task"] != "river-b") | (rows["measure"] == "stochastic")]
+    summary = metrics.summary(rows, with_failures(finished).trials)
+    assert set(summary[summary["task"] == "river-b"]["measure"]) == {"stochastic"}
+    assert {"stochastic", "deterministic"} <= set(summary[summary["task"] == "river-a"]["measure"])
 
 
 def test_markdown_and_latex_by_hand() -> None:

@@ -178,6 +178,18 @@ def test_a_curriculum_of_which_every_trial_failed_has_a_row() -> None:
     assert "computed exactly" in verdict_texts.explanation(table)[0]
 
 
+def test_one_final_policy_beside_failed_trials_is_not_called_one_seed() -> None:
+    assert verdict_texts.answers(judged(ROWS[4:5]))[0].startswith("One seed (n = 1)")
+    assert verdict_texts.answers(judged(ROWS[4:5], failed=FAILED[3:]))[0] == verdict_texts.ONE_RESULT
+
+
+def test_numbers_that_do_not_exist_are_not_exact() -> None:
+    lost = [outcome("none", 0, 0.0, 0.0, task="other")]
+    table = judged(ROWS[4:6], failed=lost)
+    assert verdict_texts.all_exact(table)
+    assert not verdict_texts.all_exact(table[table["task"] == "other"])
+
+
 def test_an_incomplete_sweep_says_so_and_counts_what_waits_neither_way() -> None:
     waiting = [outcome("dynamic", seed, 0.0, 0.0) for seed in (2, 3)]
     table = judged(ROWS[4:6], waiting=waiting[:1], running=waiting[1:])

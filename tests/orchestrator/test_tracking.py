@@ -641,11 +641,16 @@ def test_failed_trials_are_in_the_table_of_verdicts() -> None:
         FinalOutcome(str(seed), group, 4.0, (1.0,), (1.0,), is_feasible=True, is_solved=not seed, exact=True)
         for seed in range(2)
     ]
-    assert verdict_lines(outcomes, {group: 3, other: 2})[2:] == [
-        "| map | cpo | none | solved 1 of 5, feasible 1 of 5, failed 3 of 5 | 1.000 | 1.00 | 4.00 | 2 |",
+    complete, failed, waiting = TrialState.COMPLETE, TrialState.FAILED, TrialState.WAITING
+    states = {group: [complete, failed, complete, failed, waiting], other: [failed, failed]}
+    assert verdict_lines(outcomes, states)[2:] == [
+        "| map | cpo | none | solved 1 of 5, feasible 1 of 5, failed 2 of 5, no result yet 1 of 5 "
+        "| 1.000 | 1.00 | 4.00 | 2 |",
         "| map | cpo | linear | failed |  |  |  | 0 |",
     ]
-    assert verdict_lines(outcomes)[2].split(" | ")[3] == "solved 1 of 2, feasible 1 of 2"
+    alone = verdict_lines(outcomes, {group: [complete, complete]})
+    assert alone[2].split(" | ")[3] == "solved 1 of 2, feasible 1 of 2"
+    assert verdict_lines([], states) == []
 
 
 def test_a_long_table_of_verdicts_leaves_room_for_the_rest() -> None:
