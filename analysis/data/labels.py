@@ -96,9 +96,9 @@ class Keys:
 def keys_of(specs: Sequence[TrialSpec]) -> tuple[Keys, list[str]]:
     """Return the trials' labels, and notes on labels that had to be made unique.
 
-    In a grid, a label has one meaning. In merged sweeps it may have several: tasks with another horizon, limit
-    or budget, or agents and curricula of a task with other options. Their trials must not be averaged or
-    compared. So a digest of the settings is appended to such a label.
+    In a grid, a label has one meaning. In merged sweeps it may have several: tasks with another horizon,
+    limit or budget, or agents and curricula of a task with other options. Their trials must not be averaged
+    or compared. So a digest of the settings is appended to such a label.
     """
     meanings = [_meanings(spec) for spec in specs]
     labels, notes = {}, []
