@@ -76,7 +76,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
         record = trial.record()
         if record.status is TrialState.DAMAGED:
             damaged.append(f"{trial.title}: {record.error}")
-        elif record.update:
+        elif record.committed.get(trial.updates_path.name, 0):
             try:
                 rows = replay(trial, method)
             except DamagedError as error:
@@ -94,7 +94,8 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     for sentence in damaged:
         say(console, f"damaged: {sentence}")
     if not runs:
-        raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials has a policy update yet")
+        what = "is whole" if len(damaged) == len(specs) else "has a saved policy update yet"
+        raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials {what}")
     say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
     show(pd.concat(summaries), console)
     say(
