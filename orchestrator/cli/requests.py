@@ -291,15 +291,16 @@ class MergeRequest(Request):
 
 @dataclass(frozen=True)
 class BoundRequest(SourceRequest):
-    """Compare the cost of training with its bounds; find the largest training limit for a budget."""
+    """Compare the cost of training with its bounds; estimate the largest training limit for a budget."""
 
     example: ClassVar[str] = "recrl-sweep bound demo --budget 5000"
     trust: bool = by_flag(**_TRUST)
     budget: float | None = by_flag(
         type=types.cost,
         metavar="COST",
-        help="allowed cost above the deployment limit of all training episodes together: find the largest "
-        "training limit d_t",
+        help="allowed cost above the deployment limit d_d, over all training episodes: estimate the largest "
+        "training limit d_t, if policies exceed their limits as in the worst run; only for curricula whose "
+        "limits are known in advance",
     )
     cost: str = by_flag(
         default="0",
