@@ -39,7 +39,8 @@ def trust_region_step(
     """Take one trust-region step on the surrogate of some advantages; skip it if they are all equal.
 
     With a coefficient tau of the KL it solves max over x of g.x - tau x.H x / 2 within x.H x / 2 <= delta.
-    The solution is min(sqrt(2 delta / q), 1 / tau) H^-1 g: shorter than the trust region if the gain is small.
+    The solution is min(sqrt(2 delta / q), 1 / tau) H^-1 g. It is shorter than the trust region if the gain is
+    small.
 
     Args:
         policy: changed in place.
