@@ -21,6 +21,9 @@ DEFAULT_ROOT = Path("runs")
 KINDS = ("tasks", "agents", "curricula", "methods")  # methods: the key in a grid
 SWEEP_HELP = "a sweep's name, folder or grid file; optional if there is only one"
 
+_STORE = "an object store (s3://bucket/folder, gs://, abfs://...)"
+_COPY = "its folder under --root is then a local copy that stores the address"
+
 # Settings that several commands have.
 _GRID: Mapping[str, Any] = {
     "type": types.path_of,
@@ -56,11 +59,7 @@ class PlaceRequest(Request):
         metavar="FOLDER",
         help="the folder of all sweeps (default: runs)",
     )
-    storage: str | None = by_flag(
-        metavar="URI",
-        help="keep the sweep in an object store (s3://bucket/folder, gs://, abfs://...) that all nodes "
-        "reach; its folder under --root is then a local copy that stores the address",
-    )
+    storage: str | None = by_flag(metavar="URI", help=f"read the sweep from {_STORE}; {_COPY}")
 
 
 @dataclass(frozen=True)
@@ -96,6 +95,9 @@ class LaunchRequest(GridRequest):
 
     example: ClassVar[str] = "recrl-sweep launch demo.yaml --only method=none,dynamic seed=0"
     trusted: ClassVar[bool] = True
+    storage: str | None = by_flag(
+        metavar="URI", help=f"keep the sweep in {_STORE} that all nodes reach; {_COPY}"
+    )
     address: str | None = by_flag(
         metavar="HOST:PORT",
         help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
@@ -211,12 +213,12 @@ class EvaluateRequest(SweepRequest):
     episodes: int | None = by_flag(
         type=types.at_least_one,
         metavar="N",
-        help="for each policy; by default the number of the trial's own evaluation",
+        help="episodes for each policy (default: as in the trial's own evaluation)",
     )
     seed: int | None = by_flag(
         type=types.at_least_zero,
         metavar="S",
-        help="for the episodes; by default that of the trial's own evaluation, whose results are then equal",
+        help="seed of the episodes (default: the trial's own evaluation's, whose results are then equal)",
     )
     policy: str = by_flag(
         choices=("stochastic", "deterministic", "both"),
@@ -304,7 +306,7 @@ class BoundRequest(SourceRequest):
     )
     cost: str = by_flag(
         default="0",
-        metavar="INDEX",
+        metavar="INDEX|NAME",
         help="index of the cost, counted from 0, or its name (default: 0)",
     )
 
@@ -333,7 +335,9 @@ class UIRequest(SweepRequest):
 
     example: ClassVar[str] = "recrl-sweep ui demo"
     tracking_uri: str | None = by_flag(**_TRACKING)
-    port: int = by_flag(type=types.port, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)")
+    port: int = by_flag(
+        type=types.port, default=5000, metavar="N", help="port on this machine (default: 5000)"
+    )
 
 
 @dataclass(frozen=True)
@@ -341,7 +345,11 @@ class SyncRequest(SweepRequest):
     """Bring MLflow up to date with the files, for example after it was unreachable."""
 
     example: ClassVar[str] = "recrl-sweep sync demo --tracking-uri http://localhost:5000"
-    trust: bool = by_flag(**_TRUST)
+    trust: bool = by_flag(
+        action="store_true",
+        help="import tasks that the files name by an import path, so that their values final/... are exact, "
+        "as in the report: do so only with files whose author you trust",
+    )
     tracking_uri: str | None = by_flag(**_TRACKING)
     rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
 
