@@ -23,7 +23,6 @@ SWEEP_HELP = "a sweep's name, folder or grid file; optional if there is only one
 
 _STORE = "an object store (s3://bucket/folder, gs://, abfs://...)"
 _COPY = "its folder under --root is then a local copy that stores the address"
-
 # Settings that several commands have.
 _GRID: Mapping[str, Any] = {
     "type": types.path_of,
@@ -95,9 +94,7 @@ class LaunchRequest(GridRequest):
 
     example: ClassVar[str] = "recrl-sweep launch demo.yaml --only method=none,dynamic seed=0"
     trusted: ClassVar[bool] = True
-    storage: str | None = by_flag(
-        metavar="URI", help=f"keep the sweep in {_STORE} that all nodes reach; {_COPY}"
-    )
+    storage: str | None = by_flag(metavar="URI", help=f"keep the sweep in {_STORE} for all nodes; {_COPY}")
     address: str | None = by_flag(
         metavar="HOST:PORT",
         help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
@@ -213,7 +210,7 @@ class EvaluateRequest(SweepRequest):
     episodes: int | None = by_flag(
         type=types.at_least_one,
         metavar="N",
-        help="episodes for each policy (default: as in the trial's own evaluation)",
+        help="episodes for each policy (default: the trial's own number)",
     )
     seed: int | None = by_flag(
         type=types.at_least_zero,
@@ -301,13 +298,10 @@ class BoundRequest(SourceRequest):
         type=types.cost,
         metavar="COST",
         help="allowed cost above the deployment limit d_d, over all training episodes: estimate the largest "
-        "training limit d_t, if policies exceed their limits as in the worst run; only for curricula whose "
-        "limits are known in advance",
+        "training limit d_t, for curricula whose limits are known in advance",
     )
     cost: str = by_flag(
-        default="0",
-        metavar="INDEX|NAME",
-        help="index of the cost, counted from 0, or its name (default: 0)",
+        default="0", metavar="INDEX|NAME", help="the cost's index, counted from 0, or its name (default: 0)"
     )
 
 
@@ -347,8 +341,8 @@ class SyncRequest(SweepRequest):
     example: ClassVar[str] = "recrl-sweep sync demo --tracking-uri http://localhost:5000"
     trust: bool = by_flag(
         action="store_true",
-        help="import tasks that the files name by an import path, so that their values final/... are exact, "
-        "as in the report: do so only with files whose author you trust",
+        help="import tasks that files name by an import path, so that their values final/... are exact: do "
+        "so only with files whose author you trust",
     )
     tracking_uri: str | None = by_flag(**_TRACKING)
     rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
