@@ -24,7 +24,7 @@ from recrl.teachers.registry import find_teacher, teacher_config
 
 
 def run_bound(request: BoundRequest, console: Console) -> ExitCode:
-    """Compare the cost of training with its bounds; find the largest d_t within a budget."""
+    """Compare the cost of training with its bounds; estimate the largest d_t within a budget."""
     from recrl.analysis.data.cost_names import indices_of_cost  # noqa: PLC0415
     from recrl.analysis.report import text_tables  # noqa: PLC0415  (imports pandas and SciPy)
     from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415
@@ -53,6 +53,11 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
             "d_d over all episodes:",
         )
         show(text_tables.admissible_table(allowed), console)
+        say(
+            console,
+            "An estimate, not a bound: each policy is taken to exceed its limit as in the worst run. "
+            "Curricula whose limits are not known in advance are left out.",
+        )
     return ExitCode.OK
 
 
