@@ -103,7 +103,7 @@ class SweepProgress:
 
 
 def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None = None) -> SweepProgress:
-    """Read the progress of trials; one that an attempt is to begin anew counts as not yet begun.
+    """Read the progress of trials; a trial that is to run again counts as not yet begun.
 
     Args:
         specs: the trials of the grid.
