@@ -243,7 +243,7 @@ def test_trials_completed_in_two_parts_with_other_episodes_are_named(part: Part,
     merged = merge([one, dataclasses.replace(two, phases=changed)])
     assert merged.notes == (
         "completed in several parts with different episodes, as machines or versions differ; the first "
-        "part's are taken: a cpo none seed 0, a cpo none seed 1, a ppo-lag dynamic seed 0 and 3 more",
+        "part's are taken: a ppo-lag none seed 0, a ppo-lag none seed 1, a ppo-lag dynamic seed 0 and 3 more",
     )
     assert_equal(merged, one)
 
