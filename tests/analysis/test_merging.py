@@ -256,7 +256,7 @@ def test_the_command_writes_one_file(part: Part, tmp_path: Path, capsys: pytest.
     assert main(["merge", *map(str, paths), "--to", str(to)]) == ExitCode.OK
     assert "all.zip: 8 trials, 8 of them complete, " in capsys.readouterr().out
     assert_equal(export.load(to), merge([export.load(path) for path in paths]))
-    assert main(["figures", str(to), "--sketch"]) == ExitCode.OK
+    assert main(["figures", str(to), "--sketch", "--to", str(tmp_path / "figures")]) == ExitCode.OK
 
 
 def test_a_sweep_that_is_no_file_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
