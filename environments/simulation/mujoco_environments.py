@@ -21,6 +21,7 @@ from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.saved_state import IDENTITY, SavedState, identity
 from recrl.environments.simulation.actions import give_actions
 from recrl.environments.simulation.camera import Camera, Renderer
 from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
@@ -197,10 +198,15 @@ class MujocoVectorEnv(CMDPVectorEnv):
         """Return everything that the future depends on: physics, counters, generators."""
         if not self.batch.generators:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
-        return self.batch.state_dict()
+        return {IDENTITY: identity(self.cmdp), **self.batch.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
+        """Continue exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: the state is damaged, of another task, or of other options.
+        """
+        SavedState(f"{self.cmdp.name}: saved state", state).check_identity(self.cmdp)
         self.batch.load_state_dict(state)
 
 

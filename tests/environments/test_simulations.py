@@ -17,6 +17,7 @@ from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import make_scene
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
+from recrl.environments.saved_state import SavedState
 from recrl.environments.simulation.machine_code import array_at, compiled_for_batch
 from recrl.environments.simulation.mujoco_batch import PhysicsError, Simulations
 
@@ -114,7 +115,7 @@ def test_restored_simulations_with_sleeping_bodies_continue_to_the_last_bit() ->
         saved = simulations.save()
         assert (saved["asleep"] >= 0).any()
         restored = Simulations(SCENE.model, NUMBER, num_threads=2)
-        restored.load(saved)
+        restored.load(SavedState("a test", saved))
         assert restored.rows.tobytes() == simulations.rows.tobytes()
         ahead = chosen[start : start + 100]
         assert run(restored, ahead) == run(simulations, ahead)
@@ -128,7 +129,7 @@ def test_saving_changes_nothing() -> None:
     snapshot = saved.save()
     assert first + run(saved, chosen[200:]) == run(undisturbed, chosen)
     restored = Simulations(SCENE.model, NUMBER)
-    restored.load(snapshot)
+    restored.load(SavedState("a test", snapshot))
     assert first + run(restored, chosen[200:]) == run(crowd(), chosen)
 
 
@@ -145,8 +146,9 @@ def test_simulations_stepped_in_parts_move_as_those_stepped_together() -> None:
 
 def test_a_state_of_another_batch_is_refused() -> None:
     saved = crowd().save()
-    with pytest.raises(ValueError, match=r"saved physics must have shape \(3, 389\), got \(2, 389\)"):
-        Simulations(SCENE.model, 3).load(saved)
+    with pytest.raises(ValueError) as error:
+        Simulations(SCENE.model, 3).load(SavedState("a test", saved))
+    assert str(error.value) == "a test: rows must be float64 of shape (3, 389), got float64 of shape (2, 389)"
 
 
 def test_a_diverged_simulation_is_reported_until_it_is_reset(
