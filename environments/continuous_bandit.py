@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.cmdp import CMDPSpec, CostLimits, Floats
 from recrl.environments.saved_state import IDENTITY, SavedState, identity
-from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 
 class ContinuousBanditOptions(BaseModel):
@@ -68,8 +68,11 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start B episodes."""
+        """Start B episodes, or those of a ``reset_mask`` (``recrl.environments.vector``)."""
+        chosen = masked_environments(self.cmdp.name, self.num_envs, options)
         super().reset(seed=seed, options=options)
+        if chosen is not None:
+            return self.restart(chosen), {}
         self._elapsed = np.zeros(self.num_envs, np.int64)
         return self._observations(), {}
 

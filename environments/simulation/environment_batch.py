@@ -98,10 +98,15 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
         state = self.state_dict() if self.generators else None
         return _rebuilt, (type(self), self.task, self.number, options, state)
 
-    def seed(self, seed: int | None) -> None:
-        """Give each environment a generator; that of environment i does not depend on B."""
+    def seed(self, seed: int | None, ids: npt.NDArray[np.intp] | None = None) -> None:
+        """Give some environments, or all, a generator; that of environment i does not depend on B."""
         streams = np.random.SeedSequence(seed).spawn(self.number)
-        self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
+        generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
+        if ids is None:
+            self.generators = generators
+        else:
+            for index in ids:
+                self.generators[index] = generators[index]
 
     @abstractmethod
     def restart(self, ids: npt.NDArray[np.intp]) -> None:

@@ -25,7 +25,7 @@ from recrl.environments.saved_state import IDENTITY, SavedState, identity
 from recrl.environments.simulation.actions import give_actions
 from recrl.environments.simulation.camera import Camera, Renderer
 from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
-from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 Batch = EnvironmentBatch[Any, Any]
 
@@ -157,11 +157,23 @@ class MujocoVectorEnv(CMDPVectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start B episodes; ``seed`` gives each environment a generator of its own."""
+        """Start new episodes in all environments, or in those of a ``reset_mask``.
+
+        Args:
+            seed: gives each of these environments a generator of its own.
+            options: None, or ``reset_mask``, an array bool [B] with at least one True.
+
+        Raises:
+            TypeError: the mask is no array of booleans.
+            ValueError: it is invalid, there are other options, or the first reset has a mask.
+        """
+        chosen = masked_environments(self.cmdp.name, self.num_envs, options)
+        if chosen is not None and not self.batch.generators:
+            raise ValueError(f"{self.cmdp.name}: call reset without a reset_mask first")
         super().reset(seed=seed, options=options)
         if seed is not None or not self.batch.generators:
-            self.batch.seed(seed)
-        self.batch.restart(np.arange(self.num_envs))
+            self.batch.seed(seed, chosen)
+        self.batch.restart(np.arange(self.num_envs) if chosen is None else chosen)
         return self.batch.observations(), {}
 
     def step(
@@ -175,6 +187,7 @@ class MujocoVectorEnv(CMDPVectorEnv):
         info = self._description.info(outcome)
         if len(outcome.finished):
             info["final_obs"] = observations
+            info["_final_obs"] = outcome.terminated | outcome.truncated
             batch.restart(outcome.finished)
             observations = batch.observations()
         return observations, outcome.rewards, outcome.terminated, outcome.truncated, info
