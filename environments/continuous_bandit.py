@@ -119,6 +119,7 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
         """
         saved = SavedState(f"{self.cmdp.name}: saved state", state)
         saved.check_identity(self.cmdp)
+        saved.check_number("elapsed", self.num_envs)
         like = np.zeros(self.num_envs, np.int64)
         self._elapsed = saved.array("elapsed", like, least=0, most=self._horizon - 1)
 

@@ -88,11 +88,8 @@ class SavedState:
 
     def generators(self, name: str, number: int) -> list[np.random.Generator]:
         """Return the generators of ``number`` environments, from the states of their bit generators."""
+        self.check_number(name, number)
         found = self.entry(name)
-        if not isinstance(found, Sequence) or isinstance(found, str):
-            raise self.error(name, f"must be a list, got {_kind(found)}")
-        if len(found) != number:
-            raise self.error(name, f"must be of {number} environments, got {len(found)}")
         generators = [np.random.Generator(np.random.PCG64(0)) for _ in found]
         for index, (generator, saved) in enumerate(zip(generators, found, strict=True)):
             try:
@@ -100,6 +97,15 @@ class SavedState:
             except (KeyError, OverflowError, TypeError, ValueError) as error:
                 raise self.error(f"{name}.{index}", f"must be the state of a PCG64 ({error})") from error
         return generators
+
+    def check_number(self, name: str, number: int) -> None:
+        """Check that a list or an array has an entry for each of ``number`` environments."""
+        found = self.entry(name)
+        listed = isinstance(found, Sequence) and not isinstance(found, str)
+        if not listed and not (isinstance(found, np.ndarray) and found.ndim):
+            raise self.error(name, f"must be a list or an array, got {_kind(found)}")
+        if len(found) != number:
+            raise self.error(name, f"must be of {number} environments, got {len(found)}")
 
     def check_identity(self, cmdp: CMDPSpec) -> None:
         """Check that the state is of this task, horizon and number of costs; a state may have no identity."""

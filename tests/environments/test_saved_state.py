@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recrl.environments.registry import make_vector
-from recrl.environments.saved_state import IDENTITY, SavedState
+from recrl.environments.saved_state import IDENTITY
 from recrl.environments.vector import CMDPVectorEnv
 
 TASKS = ["CarGoal2", "CarButton2", "CarPush0", "SafetyHumanoidVelocity", "continuous-bandit"]
@@ -32,13 +32,18 @@ def refusal(environments: CMDPVectorEnv, state: dict[str, Any]) -> str:
     return str(error.value)
 
 
+def found(state: dict[str, Any], path: str) -> tuple[dict[str, Any], str]:
+    """Return the dict in which the last name of a path is, and that name."""
+    *parts, name = path.split(".")
+    for part in parts:
+        state = state[part]
+    return state, name
+
+
 def changed(state: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     """Return a copy of a state with another value at a path; arrays are filled with it."""
     state = copy.deepcopy(state)
-    *parts, name = path.split(".")
-    place = state
-    for part in parts:
-        place = place[part]
+    place, name = found(state, path)
     if isinstance(place[name], np.ndarray) and np.isscalar(value):
         place[name][...] = value
     else:
@@ -48,13 +53,13 @@ def changed(state: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
 
 def arrays(state: dict[str, Any], prefix: str = "") -> list[str]:
     """Return the paths of all arrays in a state."""
-    found = []
+    paths = []
     for name, value in state.items():
         if isinstance(value, dict):
-            found += arrays(value, f"{prefix}{name}.")
+            paths += arrays(value, f"{prefix}{name}.")
         elif isinstance(value, np.ndarray):
-            found.append(prefix + name)
-    return found
+            paths.append(prefix + name)
+    return paths
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -63,23 +68,21 @@ def test_every_array_of_a_state_is_checked(name: str) -> None:
     state = environments.state_dict()
     assert arrays(state)
     for path in arrays(state):
-        parent, _, last = path.rpartition(".")
-        whole = SavedState("", state)
-        for part in filter(None, parent.split(".")):
-            whole = whole.part(part)
-        good = whole.tree[last]
-        for bad in (good[:1], good.astype(np.complex128), good.tolist(), None):
+        place, last = found(state, path)
+        good = place[last]
+        for bad in (good[..., None], good.astype(np.complex128), good.tolist()):
             text = refusal(environments, changed(state, path, bad))
             assert text.startswith(f"{name}: saved state: {path} must be {good.dtype} of shape "), text
+        for bad in (good[:1], None):  # one environment would be copied to all
+            assert refusal(environments, changed(state, path, bad)).startswith(
+                f"{name}: saved state: {path} must be "
+            )
         if good.dtype.kind == "f":
             for number in (np.nan, np.inf):
                 text = refusal(environments, changed(state, path, number))
                 assert text == f"{name}: saved state: {path} must have numbers that are finite, got {number}"
         missing = copy.deepcopy(state)
-        place: Any = missing
-        for part in filter(None, parent.split(".")):
-            place = place[part]
-        del place[last]
+        del found(missing, path)[0][last]
         assert refusal(environments, missing) == f"{name}: saved state: {path} is missing"
 
 
@@ -137,8 +140,8 @@ def test_physics_that_mujoco_cannot_compute_is_refused(
 @pytest.mark.parametrize(
     ("generators", "problem"),
     [
-        (None, "generators must be a list, got NoneType"),
-        ("ab", "generators must be a list, got str"),
+        (None, "generators must be a list or an array, got NoneType"),
+        ("ab", "generators must be a list or an array, got str"),
         ([{}], "generators must be of 2 environments, got 1"),
         ([{}, {}], "generators.0 must be the state of a PCG64 (state must be for a PCG64 RNG)"),
         ([None, {}], "generators.0 must be the state of a PCG64 (state must be a dict)"),
