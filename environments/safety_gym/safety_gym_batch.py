@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import acceptable, perceive, review, step
+from recrl.environments.safety_gym.compiled_step import acceptable, review, step
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.scene import make_scene, upright
 from recrl.environments.safety_gym.step_records import ENVIRONMENT, NOT_YET
@@ -172,14 +172,6 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
     def refresh(self, ids: npt.NDArray[np.intp] | None = None) -> None:
         """Recompute distances, costs and observations of some environments, or all."""
         self.simulations.apply(review, self._address, ids)
-
-    def perceive(self) -> None:
-        """Recompute the observations from the simulations and the records."""
-        self.simulations.apply(perceive, self._address)
-
-    def pressed(self) -> Booleans:
-        """Whether the robot touches each button, [B, buttons]."""
-        return self.touching[:, self.scene.touchable["buttons"]].copy()
 
     def _own_state(self) -> dict[str, Any]:
         """State of physics, layout, goals and counters."""

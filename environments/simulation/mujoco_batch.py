@@ -63,7 +63,6 @@ def _library() -> Any:
         "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
         "mjb_warning": (pointer, (pointer,)),
         "mjb_status": (pointer, (pointer,)),
-        "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
         "mjb_forward": (integer, (pointer, pointer, integer, integer)),
         "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
         "mjb_error": (ctypes.c_char_p, (pointer, integer)),
@@ -164,15 +163,6 @@ class Simulations:
             PhysicsError: the simulations use threads, and this process is a fork of their owner.
         """
         self._call(self._library.mjb_apply, ids, function.address, argument, 1)
-
-    def step(self, substeps: int, ids: Ids = None) -> None:
-        """Advance simulations, then compute everything, accelerations included, at the new state.
-
-        Args:
-            substeps: physics steps.
-            ids: the simulations; None for all.
-        """
-        self._call(self._library.mjb_step, ids, substeps, _EVERYTHING)
 
     def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""

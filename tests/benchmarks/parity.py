@@ -2,8 +2,8 @@
 
 python tests/benchmarks/parity.py [FOLDER]     default: tests/parity
 
-Prints one line an episode; exits with 1 if anything differs by more than 1e-5, or any cost or goal differs, or
-the robot moves differently in half of the steps.
+Prints two lines an episode; exits with 1 if anything differs by more than 1e-5, or any cost or goal differs,
+or the robot moves differently in half of the steps.
 
 A recording holds, for every step of an episode, the state of the physics, what was observed, the reward,
 the cost terms and the goal. Here our environments are put into the recorded states. What they then observe,
@@ -29,15 +29,18 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.safety_gym.compiled_step import observe
 from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch
+from recrl.environments.safety_gym.step_records import environments_at, tasks_at
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS, SafetyTask
+from recrl.environments.simulation.machine_code import compiled_for_batch
 
 CHUNK = 128
 TOLERANCE = 1e-5
 PRECISE, ROUNDED = (1e-12, 1e-10), (1e-6, 1e-5)
-"""Largest median errors of a step: of coordinates (metres) and velocities (m/s, rad/s). Some recordings have the
-next state in double precision, the others in single.
+"""Largest median errors of the robot after a step: of its place (metres) and velocities (m/s, rad/s). They
+depend on whether the next state was recorded in double or in single precision.
 """
 _COMPONENTS = {"push_box_lidar": "box_lidar"}
 """The recordings' names for parts of an observation, where they are not Safety Gym's."""
@@ -96,6 +99,13 @@ class StepErrors:
         return self.place <= place and self.velocity <= velocity
 
 
+@compiled_for_batch
+def perceive(_: int, data: int, index: int, argument: int) -> None:
+    """Compute the observation of one environment; objects and accelerations stay as recorded."""
+    task = tasks_at(argument, 1)[0]
+    observe(task, environments_at(task.environments, task.number)[index], data, index)
+
+
 def compare_recording(path: Path) -> list[Comparison]:
     """Compare every episode of one file."""
     task, meta, episodes = _read(path)
@@ -144,7 +154,7 @@ def _compare_episode(
         now = np.minimum(np.arange(start, start + batch.number), length)
         _put_into(batch, meta, episode, at=now, pursuing=now)
         batch.acceleration[...] = _acceleration(task, meta, episode, now)
-        batch.perceive()
+        batch.simulations.apply(perceive, batch._address)
         seen.append(batch.observations())
         before = np.maximum(now - 1, 0)
         _put_into(batch, meta, episode, at=before, pursuing=before)

@@ -13,7 +13,11 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from recrl.environments.safety_gym.safety_gym_environments import SafetyGymEnv, SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import (
+    SafetyGymEnv,
+    SafetyGymOptions,
+    SafetyGymVectorEnv,
+)
 from recrl.environments.safety_gym.scene import rotation_matrices
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 
@@ -177,6 +181,12 @@ def test_one_cost_a_term_sums_to_what_the_single_cost_indicates() -> None:
     assert costly > 0
 
 
+def test_the_option_for_several_costs_says_that_there_is_one_for_each_term() -> None:
+    description = str(SafetyGymOptions.model_fields["cost"].description)
+    assert "per_hazard: one cost for each cost term" in description
+    assert ", ".join(SAFETY_TASKS["CarGoal2"].cost_terms) in description
+
+
 def test_costs_of_a_task_without_hazards_cannot_be_told_apart() -> None:
     with pytest.raises(
         ValueError,
@@ -216,7 +226,7 @@ def test_buttons_hide_for_ten_steps_after_one_was_pressed() -> None:
     assert not observation[lidar].any()
     backwards = np.array([-1.0, -1.0])
     seen = [environment.step(backwards)[0][lidar].any() for _ in range(12)]
-    if not environment.batch.pressed().any():
+    if not environment.batch.touching[0, environment.batch.scene.touchable["buttons"]].any():
         assert seen[-1]
     assert not any(seen[:9])
 
