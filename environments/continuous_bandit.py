@@ -26,7 +26,7 @@ from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.cmdp import CMDPSpec, CostLimits, Floats
-from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.vector import CMDPVectorEnv, masked_environments, saved_integers
 
 
 class ContinuousBanditOptions(BaseModel):
@@ -43,6 +43,7 @@ def continuous_bandit_optimum(name: str, options: ContinuousBanditOptions, limit
     >>> continuous_bandit_optimum("continuous-bandit", ContinuousBanditOptions(), CostLimits((2.5,)))
     7.5
     """
+    limits.require(1, name)
     best = min(1.0, math.sqrt(limits[0] / options.horizon))
     return options.horizon * (1.0 - (1.0 - best) ** 2)
 
@@ -68,7 +69,10 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start B episodes."""
-        super().reset(seed=seed, options=options)
+        masked = masked_environments(self.cmdp.name, self.num_envs, options)
+        super().reset(seed=seed)
+        if masked is not None:
+            return self.restart(masked), {}
         self._elapsed = np.zeros(self.num_envs, np.int64)
         return self._observations(), {}
 
@@ -109,12 +113,9 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
-        if np.shape(state["elapsed"]) != (self.num_envs,):
-            raise ValueError(
-                f"{self.cmdp.name}: the saved state has {np.size(state['elapsed'])} environments, "
-                f"expected {self.num_envs}"
-            )
-        self._elapsed = np.array(state["elapsed"], np.int64)
+        self._elapsed = saved_integers(
+            self.cmdp.name, "elapsed", state["elapsed"], num_envs=self.num_envs, bound=self._horizon
+        )
 
     def _observations(self) -> npt.NDArray[np.float32]:
         return np.ones((self.num_envs, 1), np.float32)

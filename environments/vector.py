@@ -21,6 +21,7 @@ Notation: B environments, k costs.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -61,3 +62,52 @@ class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
+
+
+def masked_environments(
+    name: str, num_envs: int, options: Mapping[str, Any] | None
+) -> npt.NDArray[np.intp] | None:
+    """Return the environments that the options of a ``reset`` select; None if it is for all of them.
+
+    Args:
+        name: the task's name, for the error.
+        num_envs: B.
+        options: of ``reset``; only ``reset_mask`` is known, bool [B].
+
+    Raises:
+        ValueError: there is another option, or the mask is invalid.
+    """
+    for key in options or {}:
+        if key != "reset_mask":
+            raise ValueError(f"{name}: reset takes no option {key!r} (its options: reset_mask)")
+    if not options:
+        return None
+    mask = options["reset_mask"]
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (num_envs,):
+        raise ValueError(f"{name}: reset_mask must be an array of {num_envs} booleans, got {mask!r}")
+    if not mask.any():
+        raise ValueError(f"{name}: reset_mask must select at least one environment, got {mask.tolist()}")
+    return np.flatnonzero(mask)
+
+
+def saved_integers(task: str, name: str, values: Any, *, num_envs: int, bound: int) -> npt.NDArray[np.int64]:
+    """Return a part of a saved state with one integer per environment, as a new array [B].
+
+    Args:
+        task: the task's name, for the error.
+        name: the part's name in the state, for the error.
+        values: as saved.
+        num_envs: B.
+        bound: the values must be 0 to ``bound`` - 1.
+
+    Raises:
+        ValueError: there is another number of environments, or a value is invalid.
+    """
+    array = np.asarray(values)
+    if array.shape != (num_envs,):
+        raise ValueError(f"{task}: the saved state has {array.size} environments, expected {num_envs}")
+    if array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= bound:
+        raise ValueError(
+            f"{task}: {name} in the saved state must be integers from 0 to {bound - 1}, got {array.tolist()}"
+        )
+    return array.astype(np.int64)

@@ -15,7 +15,9 @@ from gymnasium.vector import AutoresetMode
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
+from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.velocity.task_definitions import VELOCITY_TASKS
 from recrl.orchestrator.files.checkpoint_format import decode, encode
 
 NUM_ENVS = 3
@@ -208,6 +210,31 @@ def test_what_was_returned_is_not_changed_by_later_steps(name: str) -> None:
             returned.append(array)
             copies.append(array.copy())
     assert all(np.array_equal(now, then) for now, then in zip(returned, copies, strict=True))
+
+
+def test_the_options_of_reset_are_a_mask_or_refused(name: str) -> None:
+    if name in SAFETY_TASKS or name in VELOCITY_TASKS:
+        pytest.skip("MuJoCo tasks ignore the options of reset")
+    environment, twin = build(name), build(name)
+    environment.reset(seed=0)
+    twin.reset(seed=0)
+    for actions in random_actions(environment, 5):
+        environment.step(actions)
+        twin.step(actions)
+    mask = np.array([True] + [False] * (NUM_ENVS - 1))
+    options = {"reset_mask": mask}
+    observations, _ = environment.reset(options=options)
+    assert options["reset_mask"] is mask
+    np.testing.assert_array_equal(observations, twin.restart(np.array([0])))
+    for actions in random_actions(environment, 3, seed=1):
+        assert as_bytes(environment.step(actions)) == as_bytes(twin.step(actions))
+    with pytest.raises(ValueError, match="reset takes no option 'mud'"):
+        environment.reset(options={"mud": 1})
+    for wrong in ([True] * NUM_ENVS, np.ones(NUM_ENVS), np.ones(NUM_ENVS + 1, np.bool_)):
+        with pytest.raises(ValueError, match=f"reset_mask must be an array of {NUM_ENVS} booleans"):
+            environment.reset(options={"reset_mask": wrong})
+    with pytest.raises(ValueError, match="reset_mask must select at least one environment"):
+        environment.reset(options={"reset_mask": ~mask & False})
 
 
 def test_actions_that_mean_nothing_are_refused(name: str) -> None:
