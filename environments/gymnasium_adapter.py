@@ -18,8 +18,8 @@ of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``), act
 
 Every episode starts with ``reset(seed=...)`` and a new seed drawn here. A checkpoint holds that seed and the
 actions so far, so the environment need not be pickled. Restoring replays them, at most one episode per
-environment. It checks that the last observation is the same, and by a checksum also everything before it:
-observations, rewards, costs and ends of the episode, rounded to float32.
+environment. It checks that the last observation is the same. A checksum compares all observations, rewards,
+costs and ends, rounded to float32.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             )
         observation = self._flat(returned[0])
         self._check(observation[np.newaxis])
-        self._checksums[index] = zlib.crc32(observation)
+        self._checksums[index] = zlib.crc32(observation.tobytes())
         return observation
 
     def _replayed(self, index: int) -> npt.NDArray[np.float32]:
@@ -233,7 +233,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 np.array([ended]),
                 np.array([timed_out and not ended]),
             )
-            self._checksums[index] = zlib.crc32(row, self._checksums[index])
+            self._checksums[index] = zlib.crc32(row.tobytes(), self._checksums[index])
         return observation
 
     def _step(self, index: int, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -341,8 +341,7 @@ def _declared_horizon(environment: Environment) -> int | None:
     if environment.spec is not None and environment.spec.max_episode_steps is not None:
         return environment.spec.max_episode_steps
     horizon = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
-    is_number = isinstance(horizon, int) and not isinstance(horizon, bool)
-    return horizon if is_number and horizon >= 1 else None
+    return horizon if isinstance(horizon, int) and not isinstance(horizon, bool) and horizon >= 1 else None
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:

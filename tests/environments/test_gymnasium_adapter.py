@@ -366,7 +366,7 @@ def test_right_options_of_a_users_task_are_passed_on(options: dict[str, Any]) ->
 class Strict(Countdown):
     """Checks its options itself; ``known`` are those that it has."""
 
-    known: ClassVar = ("length",)
+    known: ClassVar[tuple[str, ...]] = ("length",)
 
     def __init__(self, **options: Any) -> None:
         if unknown := [name for name in options if name not in self.known]:
@@ -376,7 +376,7 @@ class Strict(Countdown):
 
 
 class Rendering(Strict):
-    known: ClassVar = ("length", "render_mode")
+    known = ("length", "render_mode")
 
 
 @pytest.mark.parametrize(("factory", "render_mode"), [(Strict, None), (Rendering, "rgb_array")])

@@ -512,7 +512,9 @@ def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
     config = DynamicConfig()
     assert not any(is_precise(noisy(8), config) for _ in range(100))
     assert all(is_precise(noisy(100), config) for _ in range(20))
-    assert is_precise(window(9.5, 5.0, episodes=10), config)  # deterministic: no more than the least are needed
+    assert is_precise(
+        window(9.5, 5.0, episodes=10), config
+    )  # deterministic: no more than the least are needed
     assert not is_precise(window(9.5, 5.0, episodes=9), config)
     assert not is_precise(WindowStatistics(100, 0, 0.0, (0.0,), (0.0,)), config)
 
