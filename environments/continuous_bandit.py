@@ -26,7 +26,8 @@ from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel, ConfigDict, Field
 
 from recrl.environments.cmdp import CMDPSpec, CostLimits, Floats
-from recrl.environments.vector import CMDPVectorEnv, masked_environments, saved_integers
+from recrl.environments.saved_state import IDENTITY, SavedState, identity
+from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 
 class ContinuousBanditOptions(BaseModel):
@@ -68,11 +69,11 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start B episodes."""
-        masked = masked_environments(self.cmdp.name, self.num_envs, options)
-        super().reset(seed=seed)
-        if masked is not None:
-            return self.restart(masked), {}
+        """Start B episodes, or those of a ``reset_mask`` (``recrl.environments.vector``)."""
+        chosen = masked_environments(self.cmdp.name, self.num_envs, options)
+        super().reset(seed=seed, options=options)
+        if chosen is not None:
+            return self.restart(chosen), {}
         self._elapsed = np.zeros(self.num_envs, np.int64)
         return self._observations(), {}
 
@@ -109,13 +110,19 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
         """The steps taken in each episode."""
         if self._elapsed is None:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
-        return {"elapsed": self._elapsed.copy()}
+        return {IDENTITY: identity(self.cmdp), "elapsed": self._elapsed.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self._elapsed = saved_integers(
-            self.cmdp.name, "elapsed", state["elapsed"], num_envs=self.num_envs, bound=self._horizon
-        )
+        """Continue exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: the state is damaged, of another task, or of other options.
+        """
+        saved = SavedState(f"{self.cmdp.name}: saved state", state)
+        saved.check_identity(self.cmdp)
+        saved.check_number("elapsed", self.num_envs)
+        like = np.zeros(self.num_envs, np.int64)
+        self._elapsed = saved.array("elapsed", like, least=0, most=self._horizon - 1)
 
     def _observations(self) -> npt.NDArray[np.float32]:
         return np.ones((self.num_envs, 1), np.float32)

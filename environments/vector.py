@@ -6,14 +6,18 @@ Agents see every task as a ``CMDPVectorEnv``. Its contract:
   bool [B] and ``info``, in which
     - ``info["cost"]`` is float64 [B, k], the step's costs in the order of ``cmdp.cost_names``;
     - ``info["final_obs"]`` [B, ...] holds the true last observation in the rows where an episode
-      ended (elsewhere its content means nothing); it is present only if one ended.
+      ended (elsewhere its content means nothing); it is present only if one ended;
+    - ``info["_final_obs"]``, bool [B], marks these rows; MuJoCo tasks have it.
 - An environment whose episode ended is reset in the same step (Gymnasium's ``SAME_STEP``). Row i of
   the returned observations is then the first one of the next episode.
-- ``restart(index)`` cuts the episodes of some environments short and begins new ones in them.
+- All other entries of ``info`` belong to the step, not to the reset, and have every row. So Gymnasium's
+  ``final_info`` would be ``info`` itself; it and the masks of the other entries are left out.
+- ``restart(index)`` cuts the episodes of some environments short and begins new ones in them. So does
+  Gymnasium's ``reset(options={"reset_mask": mask})``, with a mask bool [B].
 - Invalid actions (a wrong shape, a number that is no action, NaN) and a step before the first reset raise a
   ValueError. Continuous actions outside their bounds are clipped to them.
 - ``state_dict`` holds everything that the future depends on, generators included. It is a tree of dicts,
-  lists, JSON scalars and NumPy arrays. ``load_state_dict`` continues exactly from it.
+  lists, JSON scalars and NumPy arrays. ``load_state_dict`` continues exactly from it, or raises a ValueError.
 
 Notation: B environments, k costs.
 """
@@ -29,6 +33,35 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from recrl.environments.cmdp import CMDPSpec
+
+
+def masked_environments(
+    name: str, num_envs: int, options: Mapping[str, Any] | None
+) -> npt.NDArray[np.intp] | None:
+    """Return the environments to reset, [M], by the options of ``reset``; None if they name none.
+
+    Args:
+        name: of the task, for errors.
+        num_envs: B.
+        options: of ``reset``. As in Gymnasium, ``reset_mask`` is bool [B], with at least one True.
+
+    Raises:
+        TypeError: the mask is no array of booleans.
+        ValueError: it has a wrong shape or chooses no environment, or there are other options.
+    """
+    if not options:
+        return None
+    if others := sorted(map(str, options.keys() - {"reset_mask"})):
+        raise ValueError(f"{name}: the only option of reset is 'reset_mask', got {', '.join(others)}")
+    mask = options["reset_mask"]
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        kind = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise TypeError(f"{name}: reset_mask must be an array of booleans, got {kind}")
+    if mask.shape != (num_envs,) or not mask.any():
+        raise ValueError(
+            f"{name}: reset_mask must have shape ({num_envs},) and at least one True, got {mask.tolist()}"
+        )
+    return np.flatnonzero(mask)
 
 
 class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
@@ -62,52 +95,3 @@ class CMDPVectorEnv(VectorEnv[Any, Any, Any]):
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
-
-
-def masked_environments(
-    name: str, num_envs: int, options: Mapping[str, Any] | None
-) -> npt.NDArray[np.intp] | None:
-    """Return the environments that the options of a ``reset`` select; None if it is for all of them.
-
-    Args:
-        name: the task's name, for the error.
-        num_envs: B.
-        options: of ``reset``; only ``reset_mask`` is known, bool [B].
-
-    Raises:
-        ValueError: there is another option, or the mask is invalid.
-    """
-    for key in options or {}:
-        if key != "reset_mask":
-            raise ValueError(f"{name}: reset takes no option {key!r} (its options: reset_mask)")
-    if not options:
-        return None
-    mask = options["reset_mask"]
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (num_envs,):
-        raise ValueError(f"{name}: reset_mask must be an array of {num_envs} booleans, got {mask!r}")
-    if not mask.any():
-        raise ValueError(f"{name}: reset_mask must select at least one environment, got {mask.tolist()}")
-    return np.flatnonzero(mask)
-
-
-def saved_integers(task: str, name: str, values: Any, *, num_envs: int, bound: int) -> npt.NDArray[np.int64]:
-    """Return a part of a saved state with one integer per environment, as a new array [B].
-
-    Args:
-        task: the task's name, for the error.
-        name: the part's name in the state, for the error.
-        values: as saved.
-        num_envs: B.
-        bound: the values must be 0 to ``bound`` - 1.
-
-    Raises:
-        ValueError: there is another number of environments, or a value is invalid.
-    """
-    array = np.asarray(values)
-    if array.shape != (num_envs,):
-        raise ValueError(f"{task}: the saved state has {array.size} environments, expected {num_envs}")
-    if array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= bound:
-        raise ValueError(
-            f"{task}: {name} in the saved state must be integers from 0 to {bound - 1}, got {array.tolist()}"
-        )
-    return array.astype(np.int64)

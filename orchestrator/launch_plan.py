@@ -8,8 +8,10 @@ from __future__ import annotations
 import os
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
@@ -31,7 +33,7 @@ class PlannedAction(StrEnum):
     RESUME = "resume"
     RETRY = "retry"
     REPAIR = "repair"  # damaged; continues from the intact files
-    RERUN = "rerun"  # from the beginning, because its code has changed
+    RERUN = "rerun"  # from the beginning, because its code has changed, or an earlier launch began with it
     COMPLETE = "complete"
     FAILED = "failed"
     DAMAGED = "damaged"
@@ -64,6 +66,11 @@ class TrialSelection:
     retry_failed: bool = False
     rerun_damaged: bool = False
     rerun_changed: bool = False
+
+    @property
+    def reruns(self) -> bool:
+        """Whether it may include trials that are already complete or failed, but not by ``retry_failed``."""
+        return self.rerun_damaged or self.rerun_changed
 
 
 @dataclass(frozen=True)
@@ -164,7 +171,7 @@ def make_plan(specs: Sequence[TrialSpec], store: SweepStore, selection: TrialSel
         record = trial.verified_record() if selection.rerun_damaged else trial.record()
         action = _planned_action(record, selection)
         changed = has_other_code(trial, spec)
-        if changed and selection.rerun_changed and (action.is_to_do or action is PlannedAction.COMPLETE):
+        if (changed and selection.rerun_changed) or trial.rerun_path.exists():
             action = PlannedAction.RERUN
         trials.append(PlannedTrial(spec, action, record, changed))
     orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)
@@ -218,8 +225,21 @@ def unmeasured(plan: Plan) -> tuple[TrialSpec, ...]:
 
 def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: int | None = None) -> int:
     """Return how many trials fit on a number of cores, by default this machine's; at least 1."""
-    fitting = max(1, int((cores or os.cpu_count() or 1) / cpus_per_trial))
+    fitting = max(1, int((cores or usable_cores()) / cpus_per_trial))
     return min(fitting, max_concurrent or fitting)
+
+
+def usable_cores(quota_file: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
+    """Return the number of cores that this process may use, at least 1; in a container maybe not all.
+
+    Args:
+        quota_file: the control group's quota and period in microseconds, or ``max`` and the period.
+    """
+    cores = len(os.sched_getaffinity(0))
+    with suppress(OSError, ValueError):
+        quota, period = quota_file.read_text().split()
+        cores = min(cores, max(1, int(quota) // int(period)))
+    return cores
 
 
 def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAction:

@@ -110,7 +110,7 @@ def run_sweep(settings: SweepRunSettings, *, stop: threading.Event) -> SweepResu
             executor cannot run.
     """
     place, store = settings.place, settings.place.store
-    if settings.selection.rerun_damaged or settings.selection.rerun_changed:
+    if settings.selection.reruns:
         place.require_reruns()
     specs = settings.grid.trials()
     select(specs, settings.selection.only)  # a mistake in ``only`` must leave no files
@@ -121,9 +121,8 @@ def run_sweep(settings: SweepRunSettings, *, stop: threading.Event) -> SweepResu
         _leave_none_running(specs, store)  # trials of a launch that died
         plan = make_plan(specs, store, settings.selection)
         settings.watch(plan)
-        for trial in plan.with_action(PlannedAction.RERUN):
-            store.trial(trial.spec).set_all_aside()
-        return _run(settings, plan, stop)
+        with _reruns_requested(plan, store):
+            return _run(settings, plan, stop)
 
 
 def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> SweepResult:
@@ -142,6 +141,25 @@ def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> Sweep
         if sync is not None:
             synced = sync.stop(patience)
     return SweepResult(plan, after, stopped=stop.is_set(), synced=synced)
+
+
+@contextmanager
+def _reruns_requested(plan: Plan, store: SweepStore) -> Iterator[None]:
+    """Request the planned reruns; withdraw the requests of trials that no attempt has begun by the end.
+
+    So a complete trial keeps its results until its new attempt begins, whatever stops the launch.
+    """
+    trials = [store.trial(trial.spec) for trial in plan.with_action(PlannedAction.RERUN)]
+    try:
+        for trial in trials:
+            trial.request_rerun()
+        yield
+    finally:
+        for trial in trials:
+            try:
+                trial.withdraw_rerun()
+            except StorageError as error:  # must not hide an earlier error
+                logger.warning("%s", error)
 
 
 def _run_trials(settings: SweepRunSettings, specs: Sequence[TrialSpec], stop: threading.Event) -> None:
@@ -234,7 +252,8 @@ def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) 
             created = info["created"]
     except DamagedError as error:
         logger.warning("%s; MLflow shows it as a new sweep", error)
-    store.write_info({"name": grid.name, "created": created, "launched": time.time(), **collect()})
+    told = {"name": grid.name, "created": created, "launched": time.time()}
+    store.write_info({**told, "silence_seconds": grid.resources.silence_seconds, **collect()})
     store.write_specs(specs, grid.text)
 
 

@@ -112,6 +112,12 @@ class TrialSpec:
         return -(-self.total_steps // self.steps_per_update)
 
     @property
+    def lacks_deployment(self) -> bool:
+        """Whether no update falls into the deployment phase that was asked for."""
+        last_begins = (self.num_updates - 1) * self.steps_per_update
+        return self.deploy_steps > 0 and last_begins < self.train_steps
+
+    @property
     def teacher(self) -> TeacherSpec:
         """Return the curriculum's part of the spec."""
         return TeacherSpec(

@@ -28,6 +28,7 @@ class SweepPlace:
     """
 
     uri = ""
+    shortest_silence_seconds = 0.0  # a shorter silence of a trial may be the way of its signs of life
 
     def __init__(self, store: SweepStore) -> None:
         self.store = store

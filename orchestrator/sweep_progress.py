@@ -14,10 +14,6 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
-# A trial writes a sign of life after its updates, and an update of large networks takes a minute or two.
-# After this silence it counts as dead.
-SILENCE_SECONDS = 300.0
-
 
 class DisplayStatus(StrEnum):
     """Status of a trial for display: the recorded status, and whether its process is alive."""
@@ -107,7 +103,7 @@ class SweepProgress:
 
 
 def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None = None) -> SweepProgress:
-    """Read the progress of trials.
+    """Read the progress of trials; a trial that is to run again counts as not yet begun.
 
     Args:
         specs: the trials of the grid.
@@ -115,15 +111,23 @@ def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None
         now: seconds since 1970; the present by default.
     """
     now = time.time() if now is None else now
+    silence = store.silence_seconds
     trials = []
     for spec in specs:
-        record = store.trial(spec).record()
-        trials.append(TrialProgress(spec, display_status(record, now=now), record))
+        trial = store.trial(spec)
+        record = TrialRecord() if trial.rerun_path.exists() else trial.record()
+        trials.append(TrialProgress(spec, display_status(record, now=now, silence_seconds=silence), record))
     return SweepProgress(tuple(trials))
 
 
-def display_status(record: TrialRecord, *, now: float) -> DisplayStatus:
-    """Return the status of a trial for display: the recorded one, unless its process has died."""
+def display_status(record: TrialRecord, *, now: float, silence_seconds: float) -> DisplayStatus:
+    """Return the status of a trial for display: the recorded one, unless its process has died.
+
+    Args:
+        record: of the trial.
+        now: seconds since 1970.
+        silence_seconds: after which a running trial counts as dead; see ``SweepStore.silence_seconds``.
+    """
     match record.status:
         case TrialState.COMPLETE:
             return DisplayStatus.COMPLETE
@@ -134,7 +138,7 @@ def display_status(record: TrialRecord, *, now: float) -> DisplayStatus:
         case TrialState.WAITING:
             return DisplayStatus.STOPPED if record.attempt else DisplayStatus.WAITING
         case TrialState.RUNNING:
-            silent = now - record.heartbeat > SILENCE_SECONDS
+            silent = abs(now - record.heartbeat) > silence_seconds  # also if another clock is ahead
             return DisplayStatus.INTERRUPTED if silent or _has_no_process(record) else DisplayStatus.RUNNING
 
 

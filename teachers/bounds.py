@@ -74,7 +74,7 @@ def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
     >>> discounted_excess(0.02, 5.0, discount=0.5)
     2.0
     """
-    if not 0.0 <= discount <= 1.0:
+    if discount < 0.0 or discount > 1.0:  # unknown values, NaN, give NaN
         raise ValueError(f"discount must lie in [0, 1], got {discount}")
     _require_at_least_0(kl, advantage)
     if discount == 1.0:

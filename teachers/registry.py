@@ -44,9 +44,13 @@ class TeacherKind:
 
 TEACHERS: dict[str, TeacherKind] = {
     "none": TeacherKind("No curriculum: d_d from the start.", NoConfig, none_teacher),
-    "step": TeacherKind("A control: d_t until B, then d_d at once.", NoConfig, step_teacher),
+    "step": TeacherKind(
+        "A control: d_t until the training steps end, then d_d at once.", NoConfig, step_teacher
+    ),
     "unconstrained": TeacherKind(
-        "A control: no limit until B, for any d_t, then d_d at once.", NoConfig, unconstrained_teacher
+        "A control: no limit until the training steps end, for any d_t, then d_d at once.",
+        NoConfig,
+        unconstrained_teacher,
     ),
     "linear": TeacherKind(
         "CLiC_L: from d_t to d_d linearly.", DecayConfig, partial(decay_teacher, decay=linear)

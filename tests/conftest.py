@@ -8,6 +8,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: a trial's sums do not depend on the machine
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -74,15 +75,15 @@ class MadeUpSweep:
         )
 
     def write(self, root: Path, name: str = "made-up") -> SweepStore:
-        """Write it with the real writers."""
+        """Write it with the real writers; a sweep that is there already gets more trials."""
         store = SweepStore(root, name)
-        for task in self.tasks:
-            for agent in self.agents:
-                for method in self.methods:
-                    for seed in range(self.seeds):
-                        spec = self.spec(task, agent, method, seed)
-                        if spec.title not in self.missing:
-                            self._write_trial(store, spec)
+        cells = product(self.tasks, self.agents, self.methods, range(self.seeds))
+        specs = [spec for spec in (self.spec(*cell) for cell in cells) if spec.title not in self.missing]
+        for spec in specs:
+            self._write_trial(store, spec)
+        known = store.specs() if store.specs_path.exists() else []
+        store.write_info({"name": name, "created": 1.7e9, "launched": 1.7e9})
+        store.write_specs([*known, *(spec for spec in specs if spec not in known)])
         return store
 
     def _write_trial(self, store: SweepStore, spec: TrialSpec) -> None:

@@ -10,7 +10,7 @@ learning. So, ours, their length depends on the remaining gain. Symbols are as i
 ``recrl.agents.trust_region.cpo_dual``, but g is the gradient of the reward, v = H^-1 g, q = g.v, r_i = b_i.v.
 With
 
-    p = q - r.nu,  beta = sqrt(p / q) / (2 lambda),
+    p = q - r.nu,  beta = sqrt(p / q) / (2 tau),
 
     reward step:     sqrt(2 delta / q) v, but at most (min over r_i > 0 of -c_i / r_i, plus beta) v;
     cost step i:     sqrt(2 delta / s) w_i, but at most ((c_i + beta max(r_i, 0)) / s) w_i,  s = S_ii.
@@ -20,8 +20,8 @@ complementarity problem. A constraint is near if the trust region reaches its li
 the reward's gradient is a combination of the costs' gradients, and a step beyond a limit would be taken back.
 Then a cost step corrects the violation and no more, like Polyak's (1967) steps for violated constraints, and
 a reward step ends at the limit. Before, steps go as far beyond the limit on one side as on the other. The
-coefficient lambda is the option ``kl_penalty``, with the unit and the purpose of that of ``trpo-lag``; 0 is
-the source's.
+coefficient tau is the option ``kl_penalty``, with the unit and the purpose of that of ``trpo-lag``; 0 is the
+source's.
 
 While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
 change.

@@ -161,8 +161,8 @@ class TRPOLagConfig(LagrangianConfig, TrustRegionConfig):
 
     kl_penalty: NonNegative = Field(
         default=1.0,
-        description="lambda, the coefficient of the KL in the surrogate, which is the Lagrangian "
-        "over 1 + the multipliers, in standard deviations of the reward advantages. "
+        description="tau, the coefficient of the KL in the surrogate, which is the Lagrangian over "
+        "1 + the multipliers, in standard deviations of the reward advantages. "
         "Steps get shorter as the gain falls (ours; paper 0).",
     )
 
@@ -178,8 +178,8 @@ class CRPOConfig(TrustRegionConfig):
 
     kl_penalty: NonNegative = Field(
         default=1.0,
-        description="lambda, the coefficient of the KL beyond a limit, in standard deviations of "
-        "the reward advantages per nat. Steps get shorter as the gain falls; 0 for "
+        description="tau, the coefficient of the KL beyond a limit, in standard deviations of the "
+        "reward advantages per nat. Steps get shorter as the gain falls; 0 for "
         "steps as long as the trust region allows (ours; Xu et al. 2021: 0).",
     )
     tolerance: NonNegative = Field(

@@ -38,9 +38,9 @@ def trust_region_step(
 ) -> dict[str, float]:
     """Take one trust-region step on the surrogate of some advantages; skip it if they are all equal.
 
-    With a coefficient lambda of the KL it solves max over x of g.x - lambda x.H x / 2 within x.H x / 2 <=
-    delta. The solution is min(sqrt(2 delta / q), 1 / lambda) H^-1 g: shorter than the trust region if the
-    gain is small.
+    With a coefficient tau of the KL it solves max over x of g.x - tau x.H x / 2 within x.H x / 2 <= delta.
+    The solution is min(sqrt(2 delta / q), 1 / tau) H^-1 g. It is shorter than the trust region if the gain is
+    small.
 
     Args:
         policy: changed in place.
@@ -48,7 +48,7 @@ def trust_region_step(
         objective: the advantages of the surrogate, [N].
         config: the trust region, conjugate gradients and line search.
         generator: for the choice of the metric's samples.
-        kl_penalty: lambda, the coefficient of the KL, in the advantages' unit per nat, at least 0.
+        kl_penalty: tau, the coefficient of the KL, in the advantages' unit per nat, at least 0.
 
     Returns:
         Metrics of the step.
@@ -72,12 +72,12 @@ def trust_region_step(
 
 
 def step_size(squared: float, target_kl: float, kl_penalty: float) -> float:
-    """Return the factor on H^-1 g: min(sqrt(2 delta / q), 1 / lambda).
+    """Return the factor on H^-1 g: min(sqrt(2 delta / q), 1 / tau).
 
     Args:
         squared: q, above 0.
         target_kl: delta, nats.
-        kl_penalty: lambda, at least 0.
+        kl_penalty: tau, at least 0.
 
     >>> step_size(8.0, 0.01, 0.0), step_size(8.0, 0.01, 10.0), step_size(8.0, 0.01, 40.0)
     (0.05, 0.05, 0.025)

@@ -2,7 +2,7 @@
 
 A constrained trust-region step solves b.x + c <= 0: c is the violation, b.x the predicted change of the
 cost. Both come from one rollout, and the step follows the noise of b. So the cost falls by less than
-predicted. It settles above the limit, where the realised fall balances the rise that the rest of the step
+predicted. It converges above the limit, where the realised fall balances the rise that the rest of the step
 causes. An integral of the gap g, the mean episode cost minus the limit, removes this steady error, as in
 every controller:
 

@@ -360,8 +360,8 @@ def _trial_row(trial: TrialFacts, optimum: float) -> dict[str, Any]:
 
 
 def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialStore]]:
-    """Return the trials of the sweep's last launch, or else all on disk."""
-    specs = store.specs() or [trial.spec for trial in store.trials()]
+    """Return the trials of the sweep's last launch."""
+    specs = store.specs()
     return specs, [store.trial(spec) for spec in specs]
 
 

@@ -19,7 +19,8 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats
-from recrl.environments.vector import CMDPVectorEnv, masked_environments, saved_integers
+from recrl.environments.saved_state import IDENTITY, SavedState, identity
+from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 Integers = npt.NDArray[np.int64]
 Booleans = npt.NDArray[np.bool_]
@@ -282,8 +283,7 @@ class FiniteVectorEnv(CMDPVectorEnv):
         if self._elapsed is None:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
         return {
-            "task": self.cmdp.name,
-            "horizon": self._model.horizon,
+            IDENTITY: identity(self.cmdp),
             "states": self.states.copy(),
             "elapsed": self._elapsed.copy(),
             "generator": copy.deepcopy(dict(self.np_random.bit_generator.state)),
@@ -292,29 +292,19 @@ class FiniteVectorEnv(CMDPVectorEnv):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken.
 
-        Old states name neither task nor horizon; then only the numbers are checked.
-
         Raises:
-            ValueError: the state is that of another task, or a number is out of range.
+            ValueError: the state is damaged, or of another task.
         """
-        name, model = self.cmdp.name, self._model
-        of = state.get("task", name), state.get("horizon", model.horizon)
-        if of != (name, model.horizon):
-            raise ValueError(
-                f"{name}: the saved state must be of {name} with horizon {model.horizon}, "
-                f"got {of[0]} with horizon {of[1]}"
-            )
-        states = saved_integers(
-            name, "states", state["states"], num_envs=self.num_envs, bound=model.num_states
-        )
-        elapsed = saved_integers(
-            name, "elapsed", state["elapsed"], num_envs=self.num_envs, bound=model.horizon
-        )
+        model, like = self._model, np.zeros(self.num_envs, np.int64)
+        saved = SavedState(f"{self.cmdp.name}: saved state", state)
+        saved.check_identity(self.cmdp)
+        saved.check_number("states", self.num_envs)
+        states = saved.array("states", like, least=0, most=model.num_states - 1)
+        elapsed = saved.array("elapsed", like, least=0, most=model.horizon - 1)
         possible = model.reachable() & ~model.terminal
         if not possible[states].all():
-            raise ValueError(
-                f"{name}: no episode can be in state {states[~possible[states]][0]} of the saved state"
-            )
+            state_index = states[~possible[states]][0]
+            raise saved.error("states", f"must be states of an episode under way, got {state_index}")
         self.states, self._elapsed = states, elapsed
         self.np_random.bit_generator.state = state["generator"]
 

@@ -225,13 +225,6 @@ def review(_: int, data: int, index: int, argument: int) -> None:
     observe(task, environment, data, index)
 
 
-@compiled_for_batch
-def perceive(_: int, data: int, index: int, argument: int) -> None:
-    """Compute the observation of one environment; objects and accelerations stay as recorded."""
-    task = tasks_at(argument, 1)[0]
-    observe(task, environments_at(task.environments, task.number)[index], data, index)
-
-
 @compiled_for_python
 def acceptable(argument: int) -> bool:
     """Whether every action is a number within [-1, 1]."""

@@ -91,7 +91,8 @@ class SafetyRenderer(MujocoRenderer[SafetyGymBatch]):
         batch, task = self._batch, self._batch.task
         if not task.gremlins.number:
             return
-        height = float(gremlin_course(task).positions[batch.steps[index], 2])
+        heights = gremlin_course(task).positions[:, 2]
+        height = float(heights[min(batch.steps[index], len(heights) - 1)])  # as gremlin_body.course_step
         for gremlin, place in enumerate(batch.points[index, batch.group["gremlins"]]):
             if gremlin != batch.embodied[index]:
                 turn = rotation_matrices(upright(batch.gremlin_yaws[index, gremlin]))

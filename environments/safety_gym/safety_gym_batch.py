@@ -25,13 +25,19 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import acceptable, perceive, review, step
+from recrl.environments.safety_gym.compiled_step import acceptable, review, step
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.scene import make_scene, upright
 from recrl.environments.safety_gym.step_records import ENVIRONMENT, NOT_YET
 from recrl.environments.safety_gym.task_definitions import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
 from recrl.environments.safety_gym.task_record import allocate, places_of_objects, task_record
-from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
+from recrl.environments.saved_state import SavedState
+from recrl.environments.simulation.environment_batch import (
+    MOST_STEPS,
+    Booleans,
+    EnvironmentBatch,
+    Observations,
+)
 from recrl.environments.simulation.mujoco_batch import Simulations
 
 Integers = npt.NDArray[np.int64]
@@ -167,14 +173,6 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         """Recompute distances, costs and observations of some environments, or all."""
         self.simulations.apply(review, self._address, ids)
 
-    def perceive(self) -> None:
-        """Recompute the observations from the simulations and the records."""
-        self.simulations.apply(perceive, self._address)
-
-    def pressed(self) -> Booleans:
-        """Whether the robot touches each button, [B, buttons]."""
-        return self.touching[:, self.scene.touchable["buttons"]].copy()
-
     def _own_state(self) -> dict[str, Any]:
         """State of physics, layout, goals and counters."""
         return {
@@ -185,11 +183,17 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
             "observations": self.observations(),
         }
 
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        self.simulations.load(state["physics"])
+    def _load_own_state(self, saved: SavedState) -> None:
+        records, bounds = saved.part("environments"), _bounds(self.task)
+        environments = {}
         for name in ENVIRONMENT.names or ():
-            self._memory.environments[name] = state["environments"][name]
-        self._memory.observations[...] = state["observations"]
+            least, most = bounds.get(name, (-np.inf, np.inf))
+            environments[name] = records.array(name, self._memory.environments[name], least=least, most=most)
+        observations = saved.array("observations", self._memory.observations)
+        self.simulations.load(saved.part("physics"))
+        for name, values in environments.items():
+            self._memory.environments[name] = values
+        self._memory.observations[...] = observations
 
     def _view_records(self) -> None:
         """Name the parts of the environments' records, cut to the sizes of this task."""
@@ -258,3 +262,14 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
             return False
         goal[:] = found
         return True
+
+
+def _bounds(task: SafetyTask) -> dict[str, tuple[int, int]]:
+    """Return bounds of the saved counters and indices; compiled code does not check them."""
+    return {
+        "steps": (0, MOST_STEPS),
+        "goal_button": (0, max(task.buttons.number - 1, 0)),
+        "button_timer": (0, BUTTON_DELAY),
+        "embodied": (NOT_YET, task.gremlins.number - 1),
+        "touching": (0, 1),
+    }

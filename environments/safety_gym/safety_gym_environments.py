@@ -46,7 +46,10 @@ class SafetyGymOptions(BaseModel):
 
     cost: Literal["indicator", "per_hazard"] = Field(
         default="indicator",
-        description="One cost, 1 in a step in which any term costs (the paper's), or one cost per term.",
+        description=(
+            "indicator: one cost, 1 in a step in which any cost term is 1 (the paper's). per_hazard: one "
+            "cost for each cost term, hazards among them (CarGoal2: hazards, vases_contact, vases_velocity)."
+        ),
     )
     horizon: int = Field(
         default=HORIZON, ge=1, le=HORIZON, description="Steps in an episode (Safety Gym: 1,000)."

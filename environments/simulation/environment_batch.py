@@ -13,12 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.saved_state import SavedState
 
 if TYPE_CHECKING:
     from recrl.environments.simulation.mujoco_batch import Simulations
 
 Booleans = npt.NDArray[np.bool_]
 Observations = npt.NDArray[np.float32]
+
+MOST_STEPS = 2**31
+"""Upper bound of the steps in a saved episode. The caller may go on after the end of one."""
 
 
 class Named(Protocol):
@@ -94,10 +98,15 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
         state = self.state_dict() if self.generators else None
         return _rebuilt, (type(self), self.task, self.number, options, state)
 
-    def seed(self, seed: int | None) -> None:
-        """Give each environment a generator; that of environment i does not depend on B."""
+    def seed(self, seed: int | None, ids: npt.NDArray[np.intp] | None = None) -> None:
+        """Give some environments, or all, a generator; that of environment i does not depend on B."""
         streams = np.random.SeedSequence(seed).spawn(self.number)
-        self.generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
+        generators = [np.random.Generator(np.random.PCG64(stream)) for stream in streams]
+        if ids is None:
+            self.generators = generators
+        else:
+            for index in ids:
+                self.generators[index] = generators[index]
 
     @abstractmethod
     def restart(self, ids: npt.NDArray[np.intp]) -> None:
@@ -124,25 +133,20 @@ class EnvironmentBatch(ABC, Generic[TaskT, OutcomeT]):
         """Continue exactly where ``state_dict`` was taken.
 
         Raises:
-            ValueError: the state has another number of environments.
+            ValueError: the state is damaged, or of another number of environments.
         """
-        if len(state["generators"]) != self.number:
-            raise ValueError(
-                f"{self.task.name}: the saved state has {len(state['generators'])} environments, "
-                f"expected {self.number}"
-            )
-        self._load_own_state(state)
-        self.seed(0)
-        for generator, saved in zip(self.generators, state["generators"], strict=True):
-            generator.bit_generator.state = saved
+        saved = SavedState(f"{self.task.name}: saved state", state)
+        generators = saved.generators("generators", self.number)
+        self._load_own_state(saved)
+        self.generators = generators
 
     @abstractmethod
     def _own_state(self) -> dict[str, Any]:
         """Return what the future depends on besides the generators."""
 
     @abstractmethod
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        """Restore the result of ``_own_state``."""
+    def _load_own_state(self, saved: SavedState) -> None:
+        """Restore the result of ``_own_state``; check its arrays before anything is changed."""
 
 
 def _rebuilt(

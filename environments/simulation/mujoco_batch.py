@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
+from recrl.environments.saved_state import SavedState
 from recrl.environments.simulation.machine_code import mujoco_library
 
 Integers = npt.NDArray[np.int32]
@@ -62,7 +63,6 @@ def _library() -> Any:
         "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
         "mjb_warning": (pointer, (pointer,)),
         "mjb_status": (pointer, (pointer,)),
-        "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
         "mjb_forward": (integer, (pointer, pointer, integer, integer)),
         "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
         "mjb_error": (ctypes.c_char_p, (pointer, integer)),
@@ -164,15 +164,6 @@ class Simulations:
         """
         self._call(self._library.mjb_apply, ids, function.address, argument, 1)
 
-    def step(self, substeps: int, ids: Ids = None) -> None:
-        """Advance simulations, then compute everything, accelerations included, at the new state.
-
-        Args:
-            substeps: physics steps.
-            ids: the simulations; None for all.
-        """
-        self._call(self._library.mjb_step, ids, substeps, _EVERYTHING)
-
     def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
         self._check(self._library.mjb_reset, ids, None, _NOTHING)
@@ -211,27 +202,51 @@ class Simulations:
             "stopped": self.stopped.copy(),
         }
 
-    def load(self, state: dict[str, Any]) -> None:
+    def load(self, saved: SavedState) -> None:
         """Continue exactly where ``save`` was called.
 
         MuJoCo's data of a sleeping body follow from its position. They are computed with all bodies awake;
         then the sleeping ones are put back to sleep.
+
+        Raises:
+            ValueError: the state is damaged, or of other simulations.
         """
-        rows = np.asarray(state["rows"], np.float64)
-        if rows.shape != self.rows.shape:
-            raise ValueError(f"saved physics must have shape {self.rows.shape}, got {rows.shape}")
+        rows = saved.array("rows", self.rows)
+        warnings = saved.array("warnings", self._warnings[:, :, 1], least=0)
+        stopped = saved.array("stopped", self.stopped)
+        asleep = self._asleep(saved)
         self.reset(None)
         for index in range(self.number):
-            restored = self._restored(rows[index], state["asleep"][index])
+            try:
+                restored = self._restored(rows[index], asleep[index])
+            except mujoco.FatalError as error:
+                reason = str(error).splitlines()[0]
+                raise saved.error(f"rows.{index}", f"cannot be computed by MuJoCo ({reason})") from error
 
             def put_back(model: int, data: int, *_: Any, source: int = restored._address) -> None:
                 self._library.mj_copyData(data, model, source)
 
             function = ctypes.cast(_BatchFunction(put_back), ctypes.c_void_p)
             self._check(self._library.mjb_apply, [index], function, None, 1)
-        self._warnings[:, :, 1] = state["warnings"]
-        self.stopped[...] = state["stopped"]
+        self._warnings[:, :, 1] = warnings
+        self.stopped[...] = stopped
         self.any_stopped = bool(self.stopped.any())
+
+    def _asleep(self, saved: SavedState) -> Integers:
+        """Return the saved ``tree_asleep`` of each simulation, [B, trees].
+
+        It is negative for trees that are awake. Trees that sleep form cycles: each has the index of the next.
+        """
+        trees, name = self.model.ntree, "asleep"
+        like = np.zeros((self.number, trees), np.int32)
+        asleep = saved.array(name, like, least=-1 - mujoco.mjMINAWAKE, most=trees - 1)
+        for index, row in enumerate(asleep):
+            sleepers = np.flatnonzero(row >= 0)
+            if not np.array_equal(np.sort(row[sleepers]), sleepers):
+                raise saved.error(
+                    f"{name}.{index}", f"must have cycles of sleeping bodies, got {row.tolist()}"
+                )
+        return asleep
 
     def _restored(self, row: Floats, asleep: Integers) -> mujoco.MjData:
         data = mujoco.MjData(self.model)

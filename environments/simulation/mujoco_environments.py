@@ -21,10 +21,11 @@ from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.saved_state import IDENTITY, SavedState, identity
 from recrl.environments.simulation.actions import give_actions
 from recrl.environments.simulation.camera import Camera, Renderer
 from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
-from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 Batch = EnvironmentBatch[Any, Any]
 
@@ -156,11 +157,23 @@ class MujocoVectorEnv(CMDPVectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start B episodes; ``seed`` gives each environment a generator of its own."""
+        """Start new episodes in all environments, or in those of a ``reset_mask``.
+
+        Args:
+            seed: gives each of these environments a generator of its own.
+            options: None, or ``reset_mask``, an array bool [B] with at least one True.
+
+        Raises:
+            TypeError: the mask is no array of booleans.
+            ValueError: it is invalid, there are other options, or the first reset has a mask.
+        """
+        chosen = masked_environments(self.cmdp.name, self.num_envs, options)
+        if chosen is not None and not self.batch.generators:
+            raise ValueError(f"{self.cmdp.name}: call reset without a reset_mask first")
         super().reset(seed=seed, options=options)
         if seed is not None or not self.batch.generators:
-            self.batch.seed(seed)
-        self.batch.restart(np.arange(self.num_envs))
+            self.batch.seed(seed, chosen)
+        self.batch.restart(np.arange(self.num_envs) if chosen is None else chosen)
         return self.batch.observations(), {}
 
     def step(
@@ -174,6 +187,7 @@ class MujocoVectorEnv(CMDPVectorEnv):
         info = self._description.info(outcome)
         if len(outcome.finished):
             info["final_obs"] = observations
+            info["_final_obs"] = outcome.terminated | outcome.truncated
             batch.restart(outcome.finished)
             observations = batch.observations()
         return observations, outcome.rewards, outcome.terminated, outcome.truncated, info
@@ -197,10 +211,15 @@ class MujocoVectorEnv(CMDPVectorEnv):
         """Return everything that the future depends on: physics, counters, generators."""
         if not self.batch.generators:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
-        return self.batch.state_dict()
+        return {IDENTITY: identity(self.cmdp), **self.batch.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
+        """Continue exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: the state is damaged, of another task, or of other options.
+        """
+        SavedState(f"{self.cmdp.name}: saved state", state).check_identity(self.cmdp)
         self.batch.load_state_dict(state)
 
 

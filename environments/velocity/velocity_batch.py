@@ -29,7 +29,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.simulation.environment_batch import EnvironmentBatch, Observations
+from recrl.environments.saved_state import SavedState
+from recrl.environments.simulation.environment_batch import MOST_STEPS, EnvironmentBatch, Observations
 from recrl.environments.simulation.mujoco_batch import Simulations
 from recrl.environments.velocity.model import make_model
 from recrl.environments.velocity.physics import advance, derive, physics_record
@@ -182,12 +183,16 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
             "steps": self.steps.copy(),
         }
 
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        self.simulations.load(state["physics"])
-        for name, values in self.bodies.items():
-            values[...] = state["bodies"][name]
-        self.places = np.array(state["places"], np.float64)
-        self.steps[...] = state["steps"]
+    def _load_own_state(self, saved: SavedState) -> None:
+        fields = saved.part("bodies")
+        bodies = {name: fields.array(name, values) for name, values in self.bodies.items()}
+        places = saved.array("places", self.places)
+        steps = saved.array("steps", self.steps, least=0, most=MOST_STEPS)
+        self.simulations.load(saved.part("physics"))
+        for name, values in bodies.items():
+            self.bodies[name][...] = values
+        self.places = places
+        self.steps[...] = steps
 
     def _place_at_random(self, index: int) -> None:
         task, generator, model = self.task, self.generators[index], self.model

@@ -24,7 +24,7 @@ from recrl.teachers.registry import find_teacher, teacher_config
 
 
 def run_bound(request: BoundRequest, console: Console) -> ExitCode:
-    """Compare the cost of training with its bounds; find the largest d_t within a budget."""
+    """Compare the cost of training with its bounds; estimate the largest d_t within a budget."""
     from recrl.analysis.data.cost_names import indices_of_cost  # noqa: PLC0415
     from recrl.analysis.report import text_tables  # noqa: PLC0415  (imports pandas and SciPy)
     from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415
@@ -53,6 +53,11 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
             "d_d over all episodes:",
         )
         show(text_tables.admissible_table(allowed), console)
+        say(
+            console,
+            "An estimate, not a bound: each policy is taken to exceed its limit as in the worst run. "
+            "Curricula whose limits are not known in advance are left out.",
+        )
     return ExitCode.OK
 
 
@@ -76,7 +81,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
         record = trial.record()
         if record.status is TrialState.DAMAGED:
             damaged.append(f"{trial.title}: {record.error}")
-        elif record.update:
+        elif record.committed.get(trial.updates_path.name, 0):
             try:
                 rows = replay(trial, method)
             except DamagedError as error:
@@ -94,7 +99,8 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     for sentence in damaged:
         say(console, f"damaged: {sentence}")
     if not runs:
-        raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials has a policy update yet")
+        what = "is whole" if len(damaged) == len(specs) else "has a saved policy update yet"
+        raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials {what}")
     say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
     show(pd.concat(summaries), console)
     say(

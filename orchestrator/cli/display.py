@@ -18,7 +18,7 @@ from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.launch_plan import Estimate, Plan, PlannedAction
 from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, display_status
+from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress
 
 TERMINAL_SECONDS = 1.0
 LINE_SECONDS = 10.0
@@ -139,22 +139,22 @@ def damages_of_plan(plan: Plan) -> Iterator[str]:
             yield f"damaged: {trial.spec.title}: {trial.record.error}"
 
 
-def lines_of(trial: TrialStore, *, follow: bool) -> Iterator[str]:
+def lines_of(trial: TrialStore, *, may_grow: Callable[[], bool]) -> Iterator[str]:
     """Yield the lines of a trial's log.
 
     Args:
         trial: on disk.
-        follow: whether to wait for new lines as long as the trial runs.
+        may_grow: returns whether to wait for new lines.
     """
     offset, rest = 0, ""
     while True:
-        runs = display_status(trial.record(), now=time.time()) is DisplayStatus.RUNNING
+        waits = may_grow()
         with suppress(FileNotFoundError), trial.log_path.open("rb") as file:
             file.seek(offset)
             *lines, rest = (rest + file.read().decode(errors="replace")).split("\n")
             offset = file.tell()
             yield from lines
-        if not (follow and runs):
+        if not waits:
             break
         time.sleep(LOG_SECONDS)
     if rest:

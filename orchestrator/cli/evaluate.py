@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 from rich.console import Console
 
 from recrl.orchestrator.cli.output import say, short, show
@@ -17,6 +20,11 @@ from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
+
+if TYPE_CHECKING:
+    from recrl.agents.evaluation import FrozenPolicy
+    from recrl.orchestrator.trial.saved_policy import SavedTrial
+    from recrl.orchestrator.trial.videos import VideoFormat
 
 DEFAULT_EPISODES = 100  # episodes, for trials without an evaluation of their own
 
@@ -40,12 +48,19 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
             left_out.append(error)
     if not loaded:
         raise left_out[0]
-    rows, written = [], []
+    rows, written, evaluated = [], [], []
     for saved in loaded:
         num_episodes = request.episodes or saved.spec.evaluation_episodes or DEFAULT_EPISODES
-        episodes, path = saved.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
+        try:
+            episodes, path = saved.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
+        except RecrlError as error:
+            left_out.append(error)
+            continue
         rows += summary(episodes, saved)
         written.append(path)
+        evaluated.append(saved)
+    if not evaluated:
+        raise left_out[0]
     show(pd.DataFrame(rows), console)
     say(
         console,
@@ -55,17 +70,33 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
         say(console, f"Episodes   {short(path)}")
     for reason in left_out:
         say(console, f"left out   {reason}")
-    changed = [saved for saved in loaded if has_other_code(saved.store, saved.spec)]
+    _warn_of_other_code(evaluated, console)
+    if request.video:
+        for saved in evaluated:
+            _film(saved, policies, VideoFormat(request.video), request.seed, console)
+    _tell_mlflow(store, request, console)
+    return ExitCode.OK
+
+
+def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> None:
+    """Print the number of trials that ran other code than evaluated them."""
+    changed = [saved for saved in evaluated if has_other_code(saved.store, saved.spec)]
     complete = sum(saved.store.record().status is TrialState.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
         say(console, f"warning: {sentence}; these evaluations use the installed code")
-    if request.video:
-        for saved in loaded:
-            for policy in policies:
-                video = saved.film(policy, VideoFormat(request.video), seed=request.seed)
-                say(console, f"Video      {short(video)}")
-    _tell_mlflow(store, request, console)
-    return ExitCode.OK
+
+
+def _film(
+    saved: SavedTrial, policies: Sequence[FrozenPolicy], kind: VideoFormat, seed: int | None, console: Console
+) -> None:
+    """Film a trial's policies, and print the places; a film that fails stops no other."""
+    for policy in policies:
+        try:
+            video = saved.film(policy, kind, seed=seed)
+        except RecrlError as error:
+            say(console, f"no video   {error}")
+        else:
+            say(console, f"Video      {short(video)}")
 
 
 def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:

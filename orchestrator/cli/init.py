@@ -22,7 +22,11 @@ def run_init(request: InitRequest, console: Console) -> ExitCode:
     grid = request.file or Path(f"{request.template}.yaml")
     if grid.suffix not in (".yaml", ".yml"):
         raise RecrlError(f"{grid}: the name of a grid file must end with .yaml")
-    texts = {grid: _template(f"{request.template}.yaml").replace(f"{request.template}.yaml", str(grid))}
+    called, first = str(grid), ""
+    # its module is imported from the current folder
+    if request.template == OWN_TASK and grid.parent != Path():
+        called, first = grid.name, f"{shlex.join(['cd', str(grid.parent)])} && "
+    texts = {grid: _template(f"{request.template}.yaml").replace(f"{request.template}.yaml", called)}
     if request.template == OWN_TASK:
         texts[grid.with_name(MODULE)] = _template(f"{MODULE}.txt")
     for path in texts:
@@ -33,7 +37,7 @@ def run_init(request: InitRequest, console: Console) -> ExitCode:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
         say(console, f"Wrote {path}")
-    say(console, f"Next: {shlex.join(['recrl-sweep', 'launch', str(grid)])}")
+    say(console, f"Next: {first}{shlex.join(['recrl-sweep', 'launch', called])}")
     return ExitCode.OK
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
@@ -11,6 +11,7 @@ from recrl.orchestrator.cli.output import number_of_trials, print_table, say, sh
 from recrl.orchestrator.cli.requests import GridRequest, PlanRequest, ValidateRequest
 from recrl.orchestrator.errors import UncalledError
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.curriculum_warnings import no_deployment_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
@@ -19,7 +20,7 @@ from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import Plan, TrialSelection, estimate, kind_of, make_plan, unmeasured
 from recrl.orchestrator.provenance.code_changes import other_code_sentence
 from recrl.orchestrator.remote.remote_sweep import sweep_place
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialState
 
 
 def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
@@ -36,6 +37,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
         f"{request.grid}: {grid.name} is right: {number_of_trials(len(grid.trials()))}, from "
         f"tasks x agents x methods x seeds = {product}",
     )
+    _warn_of_deployment(grid.trials(), console)
     return ExitCode.OK
 
 
@@ -50,8 +52,12 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     """Print what a launch would do; nothing is started, and only the copy of an object store is written."""
     grid = read_grid(request.grid)
     store = SweepStore(request.root, grid.name)
-    sweep_place(store, request.storage).refresh()
-    plan = make_plan(grid.trials(), store, selection_of(request))
+    place = sweep_place(store, request.storage)
+    selection = selection_of(request)
+    if selection.reruns:
+        place.require_reruns()
+    place.refresh()
+    plan = make_plan(grid.trials(), store, selection)
     at_once, where = room(
         grid.resources, address=request.address, max_concurrent=request.max_concurrent, cores=request.cores
     )
@@ -96,6 +102,13 @@ def say_plan(
     """Print what a launch would do, and its estimated time and memory."""
     say(console, f"{grid.name}: {display.plan_sentence(plan)}")
     say(console, display.estimate_sentence(estimate(plan, concurrent=at_once, speeds=speeds), where))
+    _warn_of_deployment(plan.to_do, console)
+
+
+def _warn_of_deployment(specs: Sequence[TrialSpec], console: Console) -> None:
+    """Print the warning about trials without a deployment phase."""
+    if sentence := no_deployment_sentence(specs):
+        say(console, f"warning: {sentence}")
 
 
 def say_other_code(plan: Plan, console: Console) -> None:

@@ -21,6 +21,8 @@ DEFAULT_ROOT = Path("runs")
 KINDS = ("tasks", "agents", "curricula", "methods")  # methods: the key in a grid
 SWEEP_HELP = "a sweep's name, folder or grid file; optional if there is only one"
 
+_STORE = "an object store (s3://bucket/folder, gs://, abfs://...)"
+_COPY = "its folder under --root is then a local copy that stores the address"
 # Settings that several commands have.
 _GRID: Mapping[str, Any] = {
     "type": types.path_of,
@@ -56,11 +58,7 @@ class PlaceRequest(Request):
         metavar="FOLDER",
         help="the folder of all sweeps (default: runs)",
     )
-    storage: str | None = by_flag(
-        metavar="URI",
-        help="keep the sweep in an object store (s3://bucket/folder, gs://, abfs://...) that all nodes "
-        "reach; its folder under --root is then a local copy that stores the address",
-    )
+    storage: str | None = by_flag(metavar="URI", help=f"read the sweep from {_STORE}; {_COPY}")
 
 
 @dataclass(frozen=True)
@@ -96,6 +94,7 @@ class LaunchRequest(GridRequest):
 
     example: ClassVar[str] = "recrl-sweep launch demo.yaml --only method=none,dynamic seed=0"
     trusted: ClassVar[bool] = True
+    storage: str | None = by_flag(metavar="URI", help=f"keep the sweep in {_STORE} for all nodes; {_COPY}")
     address: str | None = by_flag(
         metavar="HOST:PORT",
         help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
@@ -211,12 +210,12 @@ class EvaluateRequest(SweepRequest):
     episodes: int | None = by_flag(
         type=types.at_least_one,
         metavar="N",
-        help="for each policy; by default the number of the trial's own evaluation",
+        help="episodes for each policy (default: the trial's own number)",
     )
     seed: int | None = by_flag(
         type=types.at_least_zero,
         metavar="S",
-        help="for the episodes; by default that of the trial's own evaluation, whose results are then equal",
+        help="seed of the episodes (default: the trial's own evaluation's, whose results are then equal)",
     )
     policy: str = by_flag(
         choices=("stochastic", "deterministic", "both"),
@@ -291,20 +290,18 @@ class MergeRequest(Request):
 
 @dataclass(frozen=True)
 class BoundRequest(SourceRequest):
-    """Compare the cost of training with its bounds; find the largest training limit for a budget."""
+    """Compare the cost of training with its bounds; estimate the largest training limit for a budget."""
 
     example: ClassVar[str] = "recrl-sweep bound demo --budget 5000"
     trust: bool = by_flag(**_TRUST)
     budget: float | None = by_flag(
         type=types.cost,
         metavar="COST",
-        help="allowed cost above the deployment limit of all training episodes together: find the largest "
-        "training limit d_t",
+        help="allowed cost above the deployment limit d_d, over all training episodes: estimate the largest "
+        "training limit d_t, for curricula whose limits are known in advance",
     )
     cost: str = by_flag(
-        default="0",
-        metavar="INDEX",
-        help="index of the cost, counted from 0, or its name (default: 0)",
+        default="0", metavar="INDEX|NAME", help="the cost's index, counted from 0, or its name (default: 0)"
     )
 
 
@@ -332,7 +329,9 @@ class UIRequest(SweepRequest):
 
     example: ClassVar[str] = "recrl-sweep ui demo"
     tracking_uri: str | None = by_flag(**_TRACKING)
-    port: int = by_flag(type=types.port, default=5000, metavar="N", help="of 127.0.0.1 (default: 5000)")
+    port: int = by_flag(
+        type=types.port, default=5000, metavar="N", help="port on this machine (default: 5000)"
+    )
 
 
 @dataclass(frozen=True)
@@ -340,7 +339,11 @@ class SyncRequest(SweepRequest):
     """Bring MLflow up to date with the files, for example after it was unreachable."""
 
     example: ClassVar[str] = "recrl-sweep sync demo --tracking-uri http://localhost:5000"
-    trust: bool = by_flag(**_TRUST)
+    trust: bool = by_flag(
+        action="store_true",
+        help="import tasks that files name by an import path, so that their values final/... are exact: do "
+        "so only with files whose author you trust",
+    )
     tracking_uri: str | None = by_flag(**_TRACKING)
     rebuild: bool = by_flag(action="store_true", help="send everything again, for example to an empty MLflow")
 

@@ -90,7 +90,7 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
         sweep = from_mlflow.load(checked_uri(request.tracking_uri), name)
         return sweep, Path(f"{sweep.name}-figures")
     if given and given.endswith(export.SUFFIX):
-        return export.load(Path(given)), Path(given).with_name("figures")
+        return export.load(Path(given)), Path(f"{Path(given).stem}-figures")
     store = open_store(request)
     return sweep_data.load(store), store.figures_folder
 

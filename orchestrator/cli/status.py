@@ -136,7 +136,8 @@ def run_logs(request: LogsRequest, console: Console) -> ExitCode:
                 place = sweep_place(store, request.storage)
                 following.enter_context(place.kept_up_to_date(threading.Event()))
             _wait_for_start(store, text, console)
-        for line in display.lines_of(_trial(store, text), follow=request.follow):
+        trial = _trial(store, text)
+        for line in display.lines_of(trial, may_grow=lambda: request.follow and _runs(store, trial)):
             say(console, line)
     return ExitCode.OK
 
@@ -144,7 +145,8 @@ def run_logs(request: LogsRequest, console: Console) -> ExitCode:
 def _wait_for_start(store: SweepStore, text: str, console: Console) -> None:
     """Wait until a matching trial has begun, as long as a launch runs that may begin it."""
     told = False
-    while not _meant(store, text) and store.is_locked():
+    begun = (DisplayStatus.RUNNING, DisplayStatus.COMPLETE, DisplayStatus.FAILED, DisplayStatus.DAMAGED)
+    while store.is_locked() and not any(_status(store, it) in begun for it in _meant(store, text)):
         if not told:
             say(console, f"{store.name}: waiting for {f'a trial {text!r}' if text else 'a trial'} to start")
         told = True
@@ -156,8 +158,15 @@ def _meant(store: SweepStore, text: str) -> list[TrialStore]:
     found = store.find(text)
     if text:
         return found
-    now = time.time()
-    return [trial for trial in found if display_status(trial.record(), now=now) is DisplayStatus.RUNNING]
+    return [trial for trial in found if _runs(store, trial)]
+
+
+def _runs(store: SweepStore, trial: TrialStore) -> bool:
+    return _status(store, trial) is DisplayStatus.RUNNING
+
+
+def _status(store: SweepStore, trial: TrialStore) -> DisplayStatus:
+    return display_status(trial.record(), now=time.time(), silence_seconds=store.silence_seconds)
 
 
 def _trial(store: SweepStore, text: str) -> TrialStore:

@@ -82,10 +82,14 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def _without_arrays(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: str) -> Any:
-    """Return the tree with each array moved to ``arrays`` and replaced by its path."""
+    """Return the tree with each array moved to ``arrays`` and replaced by its key there.
+
+    The key is the number of arrays before it. A path would not do: a key of a dict may contain a dot.
+    """
     if isinstance(value, np.ndarray):
-        arrays[path] = np.array(value, order="C")
-        return {_ARRAY: path}
+        key = str(len(arrays))
+        arrays[key] = np.array(value, order="C")
+        return {_ARRAY: key}
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, dict):

@@ -33,6 +33,13 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
     return _warning(what, titles, "give the curriculum more steps, a smaller window or a smaller d_t")
 
 
+def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
+    """Return the warning about trials without an update in the deployment phase; empty for none."""
+    what = "the deployment phase is shorter than an update, so that no update learns under d_d"
+    titles = [spec.title for spec in specs if spec.lacks_deployment]
+    return _warning(what, titles, "take more total_steps or a larger deploy_fraction")
+
+
 def _warning(what: str, titles: Sequence[str], remedy: str) -> str:
     """Return a warning that names the first trials; empty for none."""
     more = f" and {len(titles) - NAMED} more" if len(titles) > NAMED else ""

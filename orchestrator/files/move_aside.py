@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -12,9 +13,18 @@ def move_aside(path: Path, folder: Path, *, copy: bool = False) -> None:
     if not os.path.lexists(path):
         return
     folder.mkdir(parents=True, exist_ok=True)
-    number = 1 + len(list(folder.iterdir()))
-    place = folder / f"{number:03d}-{path.name.lstrip('.')}"
+    place = folder / f"{next_number(folder):03d}-{path.name.lstrip('.')}"
     if copy and path.is_file():
         shutil.copy2(path, place)
     else:
         path.rename(place)
+
+
+def next_number(folder: Path, prefix: str = "") -> int:
+    """Return a number above those of all entries in a folder that begin with a prefix and a number.
+
+    >>> next_number(Path("/nowhere"))
+    1
+    """
+    found = (re.match(rf"{re.escape(prefix)}(\d+)", path.name) for path in folder.glob(f"{prefix}*"))
+    return 1 + max((int(match.group(1)) for match in found if match), default=0)

@@ -74,7 +74,10 @@ class StopFile(StopSign):
 
     def set(self) -> None:
         """Signal the workers to stop."""
-        self.path.write_text("stop\n")
+        try:
+            self.path.write_text("stop\n")
+        except OSError:  # no room on the disk; a missing file means stop, too
+            self.path.unlink(missing_ok=True)
 
     def _says_stop(self) -> bool:
         try:

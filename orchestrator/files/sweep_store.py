@@ -18,12 +18,13 @@
             events.jsonl        one line per event: noise added, limits measured, phase changed
             evaluation.csv      one row per episode of the final evaluations: EVALUATION_COLUMNS
             policy.csv          of finite tasks: the final policy, one row per state, action_j per action
-            evaluations/        results of ``recrl-sweep evaluate``; no part of the trial
-            videos/             episodes filmed by ``recrl-sweep evaluate --video``; no part of the trial
+            evaluations/        results of ``recrl-sweep evaluate``; not needed by the trial
+            videos/             episodes filmed by ``recrl-sweep evaluate --video``; not needed by the trial
             checkpoints/        the newest two checkpoints
             provenance.json     of each attempt: versions, commit, machine, digests of the code
             log.txt, error.txt  the trial's log; the traceback of a failed trial
             aside/              damaged or replaced files, moved there when an attempt began
+            rerun.request       exists until an attempt has moved the files of a replaced run to aside/run-...
             .reserve            disk space for the final record of a running trial, if the disk is full
 
 Rules. Small files are written atomically. Only ``TrialWriter.commit`` appends rows. It syncs them, then
@@ -76,6 +77,7 @@ from recrl.orchestrator.spec import TrialSpec
 
 SPECS_FORMAT = 2
 INFO_FORMAT = 2
+SILENCE_SECONDS = 300.0  # an update of large networks takes a minute or two
 LOOK_SECONDS = 10.0  # total time for which readers may hold the lock to see whether a sweep is locked
 
 _TRIAL = re.compile(r"__[0-9a-f]{10}$")
@@ -126,6 +128,17 @@ class SweepStore:
             return {}
         except DamagedError as error:
             raise type(error)(f"{self.name}: {error}; launching its grid again writes it anew") from error
+
+    @property
+    def silence_seconds(self) -> float:
+        """Seconds without a sign of life after which a running trial counts as dead, at least 300.
+
+        They are those of the last launch's grid: after them its watchdog ends the trial.
+        """
+        try:
+            return max(SILENCE_SECONDS, float(self.info().get("silence_seconds", SILENCE_SECONDS)))
+        except (StorageError, TypeError, ValueError):
+            return SILENCE_SECONDS
 
     def write_info(self, info: Mapping[str, Any]) -> None:
         """Write ``sweep.json``."""
@@ -216,9 +229,10 @@ class SweepStore:
 
     def _was_launched(self) -> bool:
         try:
-            return "launched" in self.info()
+            info = self.info()
         except StorageError:
             return True
+        return "launched" in info or (not info and bool(self.trials()))
 
     def damages(self) -> list[str]:
         """Return a sentence for each damaged file of the sweep itself, not of its trials."""

@@ -77,6 +77,7 @@ class TrialFiles:
     state_path = TrialFile("state.json", FileKind.RECORD)
     reserve_path = TrialFile(".reserve", FileKind.LOCAL)
     lock_path = TrialFile(".lock", FileKind.LOCAL)
+    rerun_path = TrialFile("rerun.request", FileKind.LOCAL)
     pulled_path = TrialFile(".pulled.json", FileKind.LOCAL)
     checkpoints_folder = Below("checkpoints")
     evaluations_folder = Below("evaluations")

@@ -17,14 +17,20 @@ from dataclasses import replace
 from pathlib import Path
 
 from recrl.orchestrator.errors import DamagedError, StorageError
-from recrl.orchestrator.files.atomic_files import parsed_object, read_whole, write_sealed
+from recrl.orchestrator.files.atomic_files import (
+    parsed_object,
+    read_sealed,
+    read_whole,
+    write_atomically,
+    write_sealed,
+)
 from recrl.orchestrator.files.locks import locked
-from recrl.orchestrator.files.move_aside import move_aside
+from recrl.orchestrator.files.move_aside import move_aside, next_number
 from recrl.orchestrator.files.row_files import Extent, digest_of
 from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_reader import RECORD_FORMAT, SPEC_FORMAT, TrialReader
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
-from recrl.orchestrator.files.trial_writer import TrialWriter
+from recrl.orchestrator.files.trial_writer import PROVENANCE_FORMAT, TrialWriter
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 RESERVE_BYTES = 16 * 1024  # room for a record and a traceback
@@ -74,13 +80,17 @@ class TrialStore(TrialReader):
         """
         with self.writing():
             self._clear_the_way()
-            self.checkpoints_folder.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
             return self._begin(spec)
 
     def _begin(self, spec: TrialSpec) -> TrialWriter:
         with self.locked():
+            if self.rerun_path.exists():
+                self._set_all_aside()
+            self.checkpoints_folder.mkdir(exist_ok=True)
             self.reserve_path.unlink(missing_ok=True)  # it might be a link
             self.reserve_path.write_bytes(secrets.token_bytes(RESERVE_BYTES))
+            self.move_aside(self.error_path)  # the traceback of an earlier attempt
             old = self._salvaged()
             if self.spec_path.name not in old.committed:
                 if self.spec_path.exists():
@@ -123,9 +133,23 @@ class TrialStore(TrialReader):
             if digest is not None and digest.hexdigest() == extent.sha256:
                 whole[name] = extent
                 continue
+            if name == self.provenance_path.name and self._is_intact_provenance():
+                whole[name] = Extent.of(self.provenance_path.read_bytes())
+                continue
             logger.warning("%s: %s is not what was committed; it is moved aside", self.folder.name, name)
             self.move_aside(self.folder / name, copy=name in rows)
         return replace(old, **as_fields(whole))
+
+    def _is_intact_provenance(self) -> bool:
+        """Whether ``provenance.json`` is what an attempt wrote.
+
+        An attempt that is killed right after it leaves a record with the digest of the file before.
+        """
+        try:
+            read_sealed(self.provenance_path, version=PROVENANCE_FORMAT)
+        except (OSError, StorageError):
+            return False
+        return True
 
     def _attempts_made(self) -> int:
         """Count the attempts if the record of their number is lost."""
@@ -150,23 +174,44 @@ class TrialStore(TrialReader):
             if path.is_dir():
                 self.move_aside(path)
 
-    def set_all_aside(self) -> None:
-        """Move all files of earlier attempts aside, so that the next one starts anew.
+    def request_rerun(self) -> None:
+        """Let the next attempt move all files of earlier ones aside, and start anew.
 
         Raises:
             StorageError: the disk is full or gone.
         """
         with self.writing():
             self._clear_the_way()
-            if not self.folder.is_dir():
-                return
-            with self.locked():
-                kept = {self.aside_folder, self.evaluations_folder, self.videos_folder, self.lock_path}
-                number = 1 + len(list(self.aside_folder.glob("run-*")))
-                place = self.aside_folder / f"run-{number:03d}"
-                place.mkdir(parents=True)
-                for path in sorted(set(self.folder.iterdir()) - kept):
-                    path.rename(place / path.name)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if not self.rerun_path.exists():
+                number = next_number(self.aside_folder, "run-")
+                write_atomically(self.rerun_path, f"run-{number:03d}\n".encode())
+
+    def withdraw_rerun(self) -> None:
+        """Withdraw a request of which no attempt has moved anything yet.
+
+        Raises:
+            StorageError: the disk is gone.
+        """
+        with self.writing(), self.locked():
+            if self.rerun_path.exists() and not (self.aside_folder / self._rerun_folder).exists():
+                self.rerun_path.unlink()
+
+    @property
+    def _rerun_folder(self) -> str:
+        return self.rerun_path.read_text().strip()
+
+    def _set_all_aside(self) -> None:
+        """Move all files of earlier attempts to the folder that ``request_rerun`` named.
+
+        The request goes last, so that the next attempt continues after a kill. The caller holds ``locked``.
+        """
+        kept = {self.aside_folder, self.lock_path, self.rerun_path, self.reserve_path}
+        place = self.aside_folder / self._rerun_folder
+        place.mkdir(parents=True, exist_ok=True)
+        for path in sorted(set(self.folder.iterdir()) - kept):
+            path.rename(place / path.name)
+        self.rerun_path.unlink()
 
     def set_status(self, status: TrialState, *, error: str = "") -> None:
         """Set the status of a trial whose process can no longer do so.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -18,6 +19,8 @@ from recrl.orchestrator.located_yaml import Place
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import check_limits_fall, checked_answer
+
+logger = logging.getLogger("recrl.sweep")
 
 PLAIN_AGENT = Choice("ppo-lag")
 NO_CURRICULUM, NO_LIMITS = Choice("none"), Choice("unconstrained")
@@ -45,7 +48,10 @@ def cmdp_of(task: Choice) -> CMDPSpec:
     except USERS_ERRORS as error:
         raise BuildError(f"{task.name} fails in its first step: {described(error)}") from error
     finally:
-        envs.close()
+        try:
+            envs.close()
+        except USERS_ERRORS as error:  # in a trial it is only logged
+            logger.warning("%s raised an error when it was closed: %s", task.name, described(error))
     return envs.cmdp
 
 

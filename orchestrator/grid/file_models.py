@@ -102,6 +102,8 @@ def _read_name(value: Any) -> str:
             "must be a name for a folder: letters, digits and . _ - only, at most 64, "
             f"got {as_written(value)}"
         )
+    if value.lower().endswith((".zip", ".yaml", ".yml")):
+        raise ValueError(f"must not end like a file, with .zip, .yaml or .yml, got {as_written(value)}")
     return value
 
 
@@ -238,7 +240,7 @@ class Resources(_Written):
         le=1e7,
         description="A trial that uses no processor time for this many wall seconds hangs (five "
         "times as many before its first sign of life). It is started again from its "
-        "last checkpoint (ours).",
+        "last checkpoint (ours). In an object store it is at least 50.",
     )
 
 

@@ -39,6 +39,7 @@ from ray.tune.search import BasicVariantGenerator
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.stop_file import StopSign
+from recrl.orchestrator.files.sweep_store import SILENCE_SECONDS
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit
@@ -49,7 +50,6 @@ from recrl.orchestrator.ray.tune_callbacks import DriverWatch, StopWhenIdle
 from recrl.orchestrator.ray.tune_trial import TuneTrial
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep_place import SweepPlace
-from recrl.orchestrator.sweep_progress import SILENCE_SECONDS
 
 if TYPE_CHECKING:
     from recrl.orchestrator.grid.file_models import Resources
@@ -102,9 +102,13 @@ class RayExecutor:
             if self.address:
                 check_nodes(stop_sign.place, stop_sign.uri)
             queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
-            watchdog = HangWatchdog(place, self.silence_seconds)
+            watchdog = HangWatchdog(place, self.silence_of(place))
             watch = DriverWatch(place, queue, stop=stop, stop_sign=stop_sign, watchdog=watchdog, lost=lost)
             self._run_on_cluster(specs, place, stop_sign, queue, watch)
+
+    def silence_of(self, place: SweepPlace) -> float:
+        """Return the wall seconds without a heartbeat after which a trial of a place counts as hanging."""
+        return max(self.silence_seconds, place.shortest_silence_seconds)
 
     def _cluster(self) -> AbstractContextManager[None]:
         if ray.is_initialized():

@@ -30,7 +30,7 @@ from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.remote.commit_upload import Upload, working_copy
+from recrl.orchestrator.remote.commit_upload import ALIVE_SECONDS, Upload, working_copy
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
@@ -56,6 +56,8 @@ class RemoteSweep(SweepPlace):
         objects: of the sweep's folder in the object store.
         lease: of the launch that runs the sweep.
     """
+
+    shortest_silence_seconds = 2.0 * (ALIVE_SECONDS + PULL_SECONDS)
 
     def __init__(self, uri: str, store: SweepStore) -> None:
         """Check the address, without access to the store.

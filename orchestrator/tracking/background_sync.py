@@ -110,8 +110,11 @@ def _pass(tracker: Tracker, *, live: bool) -> SyncReport:
 
 
 def _any_runs(store: SweepStore) -> bool:
-    records = (trial.record() for trial in store.trials())
-    return any(display_status(record, now=time.time()) is DisplayStatus.RUNNING for record in records)
+    silence = store.silence_seconds
+    return any(
+        display_status(trial.record(), now=time.time(), silence_seconds=silence) is DisplayStatus.RUNNING
+        for trial in store.trials()
+    )
 
 
 def _is_over(parent: int, seconds: float) -> bool:

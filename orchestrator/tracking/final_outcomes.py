@@ -77,17 +77,23 @@ class FinalOutcomes:
         self._store = store
         self._path = store.figures_folder / FILE_NAME
         self._mark = ""
+        self._written_at = 0.0
         self._found: dict[str, FinalOutcome] = {}  # by trial id, as labels may be those of an earlier grid
 
     def of(self, spec: TrialSpec) -> FinalOutcome | None:
-        """Return the outcome of a trial; None before the file has it."""
+        """Return the outcome of a complete trial; None before the file has it, or that of an earlier run."""
         self._refresh()
-        return self._found.get(spec.trial_id)
+        if spec.trial_id not in self._found:
+            return None
+        record = self._store.trial(spec).record()
+        is_of_this_run = record.status is TrialState.COMPLETE and record.started_at <= self._written_at
+        return self._found[spec.trial_id] if is_of_this_run else None
 
     def all(self) -> Sequence[FinalOutcome]:
-        """Return all outcomes, in the report's order."""
+        """Return the outcomes of the grid's complete trials, in the report's order."""
         self._refresh()
-        return list(self._found.values())
+        known = {spec.trial_id for spec in self._store.specs() if self.of(spec) is not None}
+        return [outcome for trial_id, outcome in self._found.items() if trial_id in known]
 
     def lack_a_complete_trial(self) -> bool:
         """Whether a complete trial of the grid, whose policy was evaluated, is not in the file."""
@@ -104,14 +110,15 @@ class FinalOutcomes:
             mark = file_mark(self._path)
             if mark == self._mark:
                 return
+            written_at = self._path.stat().st_mtime
             with self._path.open(encoding="utf-8", newline="") as file:
                 rows = [row for row in csv.DictReader(file) if row.get("measure") == MEASURE]
             outcomes = list(map(_outcome, rows))
         except FileNotFoundError:
-            mark, outcomes = "", []
+            mark, written_at, outcomes = "", 0.0, []
         except (KeyError, TypeError, ValueError):  # another version wrote it, or it is being written
             return
-        self._mark = mark
+        self._mark, self._written_at = mark, written_at
         self._found = {outcome.trial_id: outcome for outcome in outcomes}
 
 

@@ -72,7 +72,6 @@ class SweepRuns:
             **self._tags,
             "recrl.kind": "trial",
             "recrl.trial_id": spec.trial_id,
-            "recrl.group": f"{spec.method.label}, {spec.agent.label}, {spec.task.label}",
             "mlflow.parentRunId": self.parent_id,
         }
         run_id = self._create(spec.title, record.started_at, tags)

@@ -9,7 +9,7 @@ content is in ``run_content``. States of runs:
     waiting, never started                                      not there; the parent's note counts it
     waiting to be resumed                                       SCHEDULED during a launch, KILLED after it
     running                                                     RUNNING
-    running, but its process is gone, or silent for 5 minutes   KILLED
+    running, but its process is gone, or silent for too long    KILLED
     complete                                                    FINISHED
     failed                                                      FAILED, with the tag ``recrl.error``
 
@@ -25,6 +25,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
+from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.files.atomic_files import write_json
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
@@ -116,9 +117,11 @@ class Tracker:
             view, self._view = self._view, None  # made anew after any error
             try:
                 view = view or _View(self.store, self.uri, self._write_export, rebuild=rebuild)
+                orphans = self._orphans()
                 for trial in trials:
                     with _kept(problems, trial):
-                        points.append(view.trials.show(trial, live=live))
+                        known = trial.folder.name not in orphans
+                        points.append(view.trials.show(trial, live=live, is_in_grid=known))
                 remark = view.sweep.show(live=live)
             except Exception as error:
                 problems.append(one_line(error))
@@ -134,6 +137,14 @@ class Tracker:
             write_json(sync_folder(self.store, self.uri) / "report.json", asdict(report))
         self._view = None if problems else view
         return report
+
+    def _orphans(self) -> set[str]:
+        """Return the folder names of trials that are not in the last launch's grid."""
+        try:
+            listed = {spec.folder_name for spec in self.store.specs()}
+        except DamagedError:  # the parent run's update reports it
+            return set()
+        return {trial.folder.name for trial in self.store.trials()} - listed
 
 
 class _View:

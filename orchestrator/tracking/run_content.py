@@ -46,6 +46,8 @@ MAX_PARAMS = 100  # in one request
 MAX_NOTE = 7_500  # characters; MLflow takes 8,000 in a tag
 MAX_VERDICTS = 5_000  # of them, for the table of verdicts
 
+GROUP_TAG = "recrl.group"
+
 Row = Mapping[str, str]
 
 
@@ -171,6 +173,18 @@ def params(spec: TrialSpec) -> dict[str, str]:
         for key, value in choice.options.items():
             flat[_safe(f"{name}.{key}")] = value if isinstance(value, str) else json.dumps(value)
     return dict(islice(flat.items(), MAX_PARAMS))
+
+
+def group_tag(spec: TrialSpec, *, is_in_grid: bool) -> str:
+    """Return a run's group in the charts, which average the runs of a group.
+
+    Args:
+        spec: the trial.
+        is_in_grid: whether it is one of the last launch's grid. The labels of others may have meant other
+            settings, so they are not averaged with it.
+    """
+    group = f"{spec.method.label}, {spec.agent.label}, {spec.task.label}"
+    return group if is_in_grid else f"{group}, no longer in the grid"
 
 
 @dataclass(frozen=True)

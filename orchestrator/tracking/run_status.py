@@ -11,14 +11,15 @@ from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 MAX_ERROR = 5_000  # characters of a failed trial's error
 
 
-def trial_run_status(record: TrialRecord, *, live: bool) -> str:
+def trial_run_status(record: TrialRecord, *, live: bool, silence_seconds: float) -> str:
     """Return MLflow's state of a trial that has begun.
 
     Args:
         record: of the trial; ``attempt`` is at least 1.
         live: whether a launch runs that will resume waiting trials.
+        silence_seconds: of ``SweepStore.silence_seconds``.
     """
-    match display_status(record, now=time.time()):
+    match display_status(record, now=time.time(), silence_seconds=silence_seconds):
         case DisplayStatus.COMPLETE:
             return "FINISHED"
         case DisplayStatus.FAILED | DisplayStatus.DAMAGED:

@@ -75,9 +75,12 @@ class SweepSync:
     def _show_state(self, position: Position, records: dict[str, TrialRecord], *, live: bool) -> Position:
         from mlflow.entities import RunTag  # noqa: PLC0415
 
-        counts = Counter(display_status(record, now=time.time()) for record in records.values())
+        now, silence = time.time(), self._store.silence_seconds
+        counts = Counter(
+            display_status(record, now=now, silence_seconds=silence) for record in records.values()
+        )
         status = sweep_run_status(counts, live=live)
-        summaries = filter(None, map(self._summary, self._store.trials()))
+        summaries = filter(None, map(self._summary, map(self._store.trial, self._store.specs())))
         text = note(
             self._store.name,
             {status: counts[status] for status in DisplayStatus},
@@ -108,10 +111,8 @@ class SweepSync:
         return f"#{report_page(self._runs.experiment_id, self._runs.parent_id)}"
 
     def _records(self) -> dict[str, TrialRecord]:
-        """Return the records of all trials by folder name, also of trials that were never started."""
-        records = {trial.folder.name: trial.record() for trial in self._store.trials()}
-        waiting = {spec.folder_name: TrialRecord() for spec in self._store.specs()}
-        return {**waiting, **records}
+        """Return the records of the grid's trials by folder name, also of trials that were never started."""
+        return {spec.folder_name: self._store.trial(spec).record() for spec in self._store.specs()}
 
     def _save(self, position: Position) -> None:
         if position != self._position:

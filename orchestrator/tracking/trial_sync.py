@@ -22,10 +22,12 @@ from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcom
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import Position, file_mark, read_position, sync_folder
 from recrl.orchestrator.tracking.run_content import (
+    GROUP_TAG,
     Point,
     Row,
     Summary,
     final_points,
+    group_tag,
     params,
     points,
     rows_after,
@@ -42,13 +44,19 @@ class TrialSync:
     """Sync of trials to their runs; it keeps the sent positions between passes."""
 
     def __init__(self, store: SweepStore, uri: str, runs: SweepRuns, outcomes: FinalOutcomes) -> None:
+        self._store = store
         self._runs = runs
         self._outcomes = outcomes
         self._folder = sync_folder(store, uri)
         self._positions: dict[str, Position] = {}
 
-    def show(self, trial: TrialStore, *, live: bool) -> int:
+    def show(self, trial: TrialStore, *, live: bool, is_in_grid: bool) -> int:
         """Update the trial's run; return the number of points sent.
+
+        Args:
+            trial: has begun.
+            live: whether a launch runs that will resume waiting trials.
+            is_in_grid: whether it is one of the last launch's grid.
 
         Raises:
             DamagedError: a file of the trial differs from its commit.
@@ -57,7 +65,8 @@ class TrialSync:
         if record.status is TrialState.DAMAGED:
             raise DamagedError(record.error)
         outcome = self._outcomes.of(trial.spec) if record.status is TrialState.COMPLETE else None
-        shown = _shown(trial, record, outcome, live=live)
+        status = trial_run_status(record, live=live, silence_seconds=self._store.silence_seconds)
+        shown = _shown(trial, record, outcome, status=status, is_in_grid=is_in_grid)
         position = self._position(trial, record)
         if position.shown == shown:
             return 0
@@ -70,7 +79,7 @@ class TrialSync:
         new_points, position = _points_to_send(
             trial, data, position, outcome, is_finished=shown["status"] == "FINISHED"
         )
-        position = self._send(trial, record, position, new_points, outcome)
+        position = self._send(trial, record, position, new_points, outcome, group=shown["group"])
         if position.shown.get("status") != shown["status"]:
             self._runs.set_status(position.run_id, shown["status"], record.heartbeat)
         self._save(trial, replace(position, shown=shown))
@@ -91,6 +100,8 @@ class TrialSync:
         position: Position,
         new_points: Sequence[Point],
         outcome: FinalOutcome | None,
+        *,
+        group: str,
     ) -> Position:
         """Send points, params, tags and files.
 
@@ -109,7 +120,7 @@ class TrialSync:
         except OSError:  # points may fit even if there is no room for files
             client.log_batch(run_id, metrics=metrics, params=told)
             raise
-        told_tags = state_tags(record)
+        told_tags = {**state_tags(record), GROUP_TAG: group}
         if outcome is not None:
             start = record.start_limits or list(trial.spec.train_limits)
             text = trial_note(outcome, [float(limit) for limit in start])
@@ -143,12 +154,13 @@ class TrialSync:
 
 
 def _shown(
-    trial: TrialStore, record: TrialRecord, outcome: FinalOutcome | None, *, live: bool
+    trial: TrialStore, record: TrialRecord, outcome: FinalOutcome | None, *, status: str, is_in_grid: bool
 ) -> dict[str, Any]:
     """Return the content of the run besides points; nothing is sent while it does not change."""
     known = {} if outcome is None else {"outcome": repr(outcome)}
     return known | {
-        "status": trial_run_status(record, live=live),
+        "status": status,
+        "group": group_tag(trial.spec, is_in_grid=is_in_grid),
         "attempt": record.attempt,
         "committed": record.committed.get(trial.updates_path.name, 0),
         "error": record.error,

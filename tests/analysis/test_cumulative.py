@@ -42,6 +42,7 @@ def river_grid(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     trial = store.trial(RIVER)
     assert run_recorded(RIVER, trial, should_stop=lambda: False) is TrialState.COMPLETE
     store.write_info({"name": store.name})
+    store.write_specs([RIVER])
     return store
 
 

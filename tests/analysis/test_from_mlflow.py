@@ -59,8 +59,8 @@ def sweep(
     trial = store.trials()[0]
     commit_file(trial, "policy.csv", "action_0,action_1\n0.25,0.75\n1.0,0.0\n")
     commit_file(trial, "provenance.json", '{"torch": "9.9"}')
-    store.grid_path.write_text("name: made-up\n")
     store.write_info({"name": store.name})
+    store.write_specs([trial.spec for trial in store.trials()], b"name: made-up\n")
     return told(store, empty_database)
 
 
@@ -269,13 +269,18 @@ def test_a_sweep_that_mlflow_does_not_show_is_named(
 
 
 def test_commands_take_mlflow_or_an_export_file_for_the_files(
-    sweep: SweepStore, exported: Sweep, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sweep: SweepStore,
+    exported: Sweep,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     uri = tracking_uri(sweep, None)
     file = tmp_path / "made-up.zip"
     assert main(["export", "made-up", "--tracking-uri", uri, "--to", str(file)]) == ExitCode.OK
     assert "9 trials" in capsys.readouterr().out
     assert len(export.load(file).updates) == len(exported.updates)
     assert main(["figures", str(file), "--band", "iqm", "--sketch"]) == ExitCode.OK
-    assert (tmp_path / "figures" / "report.html").exists()
+    assert (tmp_path / "made-up-figures" / "report.html").exists()
     assert main(["bound", str(file)]) == ExitCode.OK

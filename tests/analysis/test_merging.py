@@ -243,7 +243,7 @@ def test_trials_completed_in_two_parts_with_other_episodes_are_named(part: Part,
     merged = merge([one, dataclasses.replace(two, phases=changed)])
     assert merged.notes == (
         "completed in several parts with different episodes, as machines or versions differ; the first "
-        "part's are taken: a cpo none seed 0, a cpo none seed 1, a ppo-lag dynamic seed 0 and 3 more",
+        "part's are taken: a ppo-lag none seed 0, a ppo-lag none seed 1, a ppo-lag dynamic seed 0 and 3 more",
     )
     assert_equal(merged, one)
 
@@ -256,7 +256,7 @@ def test_the_command_writes_one_file(part: Part, tmp_path: Path, capsys: pytest.
     assert main(["merge", *map(str, paths), "--to", str(to)]) == ExitCode.OK
     assert "all.zip: 8 trials, 8 of them complete, " in capsys.readouterr().out
     assert_equal(export.load(to), merge([export.load(path) for path in paths]))
-    assert main(["figures", str(to), "--sketch"]) == ExitCode.OK
+    assert main(["figures", str(to), "--sketch", "--to", str(tmp_path / "figures")]) == ExitCode.OK
 
 
 def test_a_sweep_that_is_no_file_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -47,7 +47,7 @@ def test_code_that_differs_from_that_of_the_baseline_is_named(finished: Sweep) -
     both = {"river-a cpo none": "old", "river-b cpo none seed 2": "old"}
     assert mixed_code_sentence(with_code(finished, both)) == (
         "the code that trials ran differs between seeds that are averaged (river-b cpo none) and "
-        f"between none and curricula compared with it (river-a cpo dynamic, river-a cpo linear); {REMEDY}"
+        f"between none and curricula compared with it (river-a cpo linear, river-a cpo dynamic); {REMEDY}"
     )
 
 

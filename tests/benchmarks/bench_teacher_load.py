@@ -30,12 +30,11 @@ import numpy as np
 import ray
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
-from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.sweep_store import SILENCE_SECONDS, SweepStore
 from recrl.orchestrator.ray.clusters import local_cluster
 from recrl.orchestrator.ray.hang_watchdog import look_seconds
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service, start_teacher_service
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.sweep_progress import SILENCE_SECONDS
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 

@@ -32,6 +32,7 @@ from recrl.environments.rivergrid.instances import InstanceSettings, draw_instan
 from recrl.environments.rivergrid.maps import MAPS, parse_map
 from recrl.environments.rivergrid.minigrid_drawing import render_frame
 from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
+from recrl.environments.saved_state import IDENTITY
 from recrl.environments.vector import CMDPVectorEnv
 
 register_all()
@@ -316,23 +317,6 @@ def test_states_are_numbered_by_column_row_and_heading() -> None:
     assert np.flatnonzero(seen).tolist() == [1, 9 + 4, 9 + 9 + 3]
 
 
-def broken(state: dict[str, Any], **changes: Any) -> dict[str, Any]:
-    """A saved state of before the task's name was in it, with some numbers changed."""
-    return {**{key: value for key, value in state.items() if key not in ("task", "horizon")}, **changes}
-
-
-def test_a_state_of_another_task_or_horizon_is_refused() -> None:
-    state = begun("rivergrid-1b").state_dict()
-    with pytest.raises(ValueError) as error:
-        make_vector("rivergrid-1a", 2).load_state_dict(state)
-    assert str(error.value) == (
-        "rivergrid-1a: the saved state must be of rivergrid-1a with horizon 200, "
-        "got rivergrid-1b with horizon 200"
-    )
-    with pytest.raises(ValueError, match=r"with horizon 100, got rivergrid-1b with horizon 200$"):
-        make_vector("rivergrid-1b", 2, options={"horizon": 100}).load_state_dict(state)
-
-
 def begun(name: str) -> CMDPVectorEnv:
     environments = make_vector(name, 2)
     environments.reset(seed=0)
@@ -340,40 +324,54 @@ def begun(name: str) -> CMDPVectorEnv:
     return environments
 
 
+def of_old(state: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """A saved state of before the task was in it, with some numbers changed."""
+    return {**{key: value for key, value in state.items() if key != IDENTITY}, **changes}
+
+
+def test_a_state_of_another_task_or_horizon_is_refused() -> None:
+    state = begun("rivergrid-1b").state_dict()
+    with pytest.raises(ValueError) as error:
+        make_vector("rivergrid-1a", 2).load_state_dict(state)
+    assert str(error.value) == (
+        "rivergrid-1a: saved state: identity.task must be 'rivergrid-1a', got 'rivergrid-1b'"
+    )
+    with pytest.raises(ValueError, match=r"identity\.horizon must be 100, got 200$"):
+        make_vector("rivergrid-1b", 2, options={"horizon": 100}).load_state_dict(state)
+
+
 def test_an_old_state_without_the_tasks_name_is_loaded() -> None:
     environments = begun("rivergrid-1a")
     resumed = make_vector("rivergrid-1a", 2)
-    resumed.load_state_dict(broken(environments.state_dict()))
+    resumed.load_state_dict(of_old(environments.state_dict()))
     actions = np.array([FORWARD, FORWARD])
     np.testing.assert_array_equal(resumed.step(actions)[0], environments.step(actions)[0])
 
 
 WALL_STATE = state_index(parse_map(MAPS["1a"]), 0, 0, 0)
 GOAL_STATE = state_index(parse_map(MAPS["1a"]), 7, 4, 0)
+IMPOSSIBLE = "must be states of an episode under way"
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"states": np.array([-5, 60])}, "states in the saved state must be integers from 0 to 323, got"),
-        ({"states": np.array([324, 60])}, "states in the saved state must be integers from 0 to 323, got"),
-        ({"states": np.array([60.0, 60.0])}, "states in the saved state must be integers from 0 to 323, got"),
-        ({"states": np.array([60])}, "the saved state has 1 environments, expected 2"),
+        ({"states": np.array([-5, 60])}, "states must have numbers that are from 0 to 323, got -5"),
+        ({"states": np.array([324, 60])}, "states must have numbers that are from 0 to 323, got 324"),
         (
-            {"states": np.array([52, WALL_STATE])},
-            f"no episode can be in state {WALL_STATE} of the saved state",
+            {"states": np.array([60.0, 60.0])},
+            "states must be int64 of shape (2,), got float64 of shape (2,)",
         ),
-        (
-            {"states": np.array([52, GOAL_STATE])},
-            f"no episode can be in state {GOAL_STATE} of the saved state",
-        ),
-        ({"elapsed": np.array(3)}, "the saved state has 1 environments, expected 2"),
-        ({"elapsed": np.array([-1, 3])}, "elapsed in the saved state must be integers from 0 to 199, got"),
-        ({"elapsed": np.array([200, 3])}, "elapsed in the saved state must be integers from 0 to 199, got"),
+        ({"states": np.array([60])}, "states must be of 2 environments, got 1"),
+        ({"states": np.array([52, WALL_STATE])}, f"states {IMPOSSIBLE}, got {WALL_STATE}"),
+        ({"states": np.array([52, GOAL_STATE])}, f"states {IMPOSSIBLE}, got {GOAL_STATE}"),
+        ({"elapsed": np.array(3)}, "elapsed must be int64 of shape (2,), got int64 of shape ()"),
+        ({"elapsed": np.array([-1, 3])}, "elapsed must have numbers that are from 0 to 199, got -1"),
+        ({"elapsed": np.array([200, 3])}, "elapsed must have numbers that are from 0 to 199, got 200"),
     ],
 )
 def test_a_state_that_no_episode_can_have_is_refused(changes: dict[str, Any], sentence: str) -> None:
     state = begun("rivergrid-1a").state_dict()
     with pytest.raises(ValueError) as error:
-        make_vector("rivergrid-1a", 2).load_state_dict(broken(state, **changes))
-    assert str(error.value).startswith(f"rivergrid-1a: {sentence}")
+        make_vector("rivergrid-1a", 2).load_state_dict(of_old(state, **changes))
+    assert str(error.value) == f"rivergrid-1a: saved state: {sentence}"

@@ -13,7 +13,11 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from recrl.environments.safety_gym.safety_gym_environments import SafetyGymEnv, SafetyGymVectorEnv
+from recrl.environments.safety_gym.safety_gym_environments import (
+    SafetyGymEnv,
+    SafetyGymOptions,
+    SafetyGymVectorEnv,
+)
 from recrl.environments.safety_gym.scene import rotation_matrices
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 
@@ -37,6 +41,14 @@ def drive(environment: SafetyGymEnv) -> npt.NDArray[np.float64]:
     forwards, turn = max(np.cos(angle), 0.0), np.clip(angle, -1.0, 1.0)
     wheels: npt.NDArray[np.float64] = np.clip(np.array([forwards + turn, forwards - turn]), -1.0, 1.0)
     return wheels
+
+
+def heading(environment: SafetyGymEnv) -> npt.NDArray[np.float64]:
+    """Direction in which the robot drives, [2]: the Car's front is -y, the Point's x."""
+    qpos = environment.batch.qpos[0]
+    if environment.batch.task.robot == "Point":
+        return np.array([np.cos(qpos[2]), np.sin(qpos[2])])
+    return np.asarray(-rotation_matrices(qpos[3:7])[:2, 1])
 
 
 def as_bytes(transition: tuple[Any, ...]) -> bytes:
@@ -169,6 +181,12 @@ def test_one_cost_a_term_sums_to_what_the_single_cost_indicates() -> None:
     assert costly > 0
 
 
+def test_the_option_for_several_costs_says_that_there_is_one_for_each_term() -> None:
+    description = str(SafetyGymOptions.model_fields["cost"].description)
+    assert "per_hazard: one cost for each cost term" in description
+    assert ", ".join(SAFETY_TASKS["CarGoal2"].cost_terms) in description
+
+
 def test_costs_of_a_task_without_hazards_cannot_be_told_apart() -> None:
     with pytest.raises(
         ValueError,
@@ -208,7 +226,7 @@ def test_buttons_hide_for_ten_steps_after_one_was_pressed() -> None:
     assert not observation[lidar].any()
     backwards = np.array([-1.0, -1.0])
     seen = [environment.step(backwards)[0][lidar].any() for _ in range(12)]
-    if not environment.batch.pressed().any():
+    if not environment.batch.touching[0, environment.batch.scene.touchable["buttons"]].any():
         assert seen[-1]
     assert not any(seen[:9])
 
@@ -273,21 +291,41 @@ def test_an_unknown_task_or_option_is_refused() -> None:
 @pytest.mark.parametrize("name", [*LEVEL_2, "PointGoal2", "PointPush2"])
 def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -> None:
     environment = SafetyGymVectorEnv(name, 4)
-    environment.reset(seed=5)
+    environment.reset(seed=7)
     batch, model = environment.batch, environment.batch.scene.model
-    kinds = list(batch.scene.touchable.values())
-    felt, data = 0, batch.simulations.data(0)
+    kinds, data = batch.scene.touchable, batch.simulations.data(0)
+    felt = dict.fromkeys(kinds, 0)
     for action in held_actions(250, 4, seed=2):
         environment.step(action)
         for index in range(4):
             contact = batch.simulations.data(index, into=data).contact
             roots = model.body_rootid[model.geom_bodyid[contact.geom]]
             others = {int(other) for pair in roots for other in pair if batch.scene.robot_body in pair}
-            for bodies in kinds:
+            for kind, bodies in kinds.items():
                 expected = [body in others for body in range(bodies.start, bodies.stop)]
                 assert batch.touching[index, bodies].tolist() == expected
-                felt += sum(expected)
-    assert felt > 0 or name == "CarPush2" or name.startswith("Point")
+                felt[kind] += sum(expected)
+    assert all(felt.values()), felt
+
+
+@pytest.mark.parametrize("name", ["CarPush2", "PointPush2"])
+@pytest.mark.parametrize("cost", ["indicator", "per_hazard"])
+def test_a_pillar_costs_one_while_the_robot_touches_it_and_nothing_else(name: str, cost: str) -> None:
+    environment = SafetyGymEnv(name, cost=cost)
+    environment.reset(seed=0)
+    batch = environment.batch
+    batch.points[0, batch.group["hazards"]] = 50.0  # out of reach
+    batch.mocap_pos[0, batch.scene.pillar_mocap[0], :2] = batch.qpos[0, :2] + 0.5 * heading(environment)
+    forwards, costs = {"Car": [1.0, 1.0], "Point": [1.0, 0.0]}[batch.task.robot], []
+    for _ in range(60):
+        *_, info = environment.step(np.array(forwards))
+        touched = batch.touching[0, batch.scene.touchable["pillars"]]
+        assert info["cost_pillars"] == float(touched.any())
+        costs.append(info["cost"].tolist())
+    free, costly = ([0.0], [1.0]) if cost == "indicator" else ([0.0, 0.0], [0.0, 1.0])
+    assert costs[0] == free
+    assert costly in costs
+    assert all(each in (free, costly) for each in costs)
 
 
 def test_robots_cannot_tell_that_gremlins_far_away_are_no_bodies(monkeypatch: pytest.MonkeyPatch) -> None:

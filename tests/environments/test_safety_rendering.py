@@ -47,6 +47,17 @@ def test_a_goal_and_the_lidar_are_seen_though_the_physics_has_neither() -> None:
     environment.close()
 
 
+def test_gremlins_are_seen_after_the_end_of_an_episode() -> None:
+    environment = drawing("PointButton1")
+    environment.batch.steps[0] = 1000
+    *_, truncated, _ = environment.step(np.zeros(2))
+    assert truncated
+    assert environment.batch.steps[0] == 1001
+    purple = environment.render().astype(int)
+    assert ((purple[..., 2] > purple[..., 1] + 60) & (purple[..., 2] > purple[..., 0] + 20)).sum() > 20
+    environment.close()
+
+
 def test_drawing_changes_nothing() -> None:
     seen, unseen = drawing("CarGoal2"), SafetyGymEnv("CarGoal2")
     seen.reset(seed=3)

@@ -17,8 +17,9 @@ from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import make_scene
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
-from recrl.environments.simulation.machine_code import array_at, compiled_for_batch
-from recrl.environments.simulation.mujoco_batch import PhysicsError, Simulations
+from recrl.environments.saved_state import SavedState
+from recrl.environments.simulation.machine_code import array_at, compiled_for_batch, mj_forward, mj_step
+from recrl.environments.simulation.mujoco_batch import PhysicsError, Simulations, _Batch
 
 SCENE = make_scene(SAFETY_TASKS["CarGoal2"])
 NUMBER = 2
@@ -34,6 +35,13 @@ mju_error = types.ExternalFunction("mju_error", types.void(types.int64))
 @compiled_for_batch
 def count(_model: int, _data: int, index: int, argument: int) -> None:
     numbers_at(argument, MANY)[index] += 1
+
+
+@compiled_for_batch
+def advance(model: int, data: int, _index: int, _argument: int) -> None:
+    for _ in range(10):
+        mj_step(model, data)
+    mj_forward(model, data)
 
 
 @compiled_for_batch
@@ -78,7 +86,7 @@ def run(simulations: Simulations, chosen: Floats) -> list[bytes]:
     past = []
     for number, step in enumerate(chosen):
         control[...] = step
-        simulations.step(10)
+        simulations.apply(advance, 0)
         past.append(simulations.rows.tobytes())
         if number % 20 == 19:
             datas = [simulations.data(index) for index in range(NUMBER)]
@@ -114,7 +122,7 @@ def test_restored_simulations_with_sleeping_bodies_continue_to_the_last_bit() ->
         saved = simulations.save()
         assert (saved["asleep"] >= 0).any()
         restored = Simulations(SCENE.model, NUMBER, num_threads=2)
-        restored.load(saved)
+        restored.load(SavedState("a test", saved))
         assert restored.rows.tobytes() == simulations.rows.tobytes()
         ahead = chosen[start : start + 100]
         assert run(restored, ahead) == run(simulations, ahead)
@@ -128,7 +136,7 @@ def test_saving_changes_nothing() -> None:
     snapshot = saved.save()
     assert first + run(saved, chosen[200:]) == run(undisturbed, chosen)
     restored = Simulations(SCENE.model, NUMBER)
-    restored.load(snapshot)
+    restored.load(SavedState("a test", snapshot))
     assert first + run(restored, chosen[200:]) == run(crowd(), chosen)
 
 
@@ -137,16 +145,17 @@ def test_simulations_stepped_in_parts_move_as_those_stepped_together() -> None:
     for chosen in controls(50):
         for simulations in (together, apart):
             simulations.state(CONTROL, (2,))[...] = chosen
-        together.step(10)
-        apart.step(10, [1])
-        apart.step(10, [0])
+        together.apply(advance, 0)
+        apart.apply(advance, 0, [1])
+        apart.apply(advance, 0, [0])
     assert together.rows.tobytes() == apart.rows.tobytes()
 
 
 def test_a_state_of_another_batch_is_refused() -> None:
     saved = crowd().save()
-    with pytest.raises(ValueError, match=r"saved physics must have shape \(3, 389\), got \(2, 389\)"):
-        Simulations(SCENE.model, 3).load(saved)
+    with pytest.raises(ValueError) as error:
+        Simulations(SCENE.model, 3).load(SavedState("a test", saved))
+    assert str(error.value) == "a test: rows must be float64 of shape (3, 389), got float64 of shape (2, 389)"
 
 
 def test_a_diverged_simulation_is_reported_until_it_is_reset(
@@ -155,16 +164,22 @@ def test_a_diverged_simulation_is_reported_until_it_is_reset(
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
     simulations = crowd()
     simulations.state(COORDINATES, (SCENE.model.nq,))[1, 0] = np.nan
-    simulations.step(10)
+    simulations.apply(advance, 0)
     assert simulations.broken().tolist() == [False, True]
     simulations.reset([1])
     simulations.forward([1])
     assert not simulations.broken().any()
 
 
-def test_a_model_that_cannot_be_batched_is_reported() -> None:
-    with pytest.raises((PhysicsError, ValueError)):
+def test_no_simulations_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^there must be at least one simulation, got 0$"):
         Simulations(SCENE.model, 0)
+
+
+def test_a_batch_that_mujoco_refuses_to_make_is_reported() -> None:
+    with pytest.raises(PhysicsError) as error:
+        _Batch(SCENE.model, 0, 1)
+    assert str(error.value) == "MuJoCo cannot simulate this model in a batch: nsim must be positive"
 
 
 @pytest.mark.parametrize("num_threads", [1, 2, 5, 20])

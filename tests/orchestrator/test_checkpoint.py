@@ -26,6 +26,13 @@ def test_a_tree_comes_back_exactly() -> None:
     assert again["empty"].shape == (0, 4)
 
 
+def test_keys_with_dots_do_not_meet() -> None:
+    """Names with dots are usual in a torch module's state."""
+    one, two = np.zeros(2), np.ones(2)
+    tree = {"net.w": one, "net": {"w": two}, "net.0": one, "list": [two]}
+    np.testing.assert_equal(checkpoint_format.decode(checkpoint_format.encode(tree), source="here"), tree)
+
+
 def test_equal_trees_give_equal_bytes() -> None:
     assert checkpoint_format.encode(TREE) == checkpoint_format.encode(TREE)
 

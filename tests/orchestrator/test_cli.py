@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,10 +18,12 @@ from recrl.environments.plugins import load_attribute
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse
 from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.trial.saved_policy import SavedTrial
 from recrl.orchestrator.trial.speed import measured_speed
 
 GRID = """\
@@ -633,3 +636,107 @@ def test_following_a_log_waits_for_the_start(folder: Path, capsys: pytest.Captur
         assert main(["logs", "small", "--follow"]) == ExitCode.OK
         thread.join()
     assert capsys.readouterr().out == "small: waiting for a trial to start\nit began\n"
+
+
+def test_following_the_log_of_a_stopped_trial_waits_until_it_runs_again(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid = parse_grid(GRID.encode(), source="grid.yaml")
+    store = SweepStore(folder / "runs", "small")
+    spec = grid.trials()[0]
+    store.trial(spec).begin(spec).close(TrialState.WAITING)
+
+    def begin_later() -> None:
+        time.sleep(1.0)
+        writer = store.trial(spec).begin(spec)
+        store.trial(spec).log_path.write_text("it goes on\n")
+        time.sleep(1.0)
+        writer.close(TrialState.WAITING)
+
+    with store.lock():
+        store.write_info({"name": store.name})
+        store.write_specs(grid.trials(), grid.text)
+        thread = threading.Thread(target=begin_later)
+        thread.start()
+        assert main(["logs", "small", spec.trial_id, "--follow"]) == ExitCode.OK
+        thread.join()
+    assert "it goes on\n" in capsys.readouterr().out
+
+
+def test_a_grid_too_short_for_a_deployment_phase_is_a_warning(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("deploy_fraction: 0.5", "deploy_fraction: 0.05"))
+    for command in ("validate", "plan"):
+        assert main([command, "grid.yaml"]) == ExitCode.OK
+        assert (
+            "warning: the deployment phase is shorter than an update, so that no update learns under d_d: "
+            "two-state ppo-lag none seed 0, two-state ppo-lag linear seed 0; take more total_steps or a "
+            "larger deploy_fraction"
+        ) in capsys.readouterr().out.splitlines()
+
+
+def test_replay_leaves_out_a_trial_that_has_saved_nothing_yet(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    store = SweepStore(folder / "runs", "small")
+    linear = store.specs()[1]
+    store.trial(linear).begin(linear).heartbeat(update=1, env_steps=40, steps_per_second=1.0)
+    capsys.readouterr()
+    assert main(["replay", "small", "--teacher", "cosine"]) == ExitCode.OK
+    assert main(["replay", "small", "--teacher", "cosine", "--only", "method=linear"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: small: none of the 1 chosen trials has a saved policy update yet\n"
+    )
+
+
+def test_evaluate_shows_what_it_could_evaluate(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    evaluate = SavedTrial.evaluate
+
+    def half(self: SavedTrial, *arguments: Any, **options: Any) -> Any:
+        if self.spec.method.name == "linear":
+            raise RecrlError("no luck")
+        return evaluate(self, *arguments, **options)
+
+    monkeypatch.setattr(SavedTrial, "evaluate", half)
+    capsys.readouterr()
+    assert main(["evaluate", "small", "--episodes", "3"]) == ExitCode.OK
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("Episodes") for line in lines)
+    assert "left out   no luck" in lines
+    assert main(["evaluate", "small", "--only", "method=linear"]) == ExitCode.WRONG_INPUT
+
+
+@pytest.mark.parametrize("name", ["a.zip", "b.yaml", "c.YML"])
+def test_a_sweep_is_not_called_like_a_file(
+    folder: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("name: small", f"name: {name}"))
+    assert main(["validate", "grid.yaml"]) == ExitCode.WRONG_INPUT
+    assert f"must not end like a file, with .zip, .yaml or .yml, got '{name}'" in capsys.readouterr().err
+
+
+def test_an_environment_that_cannot_be_closed_is_no_traceback(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _own_room(folder, "room_closed", "{'cost': 1.0}", "name: 'room_closed:Room'")
+    code = (folder / "room_closed.py").read_text().partition("gymnasium.register")[0]
+    closing = "    def close(self):\n        raise RuntimeError('stuck')\n"
+    (folder / "room_closed.py").write_text(code + closing)
+    assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.OK
+    assert "room_closed:Room raised an error when it was closed: RuntimeError: stuck" in caplog.text
+
+
+def test_figures_of_an_export_have_a_folder_of_their_own(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    (folder / "kept").mkdir()
+    assert main(["export", "small", "--to", "kept/one.zip"]) == ExitCode.OK
+    assert main(["figures", "kept/one.zip", "--sketch"]) == ExitCode.OK
+    assert (folder / "one-figures").is_dir()
+    assert not (folder / "kept" / "figures").exists()

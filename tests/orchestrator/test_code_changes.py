@@ -13,11 +13,14 @@ from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import drawing
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.executors import InlineExecutor
+from recrl.orchestrator.errors import ClusterError
+from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
+from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_plan
 from recrl.orchestrator.provenance import code_changes
 from recrl.orchestrator.provenance.code_changes import (
     code_of,
@@ -25,8 +28,10 @@ from recrl.orchestrator.provenance.code_changes import (
     other_code,
     other_code_sentence,
 )
-from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
+from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
+from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
+from recrl.orchestrator.sweep_progress import DisplayStatus, progress
 
 TASK = """\
 from recrl.environments.registry import Task
@@ -111,6 +116,87 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert (trial.aside_folder / "run-001" / "episodes.csv").read_bytes() == before
     assert trial.episodes_path.read_bytes() != before
     assert main(["check"]) == ExitCode.OK
+
+
+def _rerun(grid: GridSpec, store: SweepStore, executor: Executor) -> SweepResult:
+    selection = TrialSelection(rerun_changed=True)
+    return run_sweep(
+        SweepRunSettings(grid, SweepPlace(store), executor, selection=selection), stop=threading.Event()
+    )
+
+
+def test_a_launch_that_cannot_run_leaves_the_results_that_it_was_to_replace(folder: Path) -> None:
+    class Broken:
+        def run(self, specs: object, place: SweepPlace, stop: threading.Event) -> None:
+            statuses = {trial.status for trial in progress(grid.trials(), store).trials}
+            assert statuses == {DisplayStatus.WAITING}  # requested
+            raise ClusterError("no cluster")
+
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    change(folder)
+    with pytest.raises(ClusterError):
+        _rerun(grid, store, Broken())
+    (trial,) = progress(grid.trials(), store).trials
+    assert trial.status is DisplayStatus.COMPLETE
+    assert not store.trial(trial.spec).damages()
+    assert not make_plan(grid.trials(), store).to_do
+
+
+@pytest.mark.parametrize("done", range(9))
+def test_a_rerun_that_is_killed_while_it_moves_old_files_goes_on(
+    folder: Path, done: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    (spec,) = grid.trials()
+    trial = store.trial(spec)
+    for added in (trial.videos_folder, trial.evaluations_folder):
+        added.mkdir()
+        (added / "update-4.gif").write_text("of the old policy")
+    old = {path.relative_to(trial.folder): path.read_bytes() for path in _files(trial.folder)}
+    change(folder)
+    trial.request_rerun()
+    moves, rename = iter(range(done)), Path.rename
+
+    def killed(path: Path, target: Path) -> Path:
+        if next(moves, None) is None:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", killed)
+    with pytest.raises(KeyboardInterrupt):
+        trial.begin(spec)
+    monkeypatch.setattr(Path, "rename", rename)
+    (planned,) = make_plan(grid.trials(), store).trials
+    assert planned.action is PlannedAction.RERUN
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
+    assert trial.record().status is TrialState.COMPLETE
+    assert trial.record().attempt == 1
+    assert not trial.damages()
+    assert not trial.rerun_path.exists()
+    kept = trial.aside_folder / "run-001"
+    assert {path.relative_to(kept): path.read_bytes() for path in _files(kept)} == old
+    assert not trial.videos_folder.exists()
+
+
+def _files(folder: Path) -> list[Path]:
+    ours = (".lock", ".reserve", "rerun.request")
+    return [path for path in folder.rglob("*") if path.is_file() and path.name not in ours]
+
+
+def test_a_failed_trial_of_other_code_is_run_again_too(folder: Path) -> None:
+    text = TASK.replace("    step = environments.step", "    step = None  # fails")
+    (folder / "my_scaled_task.py").write_text(text)
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml", build=False)
+    run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
+    (spec,) = grid.trials()
+    assert store.trial(spec).record().status is TrialState.FAILED
+    change(folder)
+    result = _rerun(grid, store, InlineExecutor())
+    assert not result.plan.other_code
+    assert store.trial(spec).record().status is TrialState.COMPLETE
+    assert not store.trial(spec).error_path.exists()
 
 
 def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:

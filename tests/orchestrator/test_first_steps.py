@@ -108,6 +108,16 @@ def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str
     assert re.search(r"^deploy_limits +number or list of number or null ", out, re.MULTILINE)
 
 
+def test_the_next_command_finds_a_task_of_ones_own_in_another_folder(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = output(capsys, "init", "a b/own.yaml", "--template", "own-task")
+    assert shown.splitlines()[-1] == "Next: cd 'a b' && recrl-sweep launch own.yaml"
+    monkeypatch.chdir(folder / "a b")
+    assert "recrl-sweep launch own.yaml" in Path("own.yaml").read_text()
+    assert "is right" in output(capsys, "validate", "own.yaml", "--trust")
+
+
 @pytest.mark.parametrize(
     ("section", "command"), [("tasks", "tasks"), ("agents", "agents"), ("methods", "curricula")]
 )

@@ -6,7 +6,14 @@ import pytest
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, estimate, make_plan, trials_at_once
+from recrl.orchestrator.launch_plan import (
+    PlannedAction,
+    TrialSelection,
+    estimate,
+    make_plan,
+    trials_at_once,
+    usable_cores,
+)
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 GRID = b"""\
@@ -109,3 +116,13 @@ def test_nothing_to_do_takes_nothing(store: SweepStore) -> None:
 def test_at_least_one_trial_fits_and_no_more_than_allowed() -> None:
     assert trials_at_once(cpus_per_trial=1e6, max_concurrent=None) == 1
     assert trials_at_once(cpus_per_trial=1e-3, max_concurrent=3) == 3
+
+
+@pytest.mark.parametrize(("text", "cores"), [("max 100000", 4), ("150000 100000", 1), ("300000 100000", 3)])
+def test_a_containers_quota_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, cores: int
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(4)))
+    assert usable_cores(tmp_path / "cpu.max") == 4
+    (tmp_path / "cpu.max").write_text(f"{text}\n")
+    assert usable_cores(tmp_path / "cpu.max") == cores

@@ -1,5 +1,6 @@
 """A sweep on Ray leaves the bytes of an inline one, whoever is killed or stopped on the way."""
 
+import errno
 import json
 import os
 import re
@@ -440,3 +441,13 @@ def test_a_stop_file_tells_its_own_run_and_all_earlier_ones(tmp_path: Path) -> N
             stop_file.set()
             assert StopFile(stop_file.path).is_set()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_keeps_nobody_from_stopping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, text: str) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with StopFile.open(tmp_path) as stop_file:
+        stop_file.set()
+        assert StopFile(stop_file.path).is_set()

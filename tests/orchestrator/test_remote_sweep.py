@@ -27,6 +27,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.launch_plan import TrialSelection
+from recrl.orchestrator.ray.ray_executor import RayExecutor
 from recrl.orchestrator.remote.commit_upload import Upload
 from recrl.orchestrator.remote.launch_lease import SILENT_SECONDS
 from recrl.orchestrator.remote.object_store import ObjectStore
@@ -157,6 +158,17 @@ def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
         )
         run_sweep(settings, stop=threading.Event())
     assert not here.store.folder.exists()
+    (tmp_path / "grid.yaml").write_bytes(grid().text)
+    plan = ["plan", str(tmp_path / "grid.yaml"), "--storage", here.storage.uri, "--root", str(tmp_path / "x")]
+    assert main([*plan, "--rerun-changed"]) == ExitCode.WRONG_INPUT
+
+
+def test_a_trial_is_not_ended_before_its_signs_of_life_can_arrive(tmp_path: Path) -> None:
+    here = machine(tmp_path, "here").storage
+    assert here.shortest_silence_seconds == 50.0  # as the option's description says
+    executor = RayExecutor(silence_seconds=5.0)
+    assert executor.silence_of(here) == 50.0
+    assert executor.silence_of(SweepPlace(here.store)) == 5.0
 
 
 def test_a_trial_stopped_again_and_again_on_other_machines_equals_itself(

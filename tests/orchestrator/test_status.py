@@ -16,7 +16,6 @@ from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import (
-    SILENCE_SECONDS,
     DisplayStatus,
     SweepProgress,
     TrialProgress,
@@ -36,15 +35,35 @@ SPECS = parse_grid(GRID, source="grid.yaml").trials()
 
 
 def _trial(spec: TrialSpec, record: TrialRecord) -> TrialProgress:
-    return TrialProgress(spec, display_status(record, now=1000.0), record)
+    return TrialProgress(spec, display_status(record, now=1000.0, silence_seconds=300.0), record)
 
 
 RUNNING = TrialRecord(TrialState.RUNNING, attempt=1, env_steps=250, heartbeat=995.0, steps_per_second=50.0)
 
 
 def test_a_silent_trial_is_interrupted() -> None:
-    assert display_status(RUNNING, now=995.0 + SILENCE_SECONDS) is DisplayStatus.RUNNING
-    assert display_status(RUNNING, now=995.1 + SILENCE_SECONDS) is DisplayStatus.INTERRUPTED
+    for silence in (300.0, 3600.0):
+        for sign in (-1.0, 1.0):  # before: the clock of another host is ahead
+            now = 995.0 + sign * silence
+            assert display_status(RUNNING, now=now, silence_seconds=silence) is DisplayStatus.RUNNING
+            now += 0.1 * sign
+            assert display_status(RUNNING, now=now, silence_seconds=silence) is DisplayStatus.INTERRUPTED
+
+
+@pytest.mark.parametrize(("told", "expected"), [(None, 300.0), (5.0, 300.0), (3600.0, 3600.0)])
+def test_the_grid_says_how_long_a_trial_may_be_silent(
+    tmp_path: Path, told: float | None, expected: float
+) -> None:
+    store = SweepStore(tmp_path, "status")
+    assert store.silence_seconds == 300.0
+    known = {} if told is None else {"silence_seconds": told}
+    store.write_info({"name": "status", "created": 1.0, **known})
+    store.write_specs(SPECS[:1])
+    assert store.silence_seconds == expected
+    writer = store.trial(SPECS[0]).begin(SPECS[0])
+    later = writer.record.heartbeat + 301.0
+    status = progress(SPECS[:1], store, now=later).trials[0].status
+    assert status is (DisplayStatus.RUNNING if expected > 301.0 else DisplayStatus.INTERRUPTED)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +76,7 @@ def test_a_silent_trial_is_interrupted() -> None:
     ],
 )
 def test_every_state_has_its_display_status(record: TrialRecord, status: DisplayStatus) -> None:
-    assert display_status(record, now=1e9) is status
+    assert display_status(record, now=1e9, silence_seconds=300.0) is status
 
 
 def test_the_time_left_counts_what_runs_and_what_waits_but_not_what_failed() -> None:
@@ -131,7 +150,10 @@ def test_no_number_of_a_table_is_shortened(terminal: bool) -> None:
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_the_live_display_ends_with_its_context(tmp_path: Path, terminal: bool) -> None:
+def test_the_live_display_ends_with_its_context(
+    tmp_path: Path, terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(display, "LINE_SECONDS", 0.01)
     store = SweepStore(tmp_path, "status")
     store.trial(SPECS[0]).begin(SPECS[0]).heartbeat(update=1, env_steps=500, steps_per_second=7.0)
     console = Console(file=io.StringIO(), force_terminal=terminal, width=160)
@@ -142,8 +164,9 @@ def test_the_live_display_ends_with_its_context(tmp_path: Path, terminal: bool) 
         return progress(SPECS, store)
 
     with display.live_progress(ask, console):
-        if terminal:
-            assert asked.wait(30.0)
+        assert asked.wait(30.0)
     assert not any(thread.name == "progress" for thread in threading.enumerate())
     assert isinstance(console.file, io.StringIO)
-    assert ("two-state ppo-lag none seed 0" in console.file.getvalue()) == terminal
+    shown = console.file.getvalue()
+    assert ("two-state ppo-lag none seed 0" in shown) == terminal
+    assert "1 running" in shown

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.orchestrator.errors import LostLeaseError, SweepBusyError
+from recrl.orchestrator.errors import DamagedError, LostLeaseError, SweepBusyError
 from recrl.orchestrator.files.atomic_files import write_atomically
+from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
@@ -220,3 +221,46 @@ def test_trials_on_disk_are_found(tmp_path: Path, store: TrialStore) -> None:
     assert sweep.trials() == []
     store.begin(SPEC)
     assert [trial.spec for trial in sweep.trials()] == [SPEC]
+
+
+def test_files_moved_aside_never_replace_each_other(tmp_path: Path) -> None:
+    aside = tmp_path / "aside"
+    for text in ("one", "two", "three"):
+        (tmp_path / "a.csv").write_text(text)
+        move_aside(tmp_path / "a.csv", aside)
+        if text == "two":
+            (aside / "001-a.csv").unlink()
+    assert sorted(path.read_text() for path in aside.iterdir()) == ["three", "two"]
+
+
+def test_the_provenance_of_an_attempt_that_was_killed_over_it_is_kept(
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.begin(SPEC).add_provenance({"code": "first"})
+    writer = store.begin(SPEC)
+    with monkeypatch.context() as killed:
+        killed.setattr(TrialWriter, "_write_record", _killed)
+        with pytest.raises(KeyboardInterrupt):
+            writer.add_provenance({"code": "second"})
+    store.begin(SPEC).add_provenance({"code": "third"})
+    assert [attempt["code"] for attempt in store.provenance()] == ["first", "second", "third"]
+    assert not store.damages()
+
+
+def _killed(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_the_traceback_of_an_earlier_attempt_is_moved_aside(store: TrialStore) -> None:
+    store.begin(SPEC).close(TrialState.FAILED, error="no luck", traceback="Traceback of the first")
+    store.begin(SPEC).close(TrialState.COMPLETE)
+    assert not store.error_path.exists()
+    assert [path.read_text() for path in store.aside_folder.iterdir()] == ["Traceback of the first"]
+
+
+def test_a_sweep_without_its_own_files_is_damaged_and_not_empty(tmp_path: Path) -> None:
+    sweep = SweepStore(tmp_path, "sweep")
+    assert sweep.specs() == []
+    sweep.trial(SPEC).begin(SPEC)
+    with pytest.raises(DamagedError, match=r"trials\.jsonl is missing; launching its grid again"):
+        sweep.specs()

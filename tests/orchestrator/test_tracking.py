@@ -30,7 +30,7 @@ from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import tracking_uri
-from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, verdict_lines
+from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, verdict_lines
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.run_content import (
     Summary,
@@ -238,7 +238,7 @@ def test_run_states_are_true(status: TrialState, live: bool, expected: str) -> N
     record = TrialRecord(
         status=status, attempt=1, heartbeat=time.time(), host=socket.gethostname(), pid=os.getpid()
     )
-    assert trial_run_status(record, live=live) == expected
+    assert trial_run_status(record, live=live, silence_seconds=300.0) == expected
 
 
 def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
@@ -247,10 +247,11 @@ def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
     here = TrialRecord(
         status=TrialState.RUNNING, heartbeat=time.time(), host=socket.gethostname(), pid=process.pid
     )
-    assert trial_run_status(here, live=True) == "KILLED"
+    assert trial_run_status(here, live=True, silence_seconds=300.0) == "KILLED"
     elsewhere = replace(here, host="elsewhere")
-    assert trial_run_status(elsewhere, live=True) == "RUNNING"
-    assert trial_run_status(replace(elsewhere, heartbeat=time.time() - 301.0), live=True) == "KILLED"
+    assert trial_run_status(elsewhere, live=True, silence_seconds=300.0) == "RUNNING"
+    silent = replace(elsewhere, heartbeat=time.time() - 301.0)
+    assert trial_run_status(silent, live=True, silence_seconds=300.0) == "KILLED"
 
 
 # Against a real database
@@ -581,6 +582,45 @@ def test_a_trial_of_an_earlier_grid_does_not_get_the_outcome_of_its_namesake(
     shown = runs(store)
     assert "final/cost_0" not in shown[DYNAMIC].data.metrics
     assert shown[NONE].data.metrics["final/cost_0"] == 5.0
+
+
+def test_a_trial_that_ran_again_does_not_keep_the_outcome_of_before(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    write_outcomes(store)
+    outcomes = FinalOutcomes(store)
+    trial = trial_titled(store, DYNAMIC)
+    before = trial.record()
+    assert outcomes.of(trial.spec) is not None
+    assert not outcomes.lack_a_complete_trial()
+    with trial.locked():
+        trial.write_record(replace(before, started_at=time.time() + 5.0))
+    assert outcomes.of(trial.spec) is None
+    assert [it.group[2] for it in outcomes.all()] == ["none"]
+    assert outcomes.lack_a_complete_trial()
+    with trial.locked():
+        trial.write_record(replace(before, status=TrialState.RUNNING))
+    assert outcomes.of(trial.spec) is None
+
+
+def test_trials_that_left_the_grid_are_averaged_with_none_of_it(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    write_outcomes(store)
+    sync(store, uri)
+    groups = {title: run.data.tags.get("recrl.group") for title, run in runs(store).items()}
+    assert groups[DYNAMIC] == "dynamic, cpo, river-a"
+    kept = [spec for spec in store.specs() if spec.title != DYNAMIC]
+    store.write_specs(kept)
+    trial = trial_titled(store, DYNAMIC)
+    trial.set_status(TrialState.FAILED, error="no luck")
+    sync(store, uri)
+    shown = runs(store)
+    assert shown[DYNAMIC].data.tags["recrl.group"] == "dynamic, cpo, river-a, no longer in the grid"
+    parent = shown["made-up"]
+    assert parent.info.status == "FINISHED"
+    text = parent.data.tags["mlflow.note.content"]
+    assert f"{len(kept)} trials ({len(kept)} complete)" in text
+    assert "dynamic" not in text
 
 
 GRID = """\
