@@ -124,6 +124,15 @@ class CostLimits:
             if not value >= 0.0:  # also catches NaN
                 raise ValueError(f"cost limits must be at least 0, got {value}")
 
+    def require(self, number: int, task: str) -> None:
+        """Check that there is one limit for each of a task's costs.
+
+        Raises:
+            ValueError: there is another number of limits.
+        """
+        if len(self.values) != number:
+            raise ValueError(f"{task}: there must be one limit per cost, {number}, got {len(self.values)}")
+
     def __len__(self) -> int:
         return len(self.values)
 
@@ -180,6 +189,8 @@ class CurriculumStep:
     def __post_init__(self) -> None:
         if not isinstance(self.limits, CostLimits):  # a user's curriculum may return plain numbers
             object.__setattr__(self, "limits", CostLimits(tuple(self.limits)))
+        if self.start_limits is not None and not isinstance(self.start_limits, CostLimits):
+            object.__setattr__(self, "start_limits", CostLimits(tuple(self.start_limits)))
         if not 0.0 <= self.policy_noise <= 1.0:
             raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
         coefficient = self.entropy_coefficient

@@ -10,19 +10,23 @@ Requirements for a scalar environment:
 - Its action space is ``Discrete`` or a floating-point ``Box``, bounded or not.
 - It is a function of its seed and its actions: ``reset(seed=...)`` determines an episode.
 
-An environment may name its costs in an attribute ``cost_names``. It may describe the slices of its flattened
-observation in ``observation_components``, a sequence of ``recrl.environments.cmdp.ObservationComponent``;
-from it agents learn which of them are lidars. Observations of any kind are flattened to float32 vectors
-(``gymnasium.spaces.flatten``), actions clipped to their bounds.
+An environment may name its costs in an attribute ``cost_names``. Its horizon, for the agents' defaults, is
+``spec.max_episode_steps`` or, if that is missing, the number in an attribute ``horizon``. It may describe the
+slices of its flattened observation in ``observation_components``, a sequence of
+``recrl.environments.cmdp.ObservationComponent``; from it agents learn which of them are lidars. Observations
+of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to their bounds.
 
 Every episode starts with ``reset(seed=...)`` and a new seed drawn here. A checkpoint holds that seed and the
 actions so far, so the environment need not be pickled. Restoring replays them, at most one episode per
-environment, and checks that the last observation is the same.
+environment. It checks that the last observation is the same. A checksum compares all observations, rewards,
+costs and ends, rounded to float32.
 """
 
 from __future__ import annotations
 
 import copy
+import functools
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -33,9 +37,10 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
-from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 Environment = gymnasium.Env[Any, Any]
+FLAGS = (bool, np.bool_)
 SEED_BOUND = 2**31  # exclusive; some simulators take 32-bit signed seeds
 
 
@@ -63,6 +68,10 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         self._environments = [_made(name, factory) for factory in factories]
         first = self._environments[0]
         self._raw_observation_space = first.observation_space
+        # Found once: the dispatch on the space's type would take a tenth of a simple environment's step.
+        self._flatten = functools.partial(
+            spaces.flatten.dispatch(type(first.observation_space)), first.observation_space
+        )
         self.single_observation_space = _float32_vectors(name, first.observation_space)
         self.single_action_space = _supported_actions(name, first.action_space)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -74,25 +83,28 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             )
         if not _are_names(cost_names):
             raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(cost_names)}")
-        horizon = first.spec.max_episode_steps if first.spec is not None else None
         self.cmdp = CMDPSpec(
             name,
             self.single_observation_space,
             self.single_action_space,
             tuple(cost_names),
-            horizon,
+            _declared_horizon(first),
             _declared_components(first),
         )
         self._costless = costless
         self._episode_seeds = [0] * self.num_envs
         self._episode_actions: list[list[Any]] = [[] for _ in range(self.num_envs)]
+        self._checksums = [0] * self.num_envs
         self._observations: npt.NDArray[np.float32] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start B episodes; ``seed`` restarts the generator from which episode seeds are drawn."""
-        super().reset(seed=seed, options=options)
+        masked = masked_environments(self.cmdp.name, self.num_envs, options)
+        super().reset(seed=seed)
+        if masked is not None:
+            return self.restart(masked), {}
         self._observations = np.stack([self._start_episode(index) for index in range(self.num_envs)])
         return self._observations.copy(), {}
 
@@ -107,14 +119,17 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
         costs = np.zeros((self.num_envs, self.cmdp.num_costs))
-        for index, environment in enumerate(self._environments):
-            observation, reward, ended, timed_out, step_info = self._step(environment, actions[index])
+        # The environments get copies: one may scale its action in place, and the recorded one is replayed.
+        for index, (action, own) in enumerate(zip(actions, actions.copy(), strict=True)):
+            observation, reward, ended, timed_out, step_info = self._step(index, own)
             last_observations[index] = self._flat(observation)
             rewards[index] = self._number(reward)
             terminated[index], truncated[index] = ended, timed_out and not ended
             costs[index] = self._reported_costs(step_info)
-            self._episode_actions[index].append(actions[index])
+            self._episode_actions[index].append(action)
         self._check(last_observations, rewards)
+        rows = _rows(last_observations, rewards, costs, terminated, truncated)
+        self._checksums = list(map(zlib.crc32, rows, self._checksums))
         info: dict[str, Any] = {"cost": costs}
         self._observations = last_observations
         if (terminated | truncated).any():
@@ -142,7 +157,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             environment.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return seed, actions so far and last observation of every episode, and the generator."""
+        """Return seed, actions, checksum and last observation of every episode, and the generator."""
         if self._observations is None:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
         space = self.single_action_space
@@ -153,15 +168,18 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 for taken in self._episode_actions
             ],
             "observations": self._observations.copy(),
+            "checksums": list(self._checksums),
             "generator": copy.deepcopy(dict(self.np_random.bit_generator.state)),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken, by replaying the episodes under way.
 
+        A state from before the checksums is only checked by the last observation.
+
         Raises:
-            ValueError: the replay gave another observation: the environment is not determined by its seed and
-                its actions and cannot be resumed.
+            ValueError: the replay gave something else: the environment is not determined by its seed and its
+                actions and cannot be resumed.
         """
         if len(state["episode_seeds"]) != self.num_envs:
             raise ValueError(
@@ -171,20 +189,27 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         self._episode_seeds = [int(seed) for seed in state["episode_seeds"]]
         self._episode_actions = [list(actions) for actions in state["episode_actions"]]
         self._observations = np.array(state["observations"], np.float32)
-        for index, environment in enumerate(self._environments):
-            observation, _ = environment.reset(seed=self._episode_seeds[index])
-            for action in self._episode_actions[index]:
-                observation = environment.step(action)[0]
-            if not np.array_equal(self._flat(observation), self._observations[index], equal_nan=True):
-                raise ValueError(
-                    f"{self.cmdp.name}: cannot be resumed, because replaying the episode of environment "
-                    f"{index} gave another observation; reset(seed=...) must determine an episode"
-                )
+        saved = state.get("checksums")
+        for index in range(self.num_envs):
+            if not np.array_equal(self._replayed(index), self._observations[index]):
+                difference = "another observation"
+            elif saved is not None and self._checksums[index] != saved[index]:
+                difference = "other observations, rewards, costs or ends on the way"
+            else:
+                continue
+            raise ValueError(
+                f"{self.cmdp.name}: cannot be resumed, because replaying the episode of environment "
+                f"{index} gave {difference}; reset(seed=...) must determine an episode"
+            )
         self.np_random.bit_generator.state = state["generator"]
 
     def _start_episode(self, index: int) -> npt.NDArray[np.float32]:
         self._episode_seeds[index] = int(self.np_random.integers(SEED_BOUND))
         self._episode_actions[index] = []
+        return self._first_observation(index)
+
+    def _first_observation(self, index: int) -> npt.NDArray[np.float32]:
+        """Begin the episode of the environment's seed."""
         returned = self._environments[index].reset(seed=self._episode_seeds[index])
         if not isinstance(returned, tuple) or len(returned) != 2:
             raise ValueError(
@@ -192,15 +217,36 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             )
         observation = self._flat(returned[0])
         self._check(observation[np.newaxis])
+        self._checksums[index] = zlib.crc32(observation.tobytes())
         return observation
 
-    def _step(self, environment: Environment, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        returned = environment.step(action)
+    def _replayed(self, index: int) -> npt.NDArray[np.float32]:
+        """Repeat an environment's episode; return its last observation."""
+        observation = self._first_observation(index)
+        for action in np.array(self._episode_actions[index]):  # copies, as in ``step``
+            returned, reward, ended, timed_out, info = self._step(index, action)
+            observation = self._flat(returned)
+            row = _rows(
+                observation[np.newaxis],
+                np.array([self._number(reward)]),
+                self._reported_costs(info)[np.newaxis],
+                np.array([ended]),
+                np.array([timed_out and not ended]),
+            )
+            self._checksums[index] = zlib.crc32(row.tobytes(), self._checksums[index])
+        return observation
+
+    def _step(self, index: int, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        returned = self._environments[index].step(action)
         if not isinstance(returned, tuple) or len(returned) != 5 or not isinstance(returned[4], dict):
             raise ValueError(
                 f"{self.cmdp.name}: step must return (observation, reward, terminated, truncated, info), "
                 f"got {_brief(returned)}"
             )
+        if not (isinstance(returned[2], FLAGS) and isinstance(returned[3], FLAGS)):
+            flags = zip(("terminated", "truncated"), returned[2:4], strict=True)
+            name, flag = next((name, flag) for name, flag in flags if not isinstance(flag, FLAGS))
+            raise ValueError(f"{self.cmdp.name}: {name} must be True or False, got {_brief(flag)}")
         return returned
 
     def _number(self, reward: Any) -> float:
@@ -222,7 +268,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         cause: Exception | None = None
         try:
             if observation is not None:  # NumPy would convert it to NaN
-                flat = np.asarray(spaces.flatten(self._raw_observation_space, observation), np.float32)
+                flat = np.asarray(self._flatten(observation), np.float32)
                 if flat.shape == self.single_observation_space.shape:
                     return flat
         except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
@@ -270,12 +316,32 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         return costs
 
 
+def _rows(
+    observations: npt.NDArray[np.float32],
+    rewards: Floats,
+    costs: Floats,
+    terminated: npt.NDArray[np.bool_],
+    truncated: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.float32]:
+    """Return the result of a step as one row per environment, for checksums, [B, n + k + 3]."""
+    columns = (observations, rewards[:, None], costs, terminated[:, None], truncated[:, None])
+    return np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe")
+
+
 def _are_names(value: object) -> bool:
     return (
         isinstance(value, Sequence)
         and not isinstance(value, str)
         and all(isinstance(each, str) for each in value)
     )
+
+
+def _declared_horizon(environment: Environment) -> int | None:
+    """Return the steps after which an environment truncates an episode, or None if it does not say."""
+    if environment.spec is not None and environment.spec.max_episode_steps is not None:
+        return environment.spec.max_episode_steps
+    horizon = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
+    return horizon if isinstance(horizon, int) and not isinstance(horizon, bool) and horizon >= 1 else None
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:

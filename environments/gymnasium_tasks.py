@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import gymnasium
@@ -92,11 +93,18 @@ def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
 
 
 def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:
-    """Return an environment of a user's callable; it renders if the callable takes ``render_mode``."""
+    """Return an environment of a user's callable; it renders if the callable takes ``render_mode``.
+
+    A callable with ``**keywords`` may check them and refuse ``render_mode``. Then it is called without.
+    """
     keywords = options.model_dump()
-    parameters = inspect.signature(factory).parameters.values()
-    if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
-        keywords["render_mode"] = "rgb_array"
+    parameters = inspect.signature(factory).parameters
+    rendering = {**keywords, "render_mode": "rgb_array"}
+    if "render_mode" in parameters:
+        return factory(**rendering)
+    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+        with suppress(TypeError, ValueError):
+            return factory(**rendering)
     return factory(**keywords)
 
 

@@ -18,7 +18,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -143,14 +143,15 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
         ours: the built-in registry.
 
     Raises:
-        UnknownNameError: the name is not known; the message names the nearest known names.
+        UnknownNameError: the name is not known, and the message names the nearest known names; or its entry
+            point cannot be loaded.
         UntrustedNameError: it is an import path, and this process refuses them.
     """
     if name in ours:
         return ours[name]
     plugged = {point.name: point for point in entry_points(group=group)}
     if name in plugged:
-        return plugged[name].load()
+        return _loaded(plugged[name])
     if IMPORT_PATH.fullmatch(name):
         require_trust(name)
         return load_attribute(name)
@@ -161,6 +162,22 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
         f"no {kind} is called {name!r}{nearest(name, known)} "
         f"(known: {', '.join(known)}; or an import path package.module:attribute)"
     )
+
+
+def _loaded(point: EntryPoint) -> Any:
+    """Load the object of an entry point.
+
+    Raises:
+        UnknownNameError: its module cannot be imported or has no such attribute.
+    """
+    package = f" of the package {point.dist.name}" if point.dist is not None else ""
+    problem = f"the entry point {point.name}{package} cannot load {point.value!r}"
+    try:
+        return point.load()
+    except (ImportError, AttributeError) as error:
+        raise UnknownNameError(f"{problem}: {error}") from error
+    except SystemExit as error:
+        raise UnknownNameError(f"{problem}: it ends the process (exit code {error.code})") from error
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

@@ -12,8 +12,8 @@ Agents see every task as a ``CMDPVectorEnv``. Its contract:
   the returned observations is then the first one of the next episode.
 - All other entries of ``info`` belong to the step, not to the reset, and have every row. So Gymnasium's
   ``final_info`` would be ``info`` itself; it and the masks of the other entries are left out.
-- ``restart(index)`` cuts the episodes of some environments short and begins new ones in them. MuJoCo tasks
-  do the same for Gymnasium's ``reset(options={"reset_mask": mask})``, with a mask bool [B].
+- ``restart(index)`` cuts the episodes of some environments short and begins new ones in them. So does
+  Gymnasium's ``reset(options={"reset_mask": mask})``, with a mask bool [B].
 - Invalid actions (a wrong shape, a number that is no action, NaN) and a step before the first reset raise a
   ValueError. Continuous actions outside their bounds are clipped to them.
 - ``state_dict`` holds everything that the future depends on, generators included. It is a tree of dicts,

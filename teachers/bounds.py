@@ -68,9 +68,15 @@ def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
         advantage: eps, of the discounted costs, at least 0.
         discount: gamma, in [0, 1]; the bound is infinite for 1.
 
+    Raises:
+        ValueError: an argument is out of its range.
+
     >>> discounted_excess(0.02, 5.0, discount=0.5)
     2.0
     """
+    if discount < 0.0 or discount > 1.0:  # unknown values, NaN, give NaN
+        raise ValueError(f"discount must lie in [0, 1], got {discount}")
+    _require_at_least_0(kl, advantage)
     if discount == 1.0:
         return math.inf
     return math.sqrt(2 * kl) * discount * advantage / (1 - discount) ** 2
@@ -89,9 +95,15 @@ def undiscounted_excess(kl: float, advantage: float, *, horizon: int) -> float:
         advantage: eps, of the undiscounted costs that remain in the episode, at least 0.
         horizon: H, at least 1.
 
+    Raises:
+        ValueError: an argument is out of its range.
+
     >>> undiscounted_excess(0.02, 3.0, horizon=5)
     12.0
     """
+    if horizon < 1:
+        raise ValueError(f"horizon must be at least 1, got {horizon}")
+    _require_at_least_0(kl, advantage)
     return math.sqrt(2 * kl) * horizon * (horizon - 1) * advantage
 
 
@@ -101,10 +113,13 @@ def weight_sum(curriculum: str, *, policies: int, clock: Clock) -> float:
     With p_b = b / n: linear (n - 1) / 2; cosine (cot(pi / 4n) - 1) / 2; exponential
     1 / (e^(1/n) - 1) - n / (e - 1); step n - 1. With p_b = (b - 1) / n one more, w(0) - w(1) = 1.
 
+    Raises:
+        ValueError: the curriculum has no bound, or there are no policies.
+
     >>> weight_sum("linear", policies=4, clock="end")  # 3/4 + 2/4 + 1/4 + 0
     1.5
     """
-    _require_bound(curriculum)
+    _require_bound(curriculum, policies)
     at_start = 1.0 if clock == "start" and curriculum != "none" else 0.0
     return _WEIGHT_SUMS[curriculum](policies) + at_start
 
@@ -123,7 +138,11 @@ def cumulative_bound(
 
     Returns:
         A bound on the sum over the n policies of their expected cost per episode.
+
+    Raises:
+        ValueError: the curriculum has no bound, or an argument is out of its range.
     """
+    _require_limits(train_limit, deploy_limit)
     weights = weight_sum(curriculum, policies=len(excesses), clock=clock)
     return len(excesses) * deploy_limit + weights * (train_limit - deploy_limit) + math.fsum(excesses)
 
@@ -143,10 +162,14 @@ def proposition_1(
         deploy_limit: d_d, at most d_t.
         excesses: of each policy, [n], n >= 1.
 
+    Raises:
+        ValueError: the curriculum has no bound, or an argument is out of its range.
+
     >>> proposition_1("linear", 100.0, 20.0, excesses=[0.5, 0.5])
     121.0
     """
-    _require_bound(curriculum)
+    _require_bound(curriculum, len(excesses))
+    _require_limits(train_limit, deploy_limit)
     mean_limit = deploy_limit + MEAN_WEIGHTS[curriculum] * (train_limit - deploy_limit)
     return len(excesses) * mean_limit + math.fsum(excesses)
 
@@ -166,7 +189,7 @@ def largest_train_limit(
         clock: time of a policy's progress.
 
     Raises:
-        ValueError: not even d_t = d_d is within the budget.
+        ValueError: the curriculum has no bound, or not even d_t = d_d is within the budget.
 
     >>> largest_train_limit("linear", 281.0, 20.0, excesses=[0.25] * 4, clock="start")
     100.0
@@ -181,9 +204,24 @@ def largest_train_limit(
     return math.inf if weights == 0.0 else deploy_limit + (budget - least) / weights
 
 
-def _require_bound(curriculum: str) -> None:
-    """Raise ValueError if the curriculum's limits are not known in advance."""
+def _require_bound(curriculum: str, policies: int) -> None:
+    """Raise ValueError if the curriculum's limits are not known in advance, or there are no policies."""
+    if policies < 1:
+        raise ValueError(f"there must be at least 1 policy, got {policies}")
     if curriculum not in MEAN_WEIGHTS:
         raise ValueError(
             f"only {', '.join(MEAN_WEIGHTS)} have a bound before they have run, got {curriculum!r}"
         )
+
+
+def _require_limits(train_limit: float, deploy_limit: float) -> None:
+    if not 0.0 <= deploy_limit <= train_limit < math.inf:
+        raise ValueError(
+            "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), "
+            f"got {train_limit:g} and {deploy_limit:g}"
+        )
+
+
+def _require_at_least_0(kl: float, advantage: float) -> None:
+    if kl < 0.0 or advantage < 0.0:
+        raise ValueError(f"kl and advantage must be at least 0, got {kl:g} and {advantage:g}")

@@ -12,10 +12,12 @@ literal pseudocode wherever it is defined.
   8 episodes per window, constant policies of Safety Gym did in up to 59% of the cases. So a window includes
   more updates until the standard errors of its means are within the tolerances. Until then there is no
   decision. The tolerances are relative to the mean or to the episodes' standard deviation, whichever is
-  larger, so that 100 episodes are always enough.
+  larger, so that 100 episodes are always enough. A window has at least ``LEAST_EPISODES``: two or three
+  episodes agree by chance, and one has no standard error.
 - *Zero and negative means* (line 5). For an agent without costs, |new / old - 1| divides by zero, and the
   agent would wait without end. Here the test is |new - old| <= eps max(|old|, floor). It is the same if old
-  is large, and 0 after 0 has converged. The floor avoids comparing small means by their noise.
+  is large, and 0 after 0 has converged. The floor avoids comparing small means by their noise. With
+  ``window_grows`` the standard deviation of the older window is a floor, too.
 - *No finished episode.* A window without an episode gives no information: the limits do not change.
 - *Adherence* (line 6). The mean cost of an agent at its optimum is a little above its limit as often as
   below, or always: an agent that must cross five tiles of river and sometimes slips costs 5.004. C <= d would
@@ -60,6 +62,8 @@ from recrl.teachers.start_limits import StartMeasurement
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState, already_seen, progress
 from recrl.teachers.windows import WindowStatistics, extend, last_two_windows
 
+LEAST_EPISODES = 10  # of a window that grows; a standard error from fewer episodes is itself uncertain
+
 
 def has_converged(new: float, old: float, *, tolerance: float, floor: float) -> bool:
     """Whether a mean has converged: abs(new - old) <= eps max(abs(old), floor).
@@ -97,7 +101,7 @@ def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int
     Args:
         limit: d, possibly infinite.
         cost: C-bar, at least 0.
-        deploy_limit: d_d, finite.
+        deploy_limit: d_d; infinite for a cost that is never constrained.
         remaining: n, the number of remaining steps; less than 1 counts as 1.
 
     >>> next_limit(math.inf, 65.0, 5.0, remaining=6)
@@ -174,9 +178,9 @@ def is_precise(window: WindowStatistics, config: DynamicConfig) -> bool:
     """Whether the standard errors of a window's means are within the tolerances.
 
     s <= eps max(|mean|, floor, standard deviation), s the standard error of the return and of each cost. With
-    eps = 0.1 a hundred episodes are always enough.
+    eps = 0.1 a hundred episodes are always enough. Fewer than ``LEAST_EPISODES`` never are.
     """
-    if window.episodes == 0:
+    if window.episodes < LEAST_EPISODES:
         return False
     return_floor, cost_floors = _floors(window, config)
     root = math.sqrt(window.episodes)

@@ -51,8 +51,9 @@ class DynamicConfig(BaseModel):
     window_grows: bool = Field(
         default=True,
         description="Whether a window includes more updates until the standard errors of its "
-        "means are within the tolerances (ours). The tolerances are then relative to "
-        "the mean or to the episodes' standard deviation, whichever is larger.",
+        "means are within the tolerances, and it has at least 10 episodes (ours). The "
+        "tolerances are then relative to the mean or to the episodes' standard deviation, "
+        "whichever is larger.",
     )
     return_tolerance: float = Field(
         default=0.1,

@@ -58,7 +58,7 @@ class TeacherSpec:
         name: registry name (``none``, ``linear``, ``dynamic``, ...), entry point or import path.
         options: the teacher's settings, which its config class validates.
         train_limits: d_t, [k], possibly infinite.
-        deploy_limits: d_d, [k], finite, each at most d_t.
+        deploy_limits: d_d, [k], each at most d_t; infinite for a cost that is never constrained.
         train_steps: B, environment steps of the training phase, at least 1.
     """
 

@@ -17,6 +17,8 @@ multipliers [k].
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +27,7 @@ from scipy.optimize import linprog
 from recrl.environments.cmdp import CostLimits, Floats
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, InfeasibleLimitsError
 
+Actions = npt.NDArray[np.integer[Any]]
 TOLERANCE = 1e-9  # relative; on returns and costs
 MAX_POLICIES = 10_000
 
@@ -53,13 +56,25 @@ class ConstrainedOptimum:
         costs: expected undiscounted episode costs of ``policy``, [k].
         multipliers: lambda_i = dJ*/dd_i >= 0, the gain in return per unit of each limit, [k]; 0 for infinite
             limits.
-        policy: an optimal policy, pi_t(a | s), [H, S, A].
+        model: the CMDP.
+        mixture: probabilities of deterministic policies, one of which is drawn for a whole episode, with
+            their actions [H, S].
     """
 
     episode_return: float
     costs: Floats
     multipliers: Floats
-    policy: Floats
+    model: FiniteCMDP
+    mixture: tuple[tuple[float, Actions], ...]
+
+    @cached_property
+    def policy(self) -> Floats:
+        """An optimal policy, pi_t(a | s), [H, S, A]; its tables take much memory for a large CMDP."""
+        one_hot = np.eye(self.model.num_actions)
+        occupation = np.sum(
+            [weight * _occupation(self.model, one_hot[actions]) for weight, actions in self.mixture], axis=0
+        )
+        return _conditional(occupation)
 
 
 def evaluate_policy(model: FiniteCMDP, policy: Floats) -> PolicyValue:
@@ -117,15 +132,12 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
             )
         bounds = np.maximum(bounds, costs[constrained])  # rounding must not make the next phase infeasible
     used = [(weight, policy) for weight, policy in zip(weights, found, strict=False) if weight > 0.0]
-    one_hot = np.eye(model.num_actions)
-    occupation = np.sum(
-        [weight * _occupation(model, one_hot[policy.actions]) for weight, policy in used], axis=0
-    )
     return ConstrainedOptimum(
         episode_return=float(sum(weight * policy.episode_return for weight, policy in used)),
         costs=np.asarray(costs, np.float64),
         multipliers=multipliers,
-        policy=_conditional(occupation),
+        model=model,
+        mixture=tuple((float(weight), policy.actions) for weight, policy in used),
     )
 
 
@@ -133,7 +145,7 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
 class _DeterministicPolicy:
     """One vertex of the set of attainable (return, costs); ``actions`` is [H, S]."""
 
-    actions: npt.NDArray[np.intp]
+    actions: Actions
     episode_return: float
     costs: Floats
 
@@ -150,13 +162,15 @@ def _backward_induction(
     immediate = np.concatenate([model.rewards[:, :, None], model.costs], axis=2)
     going_on = ~model.terminal[:, None]
     values = np.zeros((model.num_states, 1 + model.num_costs))
-    actions = np.zeros((model.horizon, model.num_states), np.intp)
+    # The smallest type, because all policies that are found stay in memory.
+    actions = np.zeros((model.horizon, model.num_states), np.min_scalar_type(model.num_actions - 1))
     state = np.arange(model.num_states)
     for step in reversed(range(model.horizon)):
         future = np.einsum("sam,samc->sac", model.probabilities, (values * going_on)[model.successors])
         action_values = immediate + future
-        actions[step] = np.argmax(action_values @ weights, axis=1)
-        values = action_values[state, actions[step]]
+        best = np.argmax(action_values @ weights, axis=1)
+        actions[step] = best
+        values = action_values[state, best]
     totals = model.start @ values
     return _DeterministicPolicy(actions, float(totals[0]), totals[1:])
 

@@ -19,7 +19,8 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats
-from recrl.environments.vector import CMDPVectorEnv
+from recrl.environments.saved_state import IDENTITY, SavedState, identity
+from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 Integers = npt.NDArray[np.int64]
 Booleans = npt.NDArray[np.bool_]
@@ -94,6 +95,16 @@ class FiniteCMDP:
     def num_costs(self) -> int:
         """The number of costs, k."""
         return len(self.cost_names)
+
+    def reachable(self) -> Booleans:
+        """Return the states that some policy can enter, given enough steps, start included, [S]."""
+        reached = self.start > 0.0
+        newest = np.flatnonzero(reached)
+        while len(newest):
+            following = self.successors[newest][self.probabilities[newest] > 0.0]
+            newest = np.unique(following[~reached[following]])
+            reached[newest] = True
+        return reached
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +181,11 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self.states: Integers = np.zeros(num_envs, np.int64)
         self._elapsed: Integers | None = None
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was a reset, or a state was loaded."""
+        return self._elapsed is not None
+
     def finite_cmdp(self) -> FiniteCMDP:
         """The model, for exact solutions."""
         return self._model
@@ -178,7 +194,10 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start B episodes; ``seed`` restarts the generator that they share."""
-        super().reset(seed=seed, options=options)
+        masked = masked_environments(self.cmdp.name, self.num_envs, options)
+        super().reset(seed=seed)
+        if masked is not None:
+            return self.restart(masked), {}
         self.states = self._first_states(self.num_envs)
         self._elapsed = np.zeros(self.num_envs, np.int64)
         return self.observations[self.states], {}
@@ -260,24 +279,33 @@ class FiniteVectorEnv(CMDPVectorEnv):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the states, the steps taken in each episode, and the generator."""
+        """Return the task, the states, the steps taken in each episode, and the generator."""
         if self._elapsed is None:
             raise ValueError(f"{self.cmdp.name}: there is no state before reset")
         return {
+            IDENTITY: identity(self.cmdp),
             "states": self.states.copy(),
             "elapsed": self._elapsed.copy(),
             "generator": copy.deepcopy(dict(self.np_random.bit_generator.state)),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        if np.shape(state["states"]) != (self.num_envs,):
-            raise ValueError(
-                f"{self.cmdp.name}: the saved state has {np.size(state['states'])} environments, "
-                f"expected {self.num_envs}"
-            )
-        self.states = np.array(state["states"], np.int64)
-        self._elapsed = np.array(state["elapsed"], np.int64)
+        """Continue exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: the state is damaged, or of another task.
+        """
+        model, like = self._model, np.zeros(self.num_envs, np.int64)
+        saved = SavedState(f"{self.cmdp.name}: saved state", state)
+        saved.check_identity(self.cmdp)
+        saved.check_number("states", self.num_envs)
+        states = saved.array("states", like, least=0, most=model.num_states - 1)
+        elapsed = saved.array("elapsed", like, least=0, most=model.horizon - 1)
+        possible = model.reachable() & ~model.terminal
+        if not possible[states].all():
+            state_index = states[~possible[states]][0]
+            raise saved.error("states", f"must be states of an episode under way, got {state_index}")
+        self.states, self._elapsed = states, elapsed
         self.np_random.bit_generator.state = state["generator"]
 
     def _checked(self, actions: npt.NDArray[np.int64]) -> Integers:

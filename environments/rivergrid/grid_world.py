@@ -19,7 +19,7 @@ Deterministic: a seed changes nothing. ``RiverGridVectorEnv`` steps tables.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -29,7 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError, Integers
-from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance
+from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance, quickest_route
 from recrl.environments.rivergrid.maps import (
     GOAL,
     MAPS,
@@ -101,13 +101,38 @@ class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):
     """Options of ``rivergrid-generated``: a random instance with the properties of the paper's two."""
 
     @model_validator(mode="after")
-    def _can_be_drawn(self) -> Self:
-        self.river_map()
+    def _goal_is_in_reach(self) -> Self:
+        quickest = quickest_route(self.river_map())
+        assert quickest is not None, "an instance's goal can be reached"
+        if self.horizon < quickest.steps:
+            raise ValueError(
+                f"horizon must be at least {quickest.steps}, the steps to the goal of map {self.map_seed}, "
+                f"got {self.horizon}"
+            )
         return self
 
     def river_map(self) -> RiverMap:
         """The map of these settings."""
         return draw_instance(self)
+
+
+TASK_OPTIONS: dict[str, type[RiverGridOptions]] = {
+    "rivergrid-1a": RiverGridOptions,
+    "rivergrid-1b": RiverGridOptions,
+    "rivergrid": RiverGridMapOptions,
+    "rivergrid-generated": RiverGridGeneratedOptions,
+}
+
+
+def valid_options(task: str, options: Mapping[str, Any]) -> RiverGridOptions:
+    """Return the validated options of a RiverGrid task with defaults.
+
+    Raises:
+        ValueError: there is no such task, or an option is wrong.
+    """
+    if task not in TASK_OPTIONS:
+        raise ValueError(f"task must be one of {', '.join(TASK_OPTIONS)}, got {task!r}")
+    return TASK_OPTIONS[task].model_validate(dict(options))
 
 
 def state_index(river_map: RiverMap, x: int, y: int, heading: int) -> int:
@@ -185,6 +210,8 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
         """Render one RGB frame per environment, uint8 [height * 32, width * 32, 3], with MiniGrid."""
+        if not self.has_begun:
+            raise ValueError(f"{self.cmdp.name}: call reset before the first frame")
         # MiniGrid takes long to import
         from recrl.environments.rivergrid.minigrid_drawing import render_frame  # noqa: PLC0415
 
@@ -207,11 +234,28 @@ def make_river_grid(name: str, num_envs: int, options: RiverGridOptions) -> Rive
     return RiverGridVectorEnv(name, task_map(name, options), options, num_envs=num_envs)
 
 
+def vector_of_task(
+    task: str, num_envs: int = 1, render_mode: str | None = None, **options: Any
+) -> RiverGridVectorEnv:
+    """Make B environments of a RiverGrid task, for ``gymnasium.make_vec``.
+
+    Args:
+        task: a key of ``TASK_OPTIONS``.
+        num_envs: B, at least 1.
+        render_mode: None or ``rgb_array``.
+        **options: of the task.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+    return make_river_grid(task, num_envs, valid_options(task, options))
+
+
 def river_grid_optimum(name: str, options: RiverGridOptions, limits: CostLimits) -> float:
     """Return J*(d), exact to about 1e-9; -inf if no policy keeps the limits."""
     # SciPy takes half a second to import, and trials do not use it.
     from recrl.environments.finite.exact_solver import solve_by_lagrangian  # noqa: PLC0415
 
+    limits.require(len(options.costs), name)
     model = river_cmdp(task_map(name, options), costs=options.costs, horizon=options.horizon)
     try:
         return float(solve_by_lagrangian(model, limits).episode_return)

@@ -1,4 +1,4 @@
-"""Maps of RiverGrid as text: the paper's two, a parser, and a generator of random ones.
+"""Maps of RiverGrid as text: the paper's two and a parser; ``instances`` generates random ones.
 
 A map is a rectangle of characters, enclosed by walls:
 

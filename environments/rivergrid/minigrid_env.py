@@ -3,15 +3,14 @@
 It is for rendering, wrapping and comparison. Training uses ``RiverGridVectorEnv``; a test compares the two
 step by step.
 
-Its names are ``recrl/RiverGrid-1a-v0``, ``recrl/RiverGrid-1b-v0`` and, with the keyword ``drawing`` for a map
-of your own, ``recrl/RiverGrid-v0``:
+Its names are ``recrl/RiverGrid-1a-v0``, ``recrl/RiverGrid-1b-v0`` and, with the keyword ``map`` for a map of
+your own, ``recrl/RiverGrid-v0``. The other keywords are the task's options, too:
 
     gymnasium.make("recrl.environments.registration:recrl/RiverGrid-1a-v0", render_mode="rgb_array")
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,16 +23,14 @@ from recrl.environments.cmdp import Floats
 from recrl.environments.rivergrid.grid_world import (
     FORWARD,
     GOAL_REWARD,
-    HORIZON,
     STEP_REWARD,
-    CostName,
-    ObservationName,
     RiverGridOptions,
     river_observations,
     state_index,
     task_map,
+    valid_options,
 )
-from recrl.environments.rivergrid.maps import MAPS, MUD, RIVER, parse_map
+from recrl.environments.rivergrid.maps import MUD, RIVER
 from recrl.environments.rivergrid.minigrid_drawing import TILE_PIXELS, river_minigrid
 
 
@@ -46,39 +43,42 @@ class RiverGridEnv(MiniGridEnv):
     """One RiverGrid environment.
 
     Args:
-        drawing: the map, see ``recrl.environments.rivergrid.maps``.
-        max_steps: H, steps after which an episode is truncated.
-        costs: the cost functions, in order.
-        observation: ``factored`` or ``joint``.
-        **minigrid: MiniGrid's own, such as ``render_mode``.
+        task: ``rivergrid-1a``, ``rivergrid-1b``, ``rivergrid`` or ``rivergrid-generated``.
+        render_mode: None or one of MiniGrid's, such as ``rgb_array``.
+        **options: of the task.
+
+    Attributes:
+        options: as given, with defaults.
+        river_map: the map.
+        cost_names: names of the k costs in ``info["cost"]``, an array [k].
+        horizon: H, steps after which an episode is truncated.
     """
 
-    def __init__(
-        self,
-        drawing: str = MAPS["1a"],
-        *,
-        max_steps: int = HORIZON,
-        costs: Sequence[CostName] = ("river",),
-        observation: ObservationName = "factored",
-        **minigrid: Any,
-    ) -> None:
-        self.river_map = parse_map(drawing)
-        self.cost_names = tuple(costs)
-        self._observations = river_observations(self.river_map, observation)
+    def __init__(self, task: str = "rivergrid-1a", render_mode: str | None = None, **options: Any) -> None:
+        self.options = valid_options(task, options)
+        self.river_map = task_map(task, self.options)
+        self.cost_names = self.options.costs
+        self.horizon = self.options.horizon
+        self._task = task
+        self._observations = river_observations(self.river_map, self.options.observation)
         super().__init__(
             mission_space=MissionSpace(mission_func=mission),
             width=self.river_map.width,
             height=self.river_map.height,
-            max_steps=max_steps,
-            **{"highlight": False, "tile_size": TILE_PIXELS, **minigrid},
+            max_steps=self.horizon,
+            highlight=False,
+            tile_size=TILE_PIXELS,
+            render_mode=render_mode,
         )
         self.action_space = Discrete(3)
         self.observation_space = Box(0.0, 1.0, self._observations.shape[1:], np.float32)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one step; ``info["cost"]`` is float64 [k]."""
+        if self.agent_dir is None:
+            raise ValueError(f"{self._task}: call reset before the first step")
         if not self.action_space.contains(action):
-            raise ValueError(f"RiverGrid: the action must be 0, 1 or 2, got {action!r}")
+            raise ValueError(f"{self._task}: the action must be 0, 1 or 2, got {action!r}")
         observation, _, terminated, truncated, _ = super().step(action)
         reward = GOAL_REWARD if terminated else STEP_REWARD
         return observation, reward, terminated, truncated and not terminated, {"cost": self._costs(action)}
@@ -103,10 +103,4 @@ class RiverGridEnv(MiniGridEnv):
 
 def draw_river_grid(name: str, options: RiverGridOptions) -> RiverGridEnv:
     """Make a rendering RiverGrid environment, for the registry of tasks."""
-    return RiverGridEnv(
-        str(task_map(name, options)),
-        max_steps=options.horizon,
-        costs=options.costs,
-        observation=options.observation,
-        render_mode="rgb_array",
-    )
+    return RiverGridEnv(name, render_mode="rgb_array", **options.model_dump())

@@ -13,6 +13,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from pydantic import ValidationError
+
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.registry import optimal_return
 from recrl.environments.rivergrid.grid_world import RiverGridGeneratedOptions
@@ -26,11 +28,26 @@ def grid_entry(options: Mapping[str, Any]) -> str:
 
     Args:
         options: of ``rivergrid-generated``, with the river as the only cost.
+
+    Raises:
+        ValueError: an option is wrong, there are other costs, or a route of the rule for limits takes longer
+            than an episode.
     """
-    river_map = RiverGridGeneratedOptions.model_validate(dict(options)).river_map()
+    settings = RiverGridGeneratedOptions.model_validate(dict(options))
+    if settings.costs != ("river",):
+        raise ValueError(
+            f'costs must be ["river"], because the rule for limits counts the river only, '
+            f"got {json.dumps(settings.costs)}"
+        )
+    river_map = settings.river_map()
     limit, seed = suggested_limit(river_map), options["map_seed"]
     quickest, cheapest = quickest_route(river_map), cheapest_route(river_map)
     assert quickest is not None and cheapest is not None, "an instance's goal can be reached"
+    if settings.horizon < cheapest.steps:
+        raise ValueError(
+            f"horizon must be at least {cheapest.steps}, the steps of the cheapest path on map {seed}, "
+            f"got {settings.horizon}"
+        )
     optima = {
         value: optimal_return(TASK, options, CostLimits((value,)))
         for value in sorted({*range(quickest.cost + 1), limit})
@@ -49,6 +66,27 @@ def _words(route: Route) -> str:
     return f"{route.steps} steps at a cost of {route.cost}"
 
 
+def _options(text: str) -> dict[str, Any]:
+    """Parse the options on the command line."""
+    try:
+        options = json.loads(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be a JSON object ({error}), got {text!r}") from error
+    if not isinstance(options, dict):
+        raise argparse.ArgumentTypeError(f"must be a JSON object, got {text!r}")
+    return options
+
+
+def _sentence(error: ValueError) -> str:
+    """Return an error as one line, which pydantic's are not."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    return "; ".join(
+        ": ".join([*map(str, each["loc"]), each["msg"].removeprefix("Value error, ")])
+        for each in error.errors()
+    )
+
+
 def main() -> None:
     """Print one entry for each map seed on the command line."""
     parser = argparse.ArgumentParser(
@@ -57,13 +95,13 @@ def main() -> None:
     )
     parser.add_argument("map_seed", type=int, nargs="+", help="seeds of the maps")
     parser.add_argument(
-        "--options", type=json.loads, default={}, help="other options of rivergrid-generated, as JSON"
+        "--options", type=_options, default={}, help="other options of rivergrid-generated, as JSON"
     )
     arguments = parser.parse_args()
     try:
         print("\n".join(grid_entry({"map_seed": seed, **arguments.options}) for seed in arguments.map_seed))
     except ValueError as error:
-        parser.error(str(error))
+        parser.error(_sentence(error))
 
 
 if __name__ == "__main__":

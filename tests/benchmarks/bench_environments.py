@@ -18,7 +18,6 @@ from recrl.environments.cmdp import CostLimits
 from recrl.environments.finite.exact_solver import solve_by_lagrangian
 from recrl.environments.registry import make_vector
 from recrl.environments.rivergrid.grid_world import RiverGridVectorEnv
-from recrl.environments.rivergrid.maps import MAPS
 from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
 
 STEPS = 20_000
@@ -49,7 +48,7 @@ def vector_step(name: str, num_envs: int, options: dict[str, Any]) -> float:
 
 
 def minigrid_step() -> float:
-    environment = RiverGridEnv(MAPS["1a"])
+    environment = RiverGridEnv("rivergrid-1a")
     environment.reset(seed=0)
     actions = np.random.default_rng(0).integers(3, size=STEPS // 10).tolist()
 

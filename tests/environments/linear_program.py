@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
 from recrl.environments.cmdp import CostLimits, Floats
-from recrl.environments.finite.exact_solver import ConstrainedOptimum
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, InfeasibleLimitsError, Integers
 
 
-def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOptimum:
+class ProgramSolution(NamedTuple):
+    """The attributes of ``ConstrainedOptimum`` with their meaning there."""
+
+    episode_return: float
+    costs: Floats
+    multipliers: Floats
+    policy: Floats
+
+
+def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> ProgramSolution:
     """Solve for J*(d) by linear programming over occupation measures x_t(s, a) >= 0 (HiGHS).
 
     maximise    sum_{t, s, a} x_t(s, a) R(s, a)
@@ -42,7 +50,7 @@ def solve_by_linear_program(model: FiniteCMDP, limits: CostLimits) -> Constraine
     visits = occupation.sum(axis=2, keepdims=True)
     policy = np.full_like(occupation, 1.0 / model.num_actions)  # where a state is never visited
     np.divide(occupation, visits, out=policy, where=visits > 1e-12)
-    return ConstrainedOptimum(
+    return ProgramSolution(
         episode_return=float(np.sum(occupation * model.rewards)),
         costs=np.einsum("tsa,sak->k", occupation, model.costs),
         multipliers=multipliers,

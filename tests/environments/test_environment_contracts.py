@@ -210,6 +210,29 @@ def test_what_was_returned_is_not_changed_by_later_steps(name: str) -> None:
     assert all(np.array_equal(now, then) for now, then in zip(returned, copies, strict=True))
 
 
+def test_the_options_of_reset_are_a_mask_or_refused(name: str) -> None:
+    environment, twin = build(name), build(name)
+    environment.reset(seed=0)
+    twin.reset(seed=0)
+    for actions in random_actions(environment, 5):
+        environment.step(actions)
+        twin.step(actions)
+    mask = np.array([True] + [False] * (NUM_ENVS - 1))
+    options = {"reset_mask": mask}
+    observations, _ = environment.reset(options=options)
+    assert options["reset_mask"] is mask
+    np.testing.assert_array_equal(observations, twin.restart(np.array([0])))
+    for actions in random_actions(environment, 3, seed=1):
+        assert as_bytes(environment.step(actions)) == as_bytes(twin.step(actions))
+    with pytest.raises(ValueError, match="the only option of reset is 'reset_mask', got mud"):
+        environment.reset(options={"mud": 1})
+    for wrong in (np.ones(NUM_ENVS + 1, np.bool_), ~mask & False):
+        with pytest.raises(ValueError, match=rf"reset_mask must have shape \({NUM_ENVS},\) and at least one"):
+            environment.reset(options={"reset_mask": wrong})
+    with pytest.raises(TypeError, match="reset_mask must be an array of booleans, got list"):
+        environment.reset(options={"reset_mask": [True] * NUM_ENVS})
+
+
 def test_actions_that_mean_nothing_are_refused(name: str) -> None:
     environment = build(name)
     environment.reset(seed=0)

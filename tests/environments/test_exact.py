@@ -5,18 +5,21 @@ from __future__ import annotations
 import itertools
 import math
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, Floats
-from recrl.environments.finite.exact_solver import evaluate_policy, solve_by_lagrangian
+from recrl.environments.finite.exact_solver import ConstrainedOptimum, evaluate_policy, solve_by_lagrangian
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError
 from recrl.environments.registry import make_vector, optimal_return
 from recrl.environments.rivergrid.grid_world import river_cmdp
 from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance
 from recrl.environments.rivergrid.maps import MAPS, parse_map
-from tests.environments.linear_program import solve_by_linear_program
+from tests.environments.linear_program import ProgramSolution, solve_by_linear_program
+
+Solution = ConstrainedOptimum | ProgramSolution
 
 
 def random_cmdp(
@@ -95,7 +98,7 @@ def test_an_action_may_have_any_index() -> None:
 def test_both_solvers_agree_on_rivergrid_with_two_constraints_of_which_both_bind() -> None:
     model = river_cmdp(parse_map(MAPS["1b"]), costs=("river", "turns"), horizon=15)
     limits = CostLimits((1.0, 1.5))
-    solutions = [solve(model, limits) for solve in (solve_by_lagrangian, solve_by_linear_program)]
+    solutions: list[Solution] = [solve_by_lagrangian(model, limits), solve_by_linear_program(model, limits)]
     assert solutions[0].episode_return == pytest.approx(solutions[1].episode_return, abs=1e-6)
     for solution in solutions:
         assert (solution.multipliers > 0.1).all()
@@ -132,7 +135,10 @@ def test_both_solvers_agree_on_random_cmdps_and_their_policies_do_what_they_say(
         model = random_cmdp(seed, num_costs=num_costs)
         limits = CostLimits(tuple(least_costs(model) + 0.3))
         try:
-            solutions = [solve(model, limits) for solve in (solve_by_lagrangian, solve_by_linear_program)]
+            solutions: list[Solution] = [
+                solve_by_lagrangian(model, limits),
+                solve_by_linear_program(model, limits),
+            ]
         except InfeasibleLimitsError:  # each limit can be kept, but not all of them together
             with pytest.raises(InfeasibleLimitsError):
                 solve_by_linear_program(model, limits)
@@ -186,6 +192,18 @@ def test_limits_that_nobody_can_keep_are_an_error(solve: type) -> None:
     with pytest.raises(InfeasibleLimitsError, match=r"no policy keeps the limits \[2\.5\]"):
         solve(model, CostLimits((2.5,)))
     assert solve(model, CostLimits((3.0,))).episode_return == pytest.approx(3.0)
+
+
+def test_the_optimum_alone_builds_no_table_of_times_states_and_actions() -> None:
+    river_map = draw_instance(InstanceSettings(map_seed=3, width=14, height=14))
+    model = river_cmdp(river_map, costs=("river",), horizon=800)
+    table = 8 * model.horizon * model.num_states * model.num_actions
+    tracemalloc.start()
+    optimum = solve_by_lagrangian(model, CostLimits((0.4,)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < table / 2
+    assert evaluate_policy(model, optimum.policy).costs == pytest.approx([0.4])
 
 
 def test_the_number_of_limits_must_be_the_number_of_costs() -> None:

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.gymnasium_tasks import make_from_callable
+from recrl.environments.gymnasium_tasks import draw_from_callable, make_from_callable
 from recrl.environments.registry import KeywordOptions, make_vector, task_options
 
 
@@ -69,6 +69,29 @@ class Steered(gymnasium.Env[Any, Any]):
         return action.astype(np.float32), 0.0, False, False, {"cost": 0.5}
 
 
+class Scaling(Steered):
+    """Halves its action in place."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        action *= 0.5
+        return super().step(action)
+
+
+class Worn(Countdown):
+    """Its second cost rises with every episode, which no observation shows."""
+
+    cost_names: ClassVar = ("time", "wear")
+    episodes = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.episodes += 1
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, _ = super().step(action)
+        return observation, reward, terminated, truncated, {"cost": [self.time, self.episodes]}
+
+
 def test_the_cost_and_observation_of_the_last_step_are_kept() -> None:
     environment = SyncCMDPVectorEnv("countdown", [lambda: Countdown(2), lambda: Countdown(3)])
     first, _ = environment.reset(seed=0)
@@ -119,6 +142,23 @@ def test_an_environment_that_reports_no_cost_is_refused_unless_told() -> None:
     assert costless.cmdp.horizon == 500
 
 
+@pytest.mark.parametrize(
+    ("attribute", "spec_horizon", "horizon"),
+    [(None, None, None), (30, None, 30), (30, 20, 20), ("far", None, None), (0, None, None)],
+)
+def test_the_horizon_is_the_specs_or_else_the_environments(
+    attribute: Any, spec_horizon: int | None, horizon: int | None
+) -> None:
+    def build() -> Countdown:
+        environment = Countdown()
+        environment.spec = gymnasium.envs.registration.EnvSpec("C-v0", max_episode_steps=spec_horizon)
+        if attribute is not None:
+            environment.horizon = attribute  # type: ignore[attr-defined]
+        return environment
+
+    assert SyncCMDPVectorEnv("countdown", [build]).cmdp.horizon == horizon
+
+
 def test_another_number_of_costs_than_named_is_refused() -> None:
     environment = SyncCMDPVectorEnv("countdown", [Countdown], cost_names=("time",))
     environment.reset(seed=0)
@@ -145,6 +185,50 @@ def test_an_environment_with_hidden_state_is_not_resumed_silently() -> None:
         ValueError, match=r"forgetful: cannot be resumed, because replaying the episode of envi"
     ):
         SyncCMDPVectorEnv("forgetful", [lambda: Forgetful(5)]).load_state_dict(environment.state_dict())
+
+
+def test_an_environment_whose_cost_has_hidden_state_is_not_resumed_silently() -> None:
+    environment = SyncCMDPVectorEnv("worn", [lambda: Worn(5)])
+    environment.reset(seed=0)
+    for _ in range(7):
+        environment.step(np.array([1]))
+    state = environment.state_dict()
+    with pytest.raises(ValueError) as error:
+        SyncCMDPVectorEnv("worn", [lambda: Worn(5)]).load_state_dict(state)
+    assert str(error.value) == (
+        "worn: cannot be resumed, because replaying the episode of environment 0 gave other observations, "
+        "rewards, costs or ends on the way; reset(seed=...) must determine an episode"
+    )
+    del state["checksums"]  # as in states of before
+    SyncCMDPVectorEnv("worn", [lambda: Worn(5)]).load_state_dict(state)
+
+
+def test_a_resumed_environment_can_be_saved_and_resumed_again() -> None:
+    environment = SyncCMDPVectorEnv("countdown", [lambda: Countdown(5)] * 2)
+    environment.reset(seed=0)
+    for _ in range(7):
+        environment.step(np.array([1, 2]))
+    resumed = SyncCMDPVectorEnv("countdown", [lambda: Countdown(5)] * 2)
+    resumed.load_state_dict(environment.state_dict())
+    for each in (environment, resumed):
+        each.step(np.array([0, 1]))
+    assert resumed.state_dict()["checksums"] == environment.state_dict()["checksums"]
+    again = SyncCMDPVectorEnv("countdown", [lambda: Countdown(5)] * 2)
+    again.load_state_dict(resumed.state_dict())
+
+
+def test_an_environment_that_scales_its_action_in_place_is_resumed() -> None:
+    environment = SyncCMDPVectorEnv("scaling", [Scaling] * 2)
+    environment.reset(seed=0)
+    actions = np.array([[0.5, 1.5], [1.0, 2.0]])
+    for _ in range(3):
+        observations = environment.step(actions)[0]
+    assert observations.tolist() == [[0.25, 0.75], [0.5, 1.0]]
+    state = environment.state_dict()
+    assert [taken.tolist() for taken in state["episode_actions"]] == [[row.tolist()] * 3 for row in actions]
+    resumed = SyncCMDPVectorEnv("scaling", [Scaling] * 2)
+    resumed.load_state_dict(state)
+    np.testing.assert_array_equal(resumed.state_dict()["episode_actions"], state["episode_actions"])
 
 
 def test_environments_of_a_batch_do_not_repeat_each_other_nor_the_next_seeds() -> None:
@@ -211,10 +295,16 @@ def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
             "x",
             "wrong: info['cost'] must be a finite number for each of cost (the environment's cost_names), ",
         ),
+        ("terminated", "no", "wrong: terminated must be True or False, got str 'no'"),
+        ("truncated", None, "wrong: truncated must be True or False, got None"),
+        ("truncated", 1, "wrong: truncated must be True or False, got int 1"),
     ],
 )
 def test_what_an_environment_returns_is_looked_at(field: str, value: Any, sentence: str) -> None:
-    returned: dict[str, Any] = {"observation": np.zeros(1), "reward": 0.0, "cost": 0.0, field: value}
+    returned: dict[str, Any] = {
+        **{"observation": np.zeros(1), "reward": 0.0, "cost": 0.0},
+        **{"terminated": np.False_, "truncated": False, field: value},
+    }
 
     class Wrong(gymnasium.Env[Any, Any]):
         observation_space = spaces.Box(-1.0, 1.0, (1,))
@@ -225,7 +315,8 @@ def test_what_an_environment_returns_is_looked_at(field: str, value: Any, senten
 
         def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
             info = {"cost": returned["cost"]}
-            return returned["observation"], returned["reward"], False, False, info
+            ends = returned["terminated"], returned["truncated"]
+            return returned["observation"], returned["reward"], *ends, info
 
     environments = SyncCMDPVectorEnv("wrong", [Wrong])
     environments.reset(seed=0)
@@ -270,6 +361,33 @@ def test_a_wrong_option_of_a_users_task_names_the_known_ones(
 def test_right_options_of_a_users_task_are_passed_on(options: dict[str, Any]) -> None:
     make_from_callable(_breezy, "breezy", 1, KeywordOptions(**options)).close()
     make_from_callable(_any_option, "breezy", 1, KeywordOptions(**options)).close()
+
+
+class Strict(Countdown):
+    """Checks its options itself; ``known`` are those that it has."""
+
+    known: ClassVar[tuple[str, ...]] = ("length",)
+
+    def __init__(self, **options: Any) -> None:
+        if unknown := [name for name in options if name not in self.known]:
+            raise ValueError(f"unknown options {unknown}")
+        super().__init__(options.get("length", 3))
+        self.render_mode = options.get("render_mode")
+
+
+class Rendering(Strict):
+    known = ("length", "render_mode")
+
+
+@pytest.mark.parametrize(("factory", "render_mode"), [(Strict, None), (Rendering, "rgb_array")])
+def test_a_users_class_with_keywords_renders_if_it_takes_the_mode(
+    factory: type[Strict], render_mode: str | None
+) -> None:
+    environment = draw_from_callable(factory, "strict", KeywordOptions(length=2))
+    assert isinstance(environment, factory)
+    assert (environment.render_mode, environment.steps) == (render_mode, 2)
+    with pytest.raises(ValueError, match=r"^unknown options \['width'\]$"):
+        draw_from_callable(factory, "strict", KeywordOptions(width=2))
 
 
 def test_a_factory_that_makes_no_environment_is_named() -> None:

@@ -101,7 +101,7 @@ def test_a_task_whose_optimum_nobody_knows_says_none() -> None:
 
 def test_a_users_callable_is_a_task_by_its_import_path() -> None:
     path = "recrl.environments.rivergrid.minigrid_env:RiverGridEnv"
-    environment = make_vector(path, 3, options={"max_steps": 9, "costs": ["river", "turns"]})
+    environment = make_vector(path, 3, options={"horizon": 9, "costs": ["river", "turns"]})
     assert isinstance(environment, SyncCMDPVectorEnv)
     assert environment.cmdp.name == path
     assert environment.cmdp.cost_names == ("river", "turns")
@@ -121,6 +121,48 @@ def test_a_users_task_is_found_by_entry_point(tmp_path: Path, monkeypatch: pytes
     (distribution / "entry_points.txt").write_text("[recrl.tasks]\nrush = goldrush:RUSH\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert find_task("rush") is TASKS["two-state"]
+
+
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("coalrush:RUSH", "No module named 'shovel'"),
+        ("goldrash:RUSH", "No module named 'goldrash'"),
+        ("silverrush:RUSH", "module 'silverrush' has no attribute 'RUSH'"),
+        ("bankrupt:RUSH", "it ends the process (exit code 3)"),
+    ],
+)
+def test_a_broken_entry_point_is_named_with_its_package(
+    target: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "coalrush.py").write_text("import shovel\n")
+    (tmp_path / "silverrush.py").write_text("")
+    (tmp_path / "bankrupt.py").write_text("raise SystemExit(3)\n")
+    distribution = tmp_path / "gold_rush-1.0.dist-info"
+    distribution.mkdir()
+    (distribution / "METADATA").write_text("Metadata-Version: 2.1\nName: gold-rush\nVersion: 1.0\n")
+    (distribution / "entry_points.txt").write_text(f"[recrl.tasks]\nrush = {target}\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(UnknownNameError) as error:
+        find_task("rush")
+    assert str(error.value) == (
+        f"the entry point rush of the package gold-rush cannot load {target!r}: {reason}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "limits", "number"),
+    [
+        ("two-state", (1.0, 2.0), 1),
+        ("two-state-2", (1.0,), 2),
+        ("continuous-bandit", (1.0, 2.0), 1),
+        ("rivergrid-1a", (1.0, 2.0), 1),
+    ],
+)
+def test_an_optimum_needs_one_limit_per_cost(name: str, limits: tuple[float, ...], number: int) -> None:
+    with pytest.raises(ValueError) as error:
+        optimal_return(name, {}, CostLimits(limits))
+    assert str(error.value) == f"{name}: there must be one limit per cost, {number}, got {len(limits)}"
 
 
 def test_what_is_neither_a_task_nor_callable_is_refused() -> None:

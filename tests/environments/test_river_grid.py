@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 from minigrid.minigrid_env import MiniGridEnv
 
 from recrl.environments.cmdp import CostLimits
@@ -25,11 +26,14 @@ from recrl.environments.rivergrid.grid_world import (
     RiverGridMapOptions,
     RiverGridVectorEnv,
     state_index,
+    vector_of_task,
 )
 from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance
 from recrl.environments.rivergrid.maps import MAPS, parse_map
 from recrl.environments.rivergrid.minigrid_drawing import render_frame
 from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
+from recrl.environments.saved_state import IDENTITY
+from recrl.environments.vector import CMDPVectorEnv
 
 register_all()
 IDENTIFIERS = ["recrl/RiverGrid-1a-v0", "recrl/RiverGrid-1b-v0", "recrl/RiverGrid-v0"]
@@ -141,8 +145,8 @@ def test_the_fast_environment_equals_minigrids_step_for_step(
     drawing: str, costs: tuple[CostName, ...], observation: ObservationName
 ) -> None:
     horizon = 40
-    slow = RiverGridEnv(drawing, max_steps=horizon, costs=costs, observation=observation)
     options = RiverGridMapOptions(map=drawing, horizon=horizon, costs=costs, observation=observation)
+    slow = RiverGridEnv("rivergrid", **options.model_dump())
     fast = RiverGridVectorEnv("rivergrid", parse_map(drawing), options, num_envs=2)
     generator = np.random.default_rng(0)
     slow_observation, _ = slow.reset(seed=1)
@@ -178,10 +182,10 @@ def test_the_minigrid_environment_passes_gymnasiums_checker(
 
 @pytest.mark.parametrize("identifier", IDENTIFIERS)
 def test_the_minigrid_environment_passes_minigrids_own_checks(identifier: str) -> None:
-    """MiniGrid's tests/test_envs.py: repeatable rollouts, spec as JSON, max_steps, pickling, old_run_test."""
+    """MiniGrid's tests/test_envs.py: repeatable rollouts, spec as JSON, horizon, pickling, old_run_test."""
     spec = gymnasium.spec(identifier)
     assert json.loads(spec.to_json())["id"] == identifier
-    first, second = spec.make(max_steps=50), spec.make(max_steps=50)
+    first, second = spec.make(horizon=50), spec.make(horizon=50)
     np.testing.assert_array_equal(first.reset(seed=0)[0], second.reset(seed=0)[0])
     first.action_space.seed(0)
     for _ in range(50):
@@ -193,19 +197,22 @@ def test_the_minigrid_environment_passes_minigrids_own_checks(identifier: str) -
         if one[2] or one[3]:
             first.reset(seed=0)
             second.reset(seed=0)
-    turning = spec.make(max_steps=7)
+    turning = spec.make(horizon=7)
     turning.reset()
     assert [turning.step(LEFT)[3] for _ in range(7)] == [False] * 6 + [True]
     copied = pickle.loads(pickle.dumps(spec.make()))  # noqa: S301
     np.testing.assert_array_equal(copied.reset()[0], first.reset()[0])
     raw = first.unwrapped
     assert isinstance(raw, RiverGridEnv)
-    grids = []
-    for seed in (1337, 1337):
-        raw.reset(seed=seed)
-        grids.append(raw.grid)
-    assert grids[0] == grids[1]
-    assert 0 <= raw.agent_pos[0] < raw.width
+    raw.reset(seed=1337)
+    grid = raw.grid
+    drawn = [grid.get(x, y) for y in range(raw.height) for x in range(raw.width)]
+    kinds = {"#": "wall", "~": "floor", "%": "floor", "G": "goal"}
+    assert [tile and tile.type for tile in drawn] == [kinds.get(tile) for tile in "".join(raw.river_map.rows)]
+    raw.step(FORWARD)
+    raw.reset(seed=1337)  # a step changes neither the map nor the next start
+    assert raw.grid == grid
+    assert (raw.agent_pos, raw.agent_dir) == (raw.river_map.start, raw.river_map.heading)
     assert raw.pprint_grid().count(">>") == 1  # type: ignore[no-untyped-call]
     first.close()
 
@@ -213,12 +220,69 @@ def test_the_minigrid_environment_passes_minigrids_own_checks(identifier: str) -
 def test_an_action_that_minigrid_has_but_rivergrid_has_not_is_refused() -> None:
     environment = RiverGridEnv()
     environment.reset()
-    with pytest.raises(ValueError, match=r"RiverGrid: the action must be 0, 1 or 2, got 3"):
+    with pytest.raises(ValueError, match=r"^rivergrid-1a: the action must be 0, 1 or 2, got 3$"):
         environment.step(3)
 
 
+@pytest.mark.parametrize(
+    ("task", "wrong", "message"),
+    [
+        ("rivergrid-1a", {"observation": "Joint"}, "Input should be 'factored' or 'joint'"),
+        ("rivergrid-1a", {"costs": ("foo",)}, "Input should be 'river', 'turns' or 'mud'"),
+        ("rivergrid-1a", {"horizon": 0}, "Input should be greater than or equal to 1"),
+        ("rivergrid-1a", {"max_steps": 9}, "max_steps"),
+        ("rivergrid", {}, "map"),
+        ("rivergrid-1c", {}, "task must be one of rivergrid-1a, rivergrid-1b, rivergrid, rivergrid-gen"),
+    ],
+)
+@pytest.mark.parametrize("make", [RiverGridEnv, vector_of_task])
+def test_wrong_options_are_refused_as_in_a_grid(
+    make: Any, task: str, wrong: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(task, **wrong)
+
+
+def test_a_step_or_a_frame_before_reset_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^rivergrid-1a: call reset before the first step$"):
+        RiverGridEnv().step(FORWARD)
+    with pytest.raises(ValueError, match=r"^rivergrid-1a: call reset before the first frame$"):
+        make_vector("rivergrid-1a", 2).render()
+
+
+@pytest.mark.parametrize("identifier", IDENTIFIERS)
+def test_a_batch_of_a_registered_id_is_that_of_the_task(identifier: str) -> None:
+    environments = gymnasium.make_vec(identifier, num_envs=3, horizon=7, costs=["turns"])
+    assert isinstance(environments.unwrapped, RiverGridVectorEnv)
+    assert environments.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    environments.reset(seed=0)
+    for _ in range(7):
+        _, _, _, truncated, info = environments.step(np.zeros(3, np.int64))
+        assert info["cost"].tolist() == [[1.0]] * 3
+    assert truncated.all()
+    assert "final_obs" in info
+
+
+def test_a_batch_draws_its_frames_or_names_the_modes() -> None:
+    environments = gymnasium.make_vec(IDENTIFIERS[0], num_envs=2, render_mode="rgb_array")
+    environments.reset(seed=0)
+    frames = environments.render()
+    assert frames is not None
+    assert len(frames) == 2
+    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
+        gymnasium.make_vec(IDENTIFIERS[0], num_envs=2, render_mode="human")
+
+
+@pytest.mark.parametrize(("options", "horizon"), [({}, 200), ({"horizon": 30}, 30)])
+def test_the_task_gymnasium_knows_the_horizon_of_a_registered_id(
+    options: dict[str, int], horizon: int
+) -> None:
+    made = {"id": f"recrl.environments.registration:{IDENTIFIERS[1]}", "keywords": options}
+    assert make_vector("gymnasium", 1, options=made).cmdp.horizon == horizon
+
+
 def test_both_environments_draw_the_same_picture() -> None:
-    slow = RiverGridEnv(MAPS["1b"], render_mode="rgb_array")
+    slow = RiverGridEnv("rivergrid-1b", render_mode="rgb_array")
     fast = make_vector("rivergrid-1b", 2)
     assert isinstance(fast, RiverGridVectorEnv)
     slow.reset()
@@ -251,3 +315,63 @@ def test_states_are_numbered_by_column_row_and_heading() -> None:
     assert environment.states.tolist() == [state_index(river_map, 1, 4, 3)]
     seen = environment.observations[environment.states[0]]
     assert np.flatnonzero(seen).tolist() == [1, 9 + 4, 9 + 9 + 3]
+
+
+def begun(name: str) -> CMDPVectorEnv:
+    environments = make_vector(name, 2)
+    environments.reset(seed=0)
+    environments.step(np.array([LEFT, FORWARD]))
+    return environments
+
+
+def of_old(state: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """A saved state of before the task was in it, with some numbers changed."""
+    return {**{key: value for key, value in state.items() if key != IDENTITY}, **changes}
+
+
+def test_a_state_of_another_task_or_horizon_is_refused() -> None:
+    state = begun("rivergrid-1b").state_dict()
+    with pytest.raises(ValueError) as error:
+        make_vector("rivergrid-1a", 2).load_state_dict(state)
+    assert str(error.value) == (
+        "rivergrid-1a: saved state: identity.task must be 'rivergrid-1a', got 'rivergrid-1b'"
+    )
+    with pytest.raises(ValueError, match=r"identity\.horizon must be 100, got 200$"):
+        make_vector("rivergrid-1b", 2, options={"horizon": 100}).load_state_dict(state)
+
+
+def test_an_old_state_without_the_tasks_name_is_loaded() -> None:
+    environments = begun("rivergrid-1a")
+    resumed = make_vector("rivergrid-1a", 2)
+    resumed.load_state_dict(of_old(environments.state_dict()))
+    actions = np.array([FORWARD, FORWARD])
+    np.testing.assert_array_equal(resumed.step(actions)[0], environments.step(actions)[0])
+
+
+WALL_STATE = state_index(parse_map(MAPS["1a"]), 0, 0, 0)
+GOAL_STATE = state_index(parse_map(MAPS["1a"]), 7, 4, 0)
+IMPOSSIBLE = "must be states of an episode under way"
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"states": np.array([-5, 60])}, "states must have numbers that are from 0 to 323, got -5"),
+        ({"states": np.array([324, 60])}, "states must have numbers that are from 0 to 323, got 324"),
+        (
+            {"states": np.array([60.0, 60.0])},
+            "states must be int64 of shape (2,), got float64 of shape (2,)",
+        ),
+        ({"states": np.array([60])}, "states must be of 2 environments, got 1"),
+        ({"states": np.array([52, WALL_STATE])}, f"states {IMPOSSIBLE}, got {WALL_STATE}"),
+        ({"states": np.array([52, GOAL_STATE])}, f"states {IMPOSSIBLE}, got {GOAL_STATE}"),
+        ({"elapsed": np.array(3)}, "elapsed must be int64 of shape (2,), got int64 of shape ()"),
+        ({"elapsed": np.array([-1, 3])}, "elapsed must have numbers that are from 0 to 199, got -1"),
+        ({"elapsed": np.array([200, 3])}, "elapsed must have numbers that are from 0 to 199, got 200"),
+    ],
+)
+def test_a_state_that_no_episode_can_have_is_refused(changes: dict[str, Any], sentence: str) -> None:
+    state = begun("rivergrid-1a").state_dict()
+    with pytest.raises(ValueError) as error:
+        make_vector("rivergrid-1a", 2).load_state_dict(of_old(state, **changes))
+    assert str(error.value) == f"rivergrid-1a: saved state: {sentence}"

@@ -161,6 +161,7 @@ def test_a_trial_walks_on_the_map_that_its_options_name() -> None:
         ({"river_width": [2, 6]}, "two widths from 1 to 5 in a map of 9 by 9, the least first, got 2 and 6"),
         ({"river_width": [3, 2]}, "the least first, got 3 and 2"),
         ({"wall_share": 0.6}, "less than or equal to 0.5"),
+        ({"horizon": 8}, "horizon must be at least 9, the steps to the goal of map 0, got 8"),
     ],
 )
 def test_settings_that_give_no_instance_are_refused(wrong: dict[str, object], message: str) -> None:
@@ -197,6 +198,28 @@ def test_the_command_names_a_wrong_option(
     with pytest.raises(SystemExit):
         main()
     assert "widht" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ("[1]", "argument --options: must be a JSON object, got '[1]'"),
+        (
+            '{"costs": ["turns"]}',
+            'costs must be ["river"], because the rule for limits counts the river only, got ["turns"]',
+        ),
+        ('{"horizon": 3}', "horizon must be at least 9, the steps to the goal of map 0, got 3"),
+        ('{"horizon": 20}', "horizon must be at least 23, the steps of the cheapest path on map 0, got 20"),
+        ('{"widht": 8}', "widht: Extra inputs are not permitted"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(
+    options: str, sentence: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["print_instances", "0", "--options", options])
+    with pytest.raises(SystemExit):
+        main()
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"error: {sentence}")
 
 
 def test_the_committed_grid_has_the_first_six_maps_under_the_limits_of_the_rule() -> None:

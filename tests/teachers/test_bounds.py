@@ -1,6 +1,7 @@
 """Lemma 1, Proposition 1 and their inverse: by hand, against plain sums, and on random CMDPs."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -148,6 +149,43 @@ def test_a_budget_below_that_of_d_d_is_refused() -> None:
     assert str(error.value) == (
         "budget must be at least 81, the bound for d_t = d_d = 20 over 4 policies, got 50"
     )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (lambda: discounted_excess(0.02, 3.0, discount=1.5), "discount must lie in [0, 1], got 1.5"),
+        (
+            lambda: discounted_excess(-0.02, 3.0, discount=0.5),
+            "kl and advantage must be at least 0, got -0.02 and 3",
+        ),
+        (
+            lambda: undiscounted_excess(0.02, -3.0, horizon=9),
+            "kl and advantage must be at least 0, got 0.02 and -3",
+        ),
+        (lambda: undiscounted_excess(0.02, 3.0, horizon=0), "horizon must be at least 1, got 0"),
+        (
+            lambda: cumulative_bound("linear", 20.0, 100.0, excesses=[0.0], clock="start"),
+            "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), got 20 and 100",
+        ),
+        (
+            lambda: proposition_1("linear", math.inf, 20.0, excesses=[0.0]),
+            "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), got inf and 20",
+        ),
+        (
+            lambda: cumulative_bound("linear", 100.0, 20.0, excesses=[], clock="start"),
+            "there must be at least 1 policy, got 0",
+        ),
+        (
+            lambda: proposition_1("linear", 100.0, 20.0, excesses=[]),
+            "there must be at least 1 policy, got 0",
+        ),
+    ],
+)
+def test_arguments_out_of_their_range_are_one_sentence(wrong: Callable[[], float], sentence: str) -> None:
+    with pytest.raises(ValueError) as error:
+        wrong()
+    assert str(error.value) == sentence
 
 
 def test_a_curriculum_without_a_bound_is_refused() -> None:

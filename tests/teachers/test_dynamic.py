@@ -239,7 +239,7 @@ def test_the_first_judgement_takes_two_windows_and_every_other_one() -> None:
 @pytest.mark.parametrize(
     ("options", "episodes", "updates_in_a_window"),
     [
-        ({"window": 5}, 1, 5),
+        ({"window": 5}, 2, 5),
         ({"window": 5}, 500, 5),
         ({"window": 80, "window_unit": "episodes"}, 16, 5),
         ({"window": 80, "window_unit": "episodes"}, 500, 1),
@@ -375,7 +375,7 @@ def test_literally_the_clock_begins_anew_also_where_nothing_changes() -> None:
             train=(5.0,),
             deploy=(5.0,),
             updates=60,
-            episodes=lambda step: 1,
+            episodes=lambda step: 3,
             window=4,
             cost_tolerance=0.5,
             adherence_tolerance="none",
@@ -414,7 +414,7 @@ def kicked_at(**options: Any) -> list[int]:
             last_noise.append(update)
         return 9.5, (max(5.0, 9.0 - (update - last_noise[-1])) if last_noise else 5.9,)
 
-    run = play(settles, train=(5.0,), deploy=(5.0,), updates=100, episodes=lambda step: 1, **options)
+    run = play(settles, train=(5.0,), deploy=(5.0,), updates=100, episodes=lambda step: 2, **options)
     return [update for update, noise in enumerate(run.noise, start=1) if noise > 0.0]
 
 
@@ -423,7 +423,7 @@ def test_what_noise_does_to_the_costs_is_not_taken_for_being_stuck() -> None:
 
 
 def test_literally_noise_follows_noise_for_ever() -> None:
-    kicks = kicked_at(preset="paper", window=5)
+    kicks = kicked_at(preset="paper", window=10)  # five updates of two episodes
     assert kicks[0] == 10
     assert len(kicks) > 10
 
@@ -512,7 +512,10 @@ def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
     config = DynamicConfig()
     assert not any(is_precise(noisy(8), config) for _ in range(100))
     assert all(is_precise(noisy(100), config) for _ in range(20))
-    assert is_precise(window(9.5, 5.0, episodes=1), config)  # deterministic: one episode says it all
+    assert is_precise(
+        window(9.5, 5.0, episodes=10), config
+    )  # deterministic: no more than the least are needed
+    assert not is_precise(window(9.5, 5.0, episodes=9), config)
     assert not is_precise(WindowStatistics(100, 0, 0.0, (0.0,), (0.0,)), config)
 
 
@@ -536,3 +539,30 @@ def test_a_noisy_agent_is_held_where_it_is_until_a_hundred_episodes_say_that_it_
             episodes_at_change.append(total)
     assert 2 <= changes <= 6
     assert episodes_at_change[0] >= 2 * 75
+
+
+@pytest.mark.parametrize("unit", ["updates", "episodes"])
+def test_no_decision_comes_from_fewer_than_ten_and_ten_episodes(unit: str, monkeypatch: Any) -> None:
+    """With 4 x 64 steps an update and episodes of 1000, an update has a quarter of an episode."""
+    compared: list[tuple[int, int]] = []
+
+    def recorded(old: WindowStatistics, new: WindowStatistics, **keywords: Any) -> CurriculumStep:
+        compared.append((old.episodes, new.episodes))
+        return decide(old, new, **keywords)
+
+    monkeypatch.setattr("recrl.teachers.dynamic.decide", recorded)
+    generator = np.random.default_rng(2)
+    spec = TeacherSpec(
+        "dynamic", {"window": 5, "window_unit": unit}, CostLimits((200.0,)), CostLimits((25.0,)), 1_000_000
+    )
+    teacher = make_teacher(spec)
+    step, state = teacher.start()
+    for update in range(1, 2000):
+        count = 4 * ((256 * update) // 4000 > (256 * (update - 1)) // 4000)  # four end together
+        episodes = tuple(
+            EpisodeStats(b, Phase.TRAINING, 0, 1000, 10.0, (float(cost),), step.limits, 0.0)
+            for b, cost in enumerate(generator.choice([20.0, 20.0, 20.0, 60.0], count))
+        )
+        step, state = teacher.step(state, ProgressReport(update, 256 * update, episodes))
+    assert compared
+    assert min(map(min, compared)) >= 10

@@ -334,8 +334,10 @@ def test_a_state_of_json_values_is_right() -> None:
 
 
 def test_plain_numbers_are_limits_too() -> None:
-    step = CurriculumStep((2.0, 1))  # type: ignore[arg-type]
+    step = CurriculumStep((2.0, 1), start_limits=[5.0, math.inf])  # type: ignore[arg-type]
     assert step.limits == CostLimits((2.0, 1.0))
+    assert step.start_limits == CostLimits((5.0, math.inf))
+    assert CurriculumStep.from_json(step.to_json()) == step
     assert checked_answer((step, STATE), "mine", 2) == (step, STATE)
 
 
