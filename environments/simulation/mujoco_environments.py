@@ -234,6 +234,7 @@ class MujocoEnv(gymnasium.Env[Any, Any]):
     Attributes:
         family: the tasks.
         options: as given, with defaults.
+        horizon: most steps of an episode.
         cost_names: names of the k costs in ``info["cost"]``, an array [k].
         observation_components: the parts of an observation, in their order.
         batch: a batch of one environment.
@@ -249,6 +250,7 @@ class MujocoEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self._camera = Camera(render_mode, description.make_renderer)
         self.metadata = {**self.metadata, **description.rendering}
+        self.horizon = description.horizon
         self.cost_names = description.cost_names
         self.observation_components = description.components
         self.observation_space, self.action_space = description.spaces
