@@ -40,7 +40,6 @@ from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 Environment = gymnasium.Env[Any, Any]
-FLAGS = (bool, np.bool_)
 SEED_BOUND = 2**31  # exclusive; some simulators take 32-bit signed seeds
 
 
@@ -243,10 +242,9 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 f"{self.cmdp.name}: step must return (observation, reward, terminated, truncated, info), "
                 f"got {_brief(returned)}"
             )
-        if not (isinstance(returned[2], FLAGS) and isinstance(returned[3], FLAGS)):
-            flags = zip(("terminated", "truncated"), returned[2:4], strict=True)
-            name, flag = next((name, flag) for name, flag in flags if not isinstance(flag, FLAGS))
-            raise ValueError(f"{self.cmdp.name}: {name} must be True or False, got {_brief(flag)}")
+        for name, flag in zip(("terminated", "truncated"), returned[2:4], strict=True):
+            if not _is_flag(flag):
+                raise ValueError(f"{self.cmdp.name}: {name} must be True or False, got {_brief(flag)}")
         return returned
 
     def _number(self, reward: Any) -> float:
@@ -325,7 +323,15 @@ def _rows(
 ) -> npt.NDArray[np.float32]:
     """Return the result of a step as one row per environment, for checksums, [B, n + k + 3]."""
     columns = (observations, rewards[:, None], costs, terminated[:, None], truncated[:, None])
-    return np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe")
+    with np.errstate(over="ignore"):  # a number above 3e38 counts as infinite here
+        return np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe")
+
+
+def _is_flag(value: Any) -> bool:
+    """Whether a value is True or False, or 1 or 0 of any numeric type without dimensions."""
+    if isinstance(value, bool | np.bool_):  # almost always
+        return True
+    return isinstance(value, int | np.integer | np.ndarray) and np.ndim(value) == 0 and value in (0, 1)
 
 
 def _are_names(value: object) -> bool:

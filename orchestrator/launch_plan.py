@@ -171,7 +171,7 @@ def make_plan(specs: Sequence[TrialSpec], store: SweepStore, selection: TrialSel
         record = trial.verified_record() if selection.rerun_damaged else trial.record()
         action = _planned_action(record, selection)
         changed = has_other_code(trial, spec)
-        if (changed and selection.rerun_changed) or trial.rerun_path.exists():
+        if (changed and selection.rerun_changed) or trial.rerun_has_begun:
             action = PlannedAction.RERUN
         trials.append(PlannedTrial(spec, action, record, changed))
     orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)

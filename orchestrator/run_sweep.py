@@ -119,10 +119,10 @@ def run_sweep(settings: SweepRunSettings, *, stop: threading.Event) -> SweepResu
         _write_files(settings.grid, specs, store)
         place.publish()
         _leave_none_running(specs, store)  # trials of a launch that died
+        _withdraw_reruns(specs, store)
         plan = make_plan(specs, store, settings.selection)
         settings.watch(plan)
-        with _reruns_requested(plan, store):
-            return _run(settings, plan, stop)
+        return _run(settings, plan, stop)
 
 
 def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> SweepResult:
@@ -132,7 +132,8 @@ def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> Sweep
     patience = HASTY_SYNC_SECONDS
     synced: bool | None = None
     try:
-        _run_trials(settings, plan.to_do, stop)
+        with _reruns_requested(plan, store):
+            _run_trials(settings, plan.to_do, stop)
         after = progress([trial.spec for trial in plan.trials], store)
         settings.finish(after)
         if not stop.is_set():
@@ -149,17 +150,22 @@ def _reruns_requested(plan: Plan, store: SweepStore) -> Iterator[None]:
 
     So a complete trial keeps its results until its new attempt begins, whatever stops the launch.
     """
-    trials = [store.trial(trial.spec) for trial in plan.with_action(PlannedAction.RERUN)]
+    specs = [trial.spec for trial in plan.with_action(PlannedAction.RERUN)]
     try:
-        for trial in trials:
-            trial.request_rerun()
+        for spec in specs:
+            store.trial(spec).request_rerun()
         yield
     finally:
-        for trial in trials:
-            try:
-                trial.withdraw_rerun()
-            except StorageError as error:  # must not hide an earlier error
-                logger.warning("%s", error)
+        _withdraw_reruns(specs, store)
+
+
+def _withdraw_reruns(specs: Sequence[TrialSpec], store: SweepStore) -> None:
+    """Withdraw the requests to run trials again, also those of a launch that died."""
+    for spec in specs:
+        try:
+            store.trial(spec).withdraw_rerun()
+        except StorageError as error:  # must not hide an earlier error
+            logger.warning("%s", error)
 
 
 def _run_trials(settings: SweepRunSettings, specs: Sequence[TrialSpec], stop: threading.Event) -> None:

@@ -12,6 +12,7 @@ from enum import StrEnum
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 
@@ -114,10 +115,14 @@ def progress(specs: Sequence[TrialSpec], store: SweepStore, *, now: float | None
     silence = store.silence_seconds
     trials = []
     for spec in specs:
-        trial = store.trial(spec)
-        record = TrialRecord() if trial.rerun_path.exists() else trial.record()
+        record = shown_record(store.trial(spec))
         trials.append(TrialProgress(spec, display_status(record, now=now, silence_seconds=silence), record))
     return SweepProgress(tuple(trials))
+
+
+def shown_record(trial: TrialStore) -> TrialRecord:
+    """Return a trial's record for display: blank if the trial is to run again from its beginning."""
+    return TrialRecord() if trial.rerun_path.exists() else trial.record()
 
 
 def display_status(record: TrialRecord, *, now: float, silence_seconds: float) -> DisplayStatus:

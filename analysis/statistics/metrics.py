@@ -55,16 +55,19 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
 
     Returns:
         KEY, measure, episodes, exact (whether computed, not sampled), episode_return, episode_return_se,
-        cost_i, cost_i_se (standard errors over the trial's episodes, 0 where exact), trial_id,
-        deploy_limit_i, optimal_return, gap (J*(d_d) minus the return; the regret of a feasible trial), excess
-        (the largest cost_i - d_d,i), feasible, optimal (solved; False where J* is not known).
+        cost_i, cost_i_se (standard errors over the trial's episodes, 0 where exact), trial_id, cpu_seconds
+        (of the trial: MLflow tells its outcome from that of an earlier run), deploy_limit_i, optimal_return,
+        gap (J*(d_d) minus the return; the regret of a feasible trial), excess (the largest cost_i - d_d,i),
+        feasible, optimal (solved; False where J* is not known).
     """
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
     final = _with_exact(_frozen(sweep, costs), sweep.exact)
     measured = pd.concat([_deployment(sweep, costs), final], ignore_index=True)
     complete = sweep.trials[sweep.trials["status"] == TrialState.COMPLETE.value]
     limits = [f"deploy_limit_{i}" for i in range(sweep.num_costs)]
-    rows = measured.merge(complete[[*KEY, "trial_id", *limits, "optimal_return"]], on=list(KEY))
+    rows = measured.merge(
+        complete[[*KEY, "trial_id", "cpu_seconds", *limits, "optimal_return"]], on=list(KEY)
+    )
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
     rows["excess"] = pd.DataFrame(
         {i: rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"] for i in costs_of(rows)}

@@ -83,6 +83,12 @@ class RiverGridEnv(MiniGridEnv):
         reward = GOAL_REWARD if terminated else STEP_REWARD
         return observation, reward, terminated, truncated and not terminated, {"cost": self._costs(action)}
 
+    def render(self) -> Any:
+        """Return the current frame, uint8 [height, width, 3]."""
+        if self.agent_dir is None:
+            raise ValueError(f"{self._task}: call reset before the first frame")
+        return super().render()  # type: ignore[no-untyped-call]
+
     def gen_obs(self) -> npt.NDArray[np.float32]:
         """Return the current observation, a new array."""
         x, y = self.agent_pos

@@ -32,6 +32,7 @@ from recrl.orchestrator.sweep_progress import (
     TrialProgress,
     display_status,
     progress,
+    shown_record,
 )
 
 
@@ -166,7 +167,7 @@ def _runs(store: SweepStore, trial: TrialStore) -> bool:
 
 
 def _status(store: SweepStore, trial: TrialStore) -> DisplayStatus:
-    return display_status(trial.record(), now=time.time(), silence_seconds=store.silence_seconds)
+    return display_status(shown_record(trial), now=time.time(), silence_seconds=store.silence_seconds)
 
 
 def _trial(store: SweepStore, text: str) -> TrialStore:

@@ -6,6 +6,7 @@ commits it, and whether and how it is uploaded to an object store.
 
 from __future__ import annotations
 
+import re
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,20 @@ class TrialFiles:
     def is_local_copy(self) -> bool:
         """Whether the folder is only a local copy of a trial in an object store."""
         return self.pulled_path.exists()
+
+    @property
+    def rerun_folder(self) -> Path | None:
+        """Where the next attempt moves the files of earlier ones; None if that was not requested."""
+        try:
+            name = self.rerun_path.read_bytes().strip()
+        except OSError:
+            return None
+        return self.aside_folder / (name.decode() if re.fullmatch(rb"run-\d{1,9}", name) else "run-unnamed")
+
+    @property
+    def rerun_has_begun(self) -> bool:
+        """Whether an attempt has begun to move the files of earlier ones, but has not finished."""
+        return (place := self.rerun_folder) is not None and place.exists()
 
     def checkpoints(self) -> list[Path]:
         """The checkpoints on disk, newest first."""

@@ -85,11 +85,10 @@ class TrialStore(TrialReader):
 
     def _begin(self, spec: TrialSpec) -> TrialWriter:
         with self.locked():
-            if self.rerun_path.exists():
-                self._set_all_aside()
-            self.checkpoints_folder.mkdir(exist_ok=True)
             self.reserve_path.unlink(missing_ok=True)  # it might be a link
             self.reserve_path.write_bytes(secrets.token_bytes(RESERVE_BYTES))
+            self._set_all_aside_on_request()  # once there is room for an attempt
+            self.checkpoints_folder.mkdir(exist_ok=True)
             self.move_aside(self.error_path)  # the traceback of an earlier attempt
             old = self._salvaged()
             if self.spec_path.name not in old.committed:
@@ -188,33 +187,32 @@ class TrialStore(TrialReader):
                 write_atomically(self.rerun_path, f"run-{number:03d}\n".encode())
 
     def withdraw_rerun(self) -> None:
-        """Withdraw a request of which no attempt has moved anything yet.
+        """Withdraw a request of which no attempt has moved anything yet; nothing if there is none.
 
         Raises:
             StorageError: the disk is gone.
         """
-        with self.writing(), self.locked():
-            if self.rerun_path.exists() and not (self.aside_folder / self._rerun_folder).exists():
-                self.rerun_path.unlink()
+        if self.rerun_path.exists():
+            with self.writing(), self.locked():
+                if not self.rerun_has_begun:
+                    self.rerun_path.unlink(missing_ok=True)
 
-    @property
-    def _rerun_folder(self) -> str:
-        return self.rerun_path.read_text().strip()
-
-    def _set_all_aside(self) -> None:
-        """Move all files of earlier attempts to the folder that ``request_rerun`` named.
+    def _set_all_aside_on_request(self) -> None:
+        """Move all files of earlier attempts to the folder that ``request_rerun`` named, if it was called.
 
         The request goes last, so that the next attempt continues after a kill. The caller holds ``locked``.
         """
+        place = self.rerun_folder
+        if place is None:
+            return
         kept = {self.aside_folder, self.lock_path, self.rerun_path, self.reserve_path}
-        place = self.aside_folder / self._rerun_folder
         place.mkdir(parents=True, exist_ok=True)
         for path in sorted(set(self.folder.iterdir()) - kept):
             path.rename(place / path.name)
         self.rerun_path.unlink()
 
     def set_status(self, status: TrialState, *, error: str = "") -> None:
-        """Set the status of a trial whose process can no longer do so.
+        """Set the status of a trial whose process can no longer do so, or died before its attempt began.
 
         This revokes the lease of any writer.
 
@@ -229,6 +227,7 @@ class TrialStore(TrialReader):
 
     def _set_status(self, status: TrialState, error: str) -> None:
         with self.locked():
+            self._set_all_aside_on_request()
             try:
                 stated = self._stated()
             except DamagedError:

@@ -40,6 +40,7 @@ from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SILENCE_SECONDS
+from recrl.orchestrator.launch_plan import usable_cores
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit
@@ -62,7 +63,7 @@ class RayExecutor:
     """``Executor`` that runs trials in parallel on Ray.
 
     Attributes:
-        num_cpus: cores of the cluster that is started on this machine; all if None.
+        num_cpus: cores of the cluster that is started on this machine; all that this process may use if None.
         address: an existing cluster (``auto``, ``host:port``) to use instead.
         ship_package: whether to send recrl itself to that cluster's nodes.
         cpus_per_trial: cores per trial, above 0; may be a fraction.
@@ -115,7 +116,7 @@ class RayExecutor:
             return nullcontext()
         if self.address:
             return existing_cluster(self.address, ship_package=self.ship_package)
-        return local_cluster(self.num_cpus)
+        return local_cluster(self.num_cpus or usable_cores())
 
     def _run_on_cluster(
         self,

@@ -98,7 +98,9 @@ class DriverWatch(tune.Callback):
             return
         self._refresh(spec)
         files = self._place.store.trial(spec)
-        if not isinstance(cause, TeacherUnavailableError) and not files.record().status.is_finished:
+        is_earlier = files.rerun_path.exists()  # the record is that of the run to replace
+        is_over = files.record().status.is_finished and not is_earlier
+        if not isinstance(cause, TeacherUnavailableError) and not is_over:
             error = shown(process_error(cause, trial.num_failures))
             try:
                 files.set_status(TrialState.FAILED, error=error)

@@ -29,6 +29,7 @@ from typing import Self
 
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.atomic_files import write_atomically, write_json
+from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.remote.commit_format import APPENDED, CHECKPOINT, COMMIT, Commit, Piece, unpack
@@ -137,6 +138,9 @@ class RemoteTrial:
             if pieces is not None:
                 start = pieces[0].start if pieces else 0
                 _place(trial, file, start, b"".join(data[piece] for piece in pieces))
+        for file in before.commit.files.keys() - commit.files.keys():
+            if not CHECKPOINT.fullmatch(file):  # of an attempt before: its traceback, for example
+                (trial.folder / file).unlink(missing_ok=True)
         if any(CHECKPOINT.fullmatch(file) for file in wanted):
             for path in trial.checkpoints():
                 if f"checkpoints/{path.name}" not in wanted:  # of another commit: its rows are not here
@@ -260,6 +264,8 @@ def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
     """Append bytes to a file, or replace the whole file."""
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         raise StorageError(f"{trial.folder}: its object names a file outside it: {name!r}")
+    if name in files_of(FileKind.LOCAL):
+        raise StorageError(f"{trial.folder}: its object names a file of the machine's own: {name!r}")
     path = trial.folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     if start == 0:

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.tracking.positions import file_mark
 
@@ -36,6 +37,7 @@ class FinalOutcome:
         is_feasible: whether every cost is within its limit and the tolerance.
         is_solved: whether it is also near a known optimum.
         exact: whether the values were computed, not sampled.
+        cpu_seconds: CPU time of the trial, by which it is told from an earlier run; None if not known.
     """
 
     trial_id: str
@@ -46,6 +48,7 @@ class FinalOutcome:
     is_feasible: bool
     is_solved: bool
     exact: bool
+    cpu_seconds: float | None = None
 
     @property
     def verdict(self) -> str:
@@ -77,48 +80,61 @@ class FinalOutcomes:
         self._store = store
         self._path = store.figures_folder / FILE_NAME
         self._mark = ""
-        self._written_at = 0.0
         self._found: dict[str, FinalOutcome] = {}  # by trial id, as labels may be those of an earlier grid
 
-    def of(self, spec: TrialSpec) -> FinalOutcome | None:
-        """Return the outcome of a complete trial; None before the file has it, or that of an earlier run."""
-        self._refresh()
-        if spec.trial_id not in self._found:
-            return None
-        record = self._store.trial(spec).record()
-        is_of_this_run = record.status is TrialState.COMPLETE and record.started_at <= self._written_at
-        return self._found[spec.trial_id] if is_of_this_run else None
+    def of(self, spec: TrialSpec, record: TrialRecord) -> FinalOutcome | None:
+        """Return the outcome of a trial; None before the file has it, or if it has that of an earlier run.
 
-    def all(self) -> Sequence[FinalOutcome]:
-        """Return the outcomes of the grid's complete trials, in the report's order."""
+        Args:
+            spec: the trial.
+            record: of the trial.
+        """
         self._refresh()
-        known = {spec.trial_id for spec in self._store.specs() if self.of(spec) is not None}
+        found = self._found.get(spec.trial_id)
+        if found is None or record.status is not TrialState.COMPLETE:
+            return None
+        is_of_this_run = found.cpu_seconds is None or found.cpu_seconds == record.cpu_seconds
+        return found if is_of_this_run else None
+
+    def of_grid(
+        self, specs: Sequence[TrialSpec], records: Mapping[str, TrialRecord]
+    ) -> Sequence[FinalOutcome]:
+        """Return the outcomes of a grid's complete trials, in the report's order.
+
+        Args:
+            specs: the trials of the grid.
+            records: of these trials, by folder name.
+        """
+        self._refresh()
+        known = {it.trial_id for it in specs if self.of(it, records[it.folder_name]) is not None}
         return [outcome for trial_id, outcome in self._found.items() if trial_id in known]
 
     def lack_a_complete_trial(self) -> bool:
         """Whether a complete trial of the grid, whose policy was evaluated, is not in the file."""
-        trials = map(self._store.trial, self._store.specs())
-        complete = (it for it in trials if it.record().status is TrialState.COMPLETE)
-        return any(it.spec.evaluation_episodes and self.of(it.spec) is None for it in complete)
+        evaluated = (spec for spec in self._store.specs() if spec.evaluation_episodes)
+        records = ((spec, self._store.trial(spec).record()) for spec in evaluated)
+        return any(
+            record.status is TrialState.COMPLETE and self.of(spec, record) is None for spec, record in records
+        )
 
     def has_sampled(self) -> bool:
         """Whether an outcome is sampled: its task is not finite, or was not trusted when it was measured."""
-        return not all(outcome.exact for outcome in self.all())
+        self._refresh()
+        return not all(outcome.exact for outcome in self._found.values())
 
     def _refresh(self) -> None:
         try:
             mark = file_mark(self._path)
             if mark == self._mark:
                 return
-            written_at = self._path.stat().st_mtime
             with self._path.open(encoding="utf-8", newline="") as file:
                 rows = [row for row in csv.DictReader(file) if row.get("measure") == MEASURE]
             outcomes = list(map(_outcome, rows))
         except FileNotFoundError:
-            mark, written_at, outcomes = "", 0.0, []
+            mark, outcomes = "", []
         except (KeyError, TypeError, ValueError):  # another version wrote it, or it is being written
             return
-        self._mark, self._written_at = mark, written_at
+        self._mark = mark
         self._found = {outcome.trial_id: outcome for outcome in outcomes}
 
 
@@ -196,6 +212,7 @@ def _outcome(row: Mapping[str, str]) -> FinalOutcome:
         is_feasible=row["feasible"] == "True",
         is_solved=row["optimal"] == "True",
         exact=row["exact"] == "True",
+        cpu_seconds=float(row["cpu_seconds"]) if row.get("cpu_seconds") else None,
     )
 
 

@@ -117,11 +117,12 @@ class Tracker:
             view, self._view = self._view, None  # made anew after any error
             try:
                 view = view or _View(self.store, self.uri, self._write_export, rebuild=rebuild)
-                orphans = self._orphans()
+                listed, silence = self._listed(), self.store.silence_seconds
                 for trial in trials:
+                    known = listed is None or trial.folder.name in listed
                     with _kept(problems, trial):
-                        known = trial.folder.name not in orphans
-                        points.append(view.trials.show(trial, live=live, is_in_grid=known))
+                        sent = view.trials.show(trial, live=live, is_in_grid=known, silence_seconds=silence)
+                        points.append(sent)
                 remark = view.sweep.show(live=live)
             except Exception as error:
                 problems.append(one_line(error))
@@ -138,13 +139,12 @@ class Tracker:
         self._view = None if problems else view
         return report
 
-    def _orphans(self) -> set[str]:
-        """Return the folder names of trials that are not in the last launch's grid."""
+    def _listed(self) -> set[str] | None:
+        """Return the folder names of the last launch's grid; None if the file that lists them is damaged."""
         try:
-            listed = {spec.folder_name for spec in self.store.specs()}
+            return {spec.folder_name for spec in self.store.specs()}
         except DamagedError:  # the parent run's update reports it
-            return set()
-        return {trial.folder.name for trial in self.store.trials()} - listed
+            return None
 
 
 class _View:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialState
-from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
+from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.sweep_progress import DisplayStatus, display_status, shown_record
 from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes, verdict_lines
@@ -60,8 +60,9 @@ class SweepSync:
         Returns:
             The reason why the export file could not be uploaded, or empty.
         """
-        records = self._records()
-        position = self._show_state(self._position, records, live=live)
+        specs = self._store.specs()
+        records = {spec.folder_name: shown_record(self._store.trial(spec)) for spec in specs}
+        position = self._show_state(self._position, specs, records, live=live)
         position = self._runs.send_files(position, [self._store.grid_path, self._store.info_path])
         figures = sorted(self._store.figures_folder.glob("*"))
         position = self._runs.send_files(position, figures, "figures")
@@ -72,7 +73,14 @@ class SweepSync:
         self._save(position)
         return remark
 
-    def _show_state(self, position: Position, records: dict[str, TrialRecord], *, live: bool) -> Position:
+    def _show_state(
+        self,
+        position: Position,
+        specs: Sequence[TrialSpec],
+        records: Mapping[str, TrialRecord],
+        *,
+        live: bool,
+    ) -> Position:
         from mlflow.entities import RunTag  # noqa: PLC0415
 
         now, silence = time.time(), self._store.silence_seconds
@@ -80,13 +88,13 @@ class SweepSync:
             display_status(record, now=now, silence_seconds=silence) for record in records.values()
         )
         status = sweep_run_status(counts, live=live)
-        summaries = filter(None, map(self._summary, map(self._store.trial, self._store.specs())))
+        summaries = filter(None, map(self._summary, map(self._store.trial, specs)))
         text = note(
             self._store.name,
             {status: counts[status] for status in DisplayStatus},
             list(summaries),
             charts=f"#{charts_page(self._runs.experiment_id)}",
-            verdicts=verdict_lines(self._outcomes.all(), self._states(records)),
+            verdicts=verdict_lines(self._outcomes.of_grid(specs, records), _states(specs, records)),
             report=self._report(),
         )
         if position.shown.get("note") != text:
@@ -96,25 +104,24 @@ class SweepSync:
             self._runs.set_status(position.run_id, status, last or time.time())
         return replace(position, shown={**position.shown, "note": text, "status": status})
 
-    def _states(self, records: Mapping[str, TrialRecord]) -> Mapping[tuple[str, str, str], list[TrialState]]:
-        """Return the states of all trials by task, agent and curriculum."""
-        states: dict[tuple[str, str, str], list[TrialState]] = {}
-        for spec in self._store.specs():
-            group = (spec.task.label, spec.agent.label, spec.method.label)
-            states.setdefault(group, []).append(records[spec.folder_name].status)
-        return states
-
     def _report(self) -> str:
         """Return the address of the report in MLflow, or empty before it is drawn."""
         if not (self._store.figures_folder / "report.html").exists():
             return ""
         return f"#{report_page(self._runs.experiment_id, self._runs.parent_id)}"
 
-    def _records(self) -> dict[str, TrialRecord]:
-        """Return the records of the grid's trials by folder name, also of trials that were never started."""
-        return {spec.folder_name: self._store.trial(spec).record() for spec in self._store.specs()}
-
     def _save(self, position: Position) -> None:
         if position != self._position:
             position.write(self._path)
             self._position = position
+
+
+def _states(
+    specs: Sequence[TrialSpec], records: Mapping[str, TrialRecord]
+) -> Mapping[tuple[str, str, str], list[TrialState]]:
+    """Return the states of trials by task, agent and curriculum."""
+    states: dict[tuple[str, str, str], list[TrialState]] = {}
+    for spec in specs:
+        group = (spec.task.label, spec.agent.label, spec.method.label)
+        states.setdefault(group, []).append(records[spec.folder_name].status)
+    return states

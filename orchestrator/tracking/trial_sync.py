@@ -44,19 +44,19 @@ class TrialSync:
     """Sync of trials to their runs; it keeps the sent positions between passes."""
 
     def __init__(self, store: SweepStore, uri: str, runs: SweepRuns, outcomes: FinalOutcomes) -> None:
-        self._store = store
         self._runs = runs
         self._outcomes = outcomes
         self._folder = sync_folder(store, uri)
         self._positions: dict[str, Position] = {}
 
-    def show(self, trial: TrialStore, *, live: bool, is_in_grid: bool) -> int:
+    def show(self, trial: TrialStore, *, live: bool, is_in_grid: bool, silence_seconds: float) -> int:
         """Update the trial's run; return the number of points sent.
 
         Args:
             trial: has begun.
             live: whether a launch runs that will resume waiting trials.
             is_in_grid: whether it is one of the last launch's grid.
+            silence_seconds: of ``SweepStore.silence_seconds``.
 
         Raises:
             DamagedError: a file of the trial differs from its commit.
@@ -64,8 +64,8 @@ class TrialSync:
         record = trial.record()
         if record.status is TrialState.DAMAGED:
             raise DamagedError(record.error)
-        outcome = self._outcomes.of(trial.spec) if record.status is TrialState.COMPLETE else None
-        status = trial_run_status(record, live=live, silence_seconds=self._store.silence_seconds)
+        outcome = self._outcomes.of(trial.spec, record)
+        status = trial_run_status(record, live=live, silence_seconds=silence_seconds)
         shown = _shown(trial, record, outcome, status=status, is_in_grid=is_in_grid)
         position = self._position(trial, record)
         if position.shown == shown:

@@ -159,6 +159,29 @@ def test_the_horizon_is_the_specs_or_else_the_environments(
     assert SyncCMDPVectorEnv("countdown", [build]).cmdp.horizon == horizon
 
 
+@pytest.mark.parametrize("kind", [int, np.int64, np.bool_, np.asarray])
+def test_flags_may_be_numbers_and_rewards_may_be_huge(kind: Any) -> None:
+    class Loose(Countdown):
+        def step(self, action: Any) -> Any:
+            observation, _, terminated, truncated, info = super().step(action)
+            return observation, 1e39, kind(terminated), kind(truncated), info
+
+    def plain() -> SyncCMDPVectorEnv:
+        return SyncCMDPVectorEnv("loose", [Loose])
+
+    environments, reference = plain(), SyncCMDPVectorEnv("countdown", [Countdown])
+    for each in (environments, reference):
+        each.reset(seed=0)
+    for _ in range(5):
+        _, rewards, terminated, truncated, _ = environments.step(np.array([0]))
+        _, _, *flags, _ = reference.step(np.array([0]))
+        assert rewards.tolist() == [1e39]
+        assert [terminated.tolist(), truncated.tolist()] == [flag.tolist() for flag in flags]
+    again = plain()
+    again.reset(seed=0)
+    again.load_state_dict(environments.state_dict())
+
+
 def test_another_number_of_costs_than_named_is_refused() -> None:
     environment = SyncCMDPVectorEnv("countdown", [Countdown], cost_names=("time",))
     environment.reset(seed=0)
@@ -297,7 +320,7 @@ def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
         ),
         ("terminated", "no", "wrong: terminated must be True or False, got str 'no'"),
         ("truncated", None, "wrong: truncated must be True or False, got None"),
-        ("truncated", 1, "wrong: truncated must be True or False, got int 1"),
+        ("truncated", 2, "wrong: truncated must be True or False, got int 2"),
     ],
 )
 def test_what_an_environment_returns_is_looked_at(field: str, value: Any, sentence: str) -> None:

@@ -248,6 +248,8 @@ def test_a_step_or_a_frame_before_reset_is_refused() -> None:
         RiverGridEnv().step(FORWARD)
     with pytest.raises(ValueError, match=r"^rivergrid-1a: call reset before the first frame$"):
         make_vector("rivergrid-1a", 2).render()
+    with pytest.raises(ValueError, match=r"^rivergrid-1a: call reset before the first frame$"):
+        RiverGridEnv(render_mode="rgb_array").render()
 
 
 @pytest.mark.parametrize("identifier", IDENTIFIERS)
@@ -291,7 +293,7 @@ def test_both_environments_draw_the_same_picture() -> None:
         slow.step(action)
         fast.step(np.array([action, LEFT]))
     frames = fast.render()
-    np.testing.assert_array_equal(frames[0], slow.render())  # type: ignore[no-untyped-call]
+    np.testing.assert_array_equal(frames[0], slow.render())
     assert frames[0].shape == (9 * 32, 9 * 32, 3)
     assert frames[0].dtype == np.uint8
 

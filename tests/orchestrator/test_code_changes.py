@@ -1,11 +1,13 @@
 """What code a trial ran is known for each attempt, and results of other code are not mixed without a word."""
 
+import errno
 import importlib
 import json
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -28,8 +30,9 @@ from recrl.orchestrator.provenance.code_changes import (
     other_code,
     other_code_sentence,
 )
+from recrl.orchestrator.ray.tune_callbacks import DriverWatch
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
 
@@ -137,10 +140,89 @@ def test_a_launch_that_cannot_run_leaves_the_results_that_it_was_to_replace(fold
     change(folder)
     with pytest.raises(ClusterError):
         _rerun(grid, store, Broken())
+    assert _is_complete(grid, store)
+
+
+def _is_complete(grid: GridSpec, store: SweepStore) -> bool:
+    """Whether the only trial has its results, and a plain launch would do nothing."""
     (trial,) = progress(grid.trials(), store).trials
-    assert trial.status is DisplayStatus.COMPLETE
-    assert not store.trial(trial.spec).damages()
-    assert not make_plan(grid.trials(), store).to_do
+    is_whole = trial.status is DisplayStatus.COMPLETE and not store.trial(trial.spec).damages()
+    return is_whole and not make_plan(grid.trials(), store).to_do
+
+
+def test_a_launch_that_is_stopped_before_a_rerun_says_that_the_old_results_stay(folder: Path) -> None:
+    class Idle:
+        def run(self, specs: object, place: SweepPlace, stop: threading.Event) -> None:
+            stop.set()
+
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    change(folder)
+    result = _rerun(grid, store, Idle())
+    assert [it.status for it in result.progress.trials] == [DisplayStatus.COMPLETE]
+    assert _is_complete(grid, store)
+
+
+def test_a_request_of_a_killed_launch_is_void_unless_its_attempt_began(folder: Path) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    trial = store.trial(grid.trials()[0])
+    before = trial.episodes_path.read_bytes()
+    trial.request_rerun()
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    assert not trial.rerun_path.exists()
+    assert trial.episodes_path.read_bytes() == before
+    assert not trial.aside_folder.exists()
+
+
+def test_a_disk_without_room_for_an_attempt_leaves_the_results_that_it_was_to_replace(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    change(folder)
+    write = Path.write_bytes
+
+    def full(path: Path, data: bytes) -> int:
+        if path.name == ".reserve":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    _rerun(grid, store, InlineExecutor())
+    assert _is_complete(grid, store)
+
+
+@pytest.mark.parametrize("content", [b"", b"/tmp/elsewhere\n", b"../..\n", b"\xff\xfe"])
+def test_a_damaged_request_leads_nowhere_else(folder: Path, content: bytes) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    trial = store.trial(grid.trials()[0])
+    before = trial.episodes_path.read_bytes()
+    trial.rerun_path.write_bytes(content)
+    trial.begin(trial.spec)
+    assert (trial.aside_folder / "run-unnamed" / "episodes.csv").read_bytes() == before
+    assert not trial.rerun_path.exists()
+
+
+def test_a_rerun_whose_process_dies_before_it_begins_has_failed(folder: Path) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml")
+    change(folder)
+
+    class Dying:
+        def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
+            lost = SimpleNamespace(any_is_gone=lambda: False)
+            watch = DriverWatch(place, None, stop=stop, stop_sign=None, watchdog=None, lost=lost)  # type: ignore[arg-type]
+            config = {"spec": json.dumps(specs[0].to_json())}
+            watch.on_trial_error(
+                0, [], SimpleNamespace(config=config, num_failures=4, pickled_error_file=None)
+            )
+
+    result = _rerun(grid, store, Dying())
+    assert [it.status for it in result.failed] == [DisplayStatus.FAILED]
+    assert "its process failed" in result.failed[0].record.error
+    assert len(list(store.trial(grid.trials()[0]).aside_folder.glob("run-001/episodes.csv"))) == 1
 
 
 @pytest.mark.parametrize("done", range(9))

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 import pytest
 
+from recrl.analysis.data import sweep_data
+from recrl.analysis.report import table_files as sweep_tables
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import TrackingError
@@ -586,20 +588,23 @@ def test_a_trial_of_an_earlier_grid_does_not_get_the_outcome_of_its_namesake(
 
 def test_a_trial_that_ran_again_does_not_keep_the_outcome_of_before(write: Callable[..., SweepStore]) -> None:
     store = write()
-    write_outcomes(store)
+    sweep_tables.write_outcomes(sweep_data.load(store), store.figures_folder)
     outcomes = FinalOutcomes(store)
     trial = trial_titled(store, DYNAMIC)
     before = trial.record()
-    assert outcomes.of(trial.spec) is not None
+    found = outcomes.of(trial.spec, before)
+    assert found is not None
+    assert found.cpu_seconds == before.cpu_seconds > 0.0
     assert not outcomes.lack_a_complete_trial()
+    assert outcomes.of(trial.spec, replace(before, status=TrialState.RUNNING)) is None
+    again = replace(before, cpu_seconds=before.cpu_seconds + 0.25)
+    assert outcomes.of(trial.spec, again) is None
     with trial.locked():
-        trial.write_record(replace(before, started_at=time.time() + 5.0))
-    assert outcomes.of(trial.spec) is None
-    assert [it.group[2] for it in outcomes.all()] == ["none"]
+        trial.write_record(again)
+    specs = store.specs()
+    records = {spec.folder_name: store.trial(spec).record() for spec in specs}
+    assert [it.group[2] for it in outcomes.of_grid(specs, records)] == ["none"]
     assert outcomes.lack_a_complete_trial()
-    with trial.locked():
-        trial.write_record(replace(before, status=TrialState.RUNNING))
-    assert outcomes.of(trial.spec) is None
 
 
 def test_trials_that_left_the_grid_are_averaged_with_none_of_it(write: Callable[..., SweepStore]) -> None:
