@@ -37,7 +37,7 @@ class FinalOutcome:
         is_feasible: whether every cost is within its limit and the tolerance.
         is_solved: whether it is also near a known optimum.
         exact: whether the values were computed, not sampled.
-        cpu_seconds: CPU time of the trial, by which it is told from an earlier run; None if not known.
+        cpu_seconds: CPU time of the trial, which differs from that of an earlier run; None if not known.
     """
 
     trial_id: str
