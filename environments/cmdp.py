@@ -124,14 +124,18 @@ class CostLimits:
             if not value >= 0.0:  # also catches NaN
                 raise ValueError(f"cost limits must be at least 0, got {value}")
 
-    def require(self, number: int, task: str) -> None:
+    def require_one_per_cost(self, num_costs: int, task: str) -> None:
         """Check that there is one limit for each of a task's costs.
+
+        Args:
+            num_costs: k of the task.
+            task: its name, for the error.
 
         Raises:
             ValueError: there is another number of limits.
         """
-        if len(self.values) != number:
-            raise ValueError(f"{task}: there must be one limit per cost, {number}, got {len(self.values)}")
+        if len(self.values) != num_costs:
+            raise ValueError(f"{task}: there must be one limit per cost, {num_costs}, got {len(self.values)}")
 
     def __len__(self) -> int:
         return len(self.values)

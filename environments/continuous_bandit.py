@@ -44,7 +44,7 @@ def continuous_bandit_optimum(name: str, options: ContinuousBanditOptions, limit
     >>> continuous_bandit_optimum("continuous-bandit", ContinuousBanditOptions(), CostLimits((2.5,)))
     7.5
     """
-    limits.require(1, name)
+    limits.require_one_per_cost(1, name)
     best = min(1.0, math.sqrt(limits[0] / options.horizon))
     return options.horizon * (1.0 - (1.0 - best) ** 2)
 

@@ -37,6 +37,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.saved_state import SavedState
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 Environment = gymnasium.Env[Any, Any]
@@ -177,22 +178,23 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         A state from before the checksums is only checked by the last observation.
 
         Raises:
-            ValueError: the replay gave something else: the environment is not determined by its seed and its
-                actions and cannot be resumed.
+            ValueError: the state is damaged, or the replay gave something else. Then the environment is not
+                determined by its seed and its actions, and cannot be resumed.
         """
-        if len(state["episode_seeds"]) != self.num_envs:
-            raise ValueError(
-                f"{self.cmdp.name}: the saved state has {len(state['episode_seeds'])} "
-                f"environments, expected {self.num_envs}"
-            )
+        saved = SavedState(f"{self.cmdp.name}: saved state", state)
+        entries = ("episode_seeds", "episode_actions", *(["checksums"] if "checksums" in state else []))
+        for name in entries:
+            saved.check_number(name, self.num_envs)
+        like = np.zeros((self.num_envs, *(self.single_observation_space.shape or ())), np.float32)
+        self._observations = saved.array("observations", like)
+        generator = saved.generator("generator")
         self._episode_seeds = [int(seed) for seed in state["episode_seeds"]]
         self._episode_actions = [list(actions) for actions in state["episode_actions"]]
-        self._observations = np.array(state["observations"], np.float32)
-        saved = state.get("checksums")
+        expected = state.get("checksums")
         for index in range(self.num_envs):
             if not np.array_equal(self._replayed(index), self._observations[index]):
                 difference = "another observation"
-            elif saved is not None and self._checksums[index] != saved[index]:
+            elif expected is not None and self._checksums[index] != expected[index]:
                 difference = "other observations, rewards, costs or ends on the way"
             else:
                 continue
@@ -200,7 +202,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 f"{self.cmdp.name}: cannot be resumed, because replaying the episode of environment "
                 f"{index} gave {difference}; reset(seed=...) must determine an episode"
             )
-        self.np_random.bit_generator.state = state["generator"]
+        self.np_random.bit_generator.state = generator.bit_generator.state
 
     def _start_episode(self, index: int) -> npt.NDArray[np.float32]:
         self._episode_seeds[index] = int(self.np_random.integers(SEED_BOUND))

@@ -89,14 +89,19 @@ class SavedState:
     def generators(self, name: str, number: int) -> list[np.random.Generator]:
         """Return the generators of ``number`` environments, from the states of their bit generators."""
         self.check_number(name, number)
-        found = self.entry(name)
-        generators = [np.random.Generator(np.random.PCG64(0)) for _ in found]
-        for index, (generator, saved) in enumerate(zip(generators, found, strict=True)):
-            try:
-                generator.bit_generator.state = saved
-            except (KeyError, OverflowError, TypeError, ValueError) as error:
-                raise self.error(f"{name}.{index}", f"must be the state of a PCG64 ({error})") from error
-        return generators
+        return [self._generator(f"{name}.{index}", found) for index, found in enumerate(self.entry(name))]
+
+    def generator(self, name: str) -> np.random.Generator:
+        """Return the generator that all environments share, from the state of its bit generator."""
+        return self._generator(name, self.entry(name))
+
+    def _generator(self, name: str, saved: Any) -> np.random.Generator:
+        generator = np.random.Generator(np.random.PCG64(0))
+        try:
+            generator.bit_generator.state = saved
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
+            raise self.error(name, f"must be the state of a PCG64 ({error})") from error
+        return generator
 
     def check_number(self, name: str, number: int) -> None:
         """Check that a list or an array has an entry for each of ``number`` environments."""

@@ -69,7 +69,7 @@ class TrialSelection:
 
     @property
     def reruns(self) -> bool:
-        """Whether it may include trials that are already complete or failed, but not by ``retry_failed``."""
+        """Whether trials that are complete or have failed may run again from their beginning."""
         return self.rerun_damaged or self.rerun_changed
 
 

@@ -305,8 +305,9 @@ class FiniteVectorEnv(CMDPVectorEnv):
         if not possible[states].all():
             state_index = states[~possible[states]][0]
             raise saved.error("states", f"must be states of an episode under way, got {state_index}")
+        generator = saved.generator("generator")
         self.states, self._elapsed = states, elapsed
-        self.np_random.bit_generator.state = state["generator"]
+        self.np_random.bit_generator.state = generator.bit_generator.state
 
     def _checked(self, actions: npt.NDArray[np.int64]) -> Integers:
         actions = np.asarray(actions)

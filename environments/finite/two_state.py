@@ -87,7 +87,7 @@ def two_state_optimum(name: str, options: TwoStateOptions, limits: CostLimits) -
     >>> two_state_optimum("two-state-2", TwoStateOptions(horizon=10), CostLimits((5.0, 2.0)))
     16.0
     """
-    limits.require(NUM_COSTS[name], name)
+    limits.require_one_per_cost(NUM_COSTS[name], name)
     mine = expected_steps_in_mine(options)
     hasty_or_reckless = min(limits[0], mine)
     reckless = min(hasty_or_reckless, limits[1]) if NUM_COSTS[name] == 2 else 0.0

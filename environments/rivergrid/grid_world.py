@@ -255,7 +255,7 @@ def river_grid_optimum(name: str, options: RiverGridOptions, limits: CostLimits)
     # SciPy takes half a second to import, and trials do not use it.
     from recrl.environments.finite.exact_solver import solve_by_lagrangian  # noqa: PLC0415
 
-    limits.require(len(options.costs), name)
+    limits.require_one_per_cost(len(options.costs), name)
     model = river_cmdp(task_map(name, options), costs=options.costs, horizon=options.horizon)
     try:
         return float(solve_by_lagrangian(model, limits).episode_return)

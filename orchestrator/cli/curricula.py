@@ -99,7 +99,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     for sentence in damaged:
         say(console, f"damaged: {sentence}")
     if not runs:
-        what = "is whole" if len(damaged) == len(specs) else "has a saved policy update yet"
+        what = "is undamaged" if len(damaged) == len(specs) else "has a saved policy update yet"
         raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials {what}")
     say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
     show(pd.concat(summaries), console)

@@ -163,19 +163,19 @@ def verdict_lines(
     """Return the table of verdicts in Markdown, one row per task, agent and curriculum.
 
     Args:
-        outcomes: of all complete trials.
+        outcomes: of the grid's complete trials.
         states: of all trials of the grid, by group.
     """
     if not outcomes:
         return []
     groups: dict[tuple[str, str, str], list[FinalOutcome]] = {group: [] for group in states}
     for outcome in outcomes:
-        groups.setdefault(outcome.group, []).append(outcome)
+        groups[outcome.group].append(outcome)
     heads = ("task", "agent", "curriculum", "verdict", "cost", "limit", "return", "n")
     lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for group, seeds in groups.items():
         costs = [_mean(values) for values in zip(*(it.costs for it in seeds), strict=True)]
-        verdicts = _verdicts(seeds, states.get(group, ()))
+        verdicts = _verdicts(seeds, states[group])
         cells = (verdicts, _listed(costs, digits=3), _listed(seeds[0].limits if seeds else ()))
         earned = _text(_mean([it.episode_return for it in seeds])) if seeds else ""
         lines.append("| " + " | ".join([*group, *cells, earned, str(len(seeds))]) + " |")
@@ -185,7 +185,7 @@ def verdict_lines(
 def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialState]) -> str:
     """Count a group's verdicts: ``solved 2 of 5, infeasible 2 of 5 by up to 0.28, failed 1 of 5``."""
     failed = states.count(TrialState.FAILED)
-    total = max(len(states), len(seeds))  # outcomes may be those of an earlier, larger grid
+    total = len(states)
     parts = []
     for verdict in (SOLVED, FEASIBLE, INFEASIBLE):
         chosen = [it for it in seeds if it.verdict == verdict]

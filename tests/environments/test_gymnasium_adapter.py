@@ -416,3 +416,26 @@ def test_a_users_class_with_keywords_renders_if_it_takes_the_mode(
 def test_a_factory_that_makes_no_environment_is_named() -> None:
     with pytest.raises(ValueError, match=r"^os:getpid must return a Gymnasium environment, got int 3$"):
         SyncCMDPVectorEnv("os:getpid", [lambda: 3])  # type: ignore[list-item, return-value]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"episode_seeds": [1]}, "episode_seeds must be of 2 environments, got 1"),
+        ({"episode_actions": 7}, "episode_actions must be a list or an array, got int"),
+        ({"checksums": [0]}, "checksums must be of 2 environments, got 1"),
+        (
+            {"observations": np.zeros(2, np.float32)},
+            "observations must be float32 of shape (2, 4), got float32 of shape (2,)",
+        ),
+        ({"generator": {}}, "generator must be the state of a PCG64 (state must be for a PCG64 RNG)"),
+    ],
+)
+def test_a_damaged_state_is_refused(changes: dict[str, Any], sentence: str) -> None:
+    environments = SyncCMDPVectorEnv("countdown", [Countdown, Countdown])
+    environments.reset(seed=0)
+    state = environments.state_dict()
+    with pytest.raises(ValueError) as error:
+        environments.load_state_dict({**state, **changes})
+    assert str(error.value) == f"countdown: saved state: {sentence}"
+    environments.load_state_dict(state)

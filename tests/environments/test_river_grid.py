@@ -370,6 +370,7 @@ IMPOSSIBLE = "must be states of an episode under way"
         ({"elapsed": np.array(3)}, "elapsed must be int64 of shape (2,), got int64 of shape ()"),
         ({"elapsed": np.array([-1, 3])}, "elapsed must have numbers that are from 0 to 199, got -1"),
         ({"elapsed": np.array([200, 3])}, "elapsed must have numbers that are from 0 to 199, got 200"),
+        ({"generator": {}}, "generator must be the state of a PCG64 (state must be for a PCG64 RNG)"),
     ],
 )
 def test_a_state_that_no_episode_can_have_is_refused(changes: dict[str, Any], sentence: str) -> None:
