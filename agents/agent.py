@@ -127,7 +127,10 @@ class Averaging(Protocol):
     """An agent whose final policy differs from its behaviour policy; optional for agents."""
 
     def final_policy(self) -> FinalPolicy:
-        """Return the policy that would be deployed now."""
+        """Return the policy that would be deployed now.
+
+        It may share memory with the agent: use it before the agent learns again.
+        """
         ...
 
 
@@ -140,13 +143,16 @@ class Agent(FinalPolicy, Protocol):
         Args:
             rollout: T x B steps collected with the current policy.
             episode_costs: undiscounted costs of the episodes that finished in it, [E, k]. With E = 0 the
-                mean costs are estimated from the steps so far; only a CVaR is unknown until an episode has
-                finished.
+                mean costs are estimated from the steps so far; only a CVaR is unknown until a first episode
+                has finished.
             step: the curriculum's output for this update. Its limits may be infinite. Its policy noise has
                 already been added (``add_noise``). ``EntropyRewarded`` agents use its entropy coefficient.
 
         Returns:
             Metrics, finite or NaN; the keys are the same in every update.
+
+        Raises:
+            ValueError: the number of limits or of episode costs does not fit.
         """
         ...
 

@@ -28,7 +28,7 @@ class Constraints:
         limits: d, [k], possibly infinite.
         gaps: constrained value (the mean undiscounted episode cost, or its CVaR) minus limit, [k]; -inf where
             the limit is infinite, NaN where it is finite and the value is unknown.
-        standard_errors: of the mean episode costs, [k], at least 0; 0 if they are unknown.
+        standard_errors: of the constrained values, [k], at least 0; 0 if they are unknown.
         episode_length: mean steps of an episode, at least 1; NaN if unknown.
     """
 

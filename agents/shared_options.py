@@ -7,10 +7,12 @@ given together with ``preset`` override its values. Without torch, so that valid
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from recrl.environments.options import Options
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -52,10 +54,28 @@ STARTER_AGENTS_MULTIPLIERS: Mapping[str, Any] = {
 }
 
 
-class ActorCriticConfig(BaseModel):
+def require_effect(options: Options, names: Sequence[str], deciding: str) -> None:
+    """Check that options which another one makes ineffective have their defaults.
+
+    Args:
+        options: of an agent.
+        names: the ineffective ones.
+        deciding: the other one, with its value, for the error.
+
+    Raises:
+        ValueError: one of them has another value.
+    """
+    is_paper = getattr(options, "preset", None) == "paper"
+    preset: Mapping[str, Any] = getattr(options, "paper", {}) if is_paper else {}
+    for name in names:
+        value, default = getattr(options, name), type(options).model_fields[name].default
+        if value != preset.get(name, default):
+            raise ValueError(f"{name} has no effect with {deciding}: leave it out, got {value}")
+
+
+class ActorCriticConfig(Options):
     """Settings of all agents with a policy and 1 + k critics."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     paper: ClassVar[Mapping[str, Any]] = STARTER_AGENTS_SETTING
 
     preset: Literal["recommended", "paper"] = Field(
@@ -163,11 +183,11 @@ class ActorCriticConfig(BaseModel):
         description="Decay of the exponential moving average over the policies after each update. The "
         "average is the final policy, for evaluation and export (ours). 0: the last policy (paper).",
     )
-    min_std: NonNegative = Field(
+    min_std: Share = Field(
         default=0.4,
         description="Lower bound of the standard deviations of continuous actions, as a fraction of half "
         "the action's range; of more than two actions, m, it is times sqrt(2 / m). They are raised to it "
-        "after each step of the policy (ours). Under a falling limit a policy without it can become too "
+        "after each update (ours). Under a falling limit a policy without it can become too "
         "certain to change in time. Where the noise itself costs, lower it. 0: no bound (paper).",
     )
     noise_form: Literal["match-mixture", "temperature"] = Field(
@@ -178,7 +198,8 @@ class ActorCriticConfig(BaseModel):
     )
     compaction: bool = Field(
         default=True,
-        description="Evaluate networks once for each distinct observation of a rollout; exact, only faster.",
+        description="Evaluate networks once for each distinct observation of a rollout, which is faster "
+        "(ours). If off, all samples count as distinct, also for minibatch_size.",
     )
 
     @model_validator(mode="before")
@@ -187,6 +208,17 @@ class ActorCriticConfig(BaseModel):
         if isinstance(options, Mapping) and options.get("preset") == "paper":
             return {**cls.paper, **options}
         return options
+
+    @model_validator(mode="after")
+    def _options_have_an_effect(self) -> Self:
+        if self.constraint == "mean":
+            require_effect(self, ["cvar_level"], "constraint: mean")
+        if self.encoder == "none":
+            require_effect(self, ["proximity_scales"], "encoder: none")
+        if self.network is not None:
+            of_ours = ["hidden_sizes", "activation", "initialisation", "last_layer_scale"]
+            require_effect(self, of_ours, "a network of your own")
+        return self
 
 
 class AscentConfig(ActorCriticConfig):
@@ -233,7 +265,7 @@ class RadiusConfig(AscentConfig):
     )
 
 
-class LagrangianConfig(BaseModel):
+class LagrangianConfig(Options):
     """Options of Lagrange multipliers, in addition to those of an ``ActorCriticConfig``."""
 
     multiplier_rule: Literal["projected", "softplus-adam", "proportional-integral"] = Field(
@@ -277,6 +309,15 @@ class LagrangianConfig(BaseModel):
                 f"multiplier_initial must be at most multiplier_maximum, {self.multiplier_maximum}, "
                 f"got {self.multiplier_initial}"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _options_of_the_rule_have_an_effect(self) -> Self:
+        deciding = f"multiplier_rule: {self.multiplier_rule}"
+        if self.multiplier_rule != "proportional-integral":
+            require_effect(self, ["multiplier_proportional"], deciding)
+        if self.multiplier_rule == "softplus-adam":
+            require_effect(self, ["multiplier_maximum"], deciding)
         return self
 
 

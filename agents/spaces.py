@@ -36,15 +36,27 @@ def observation_size(space: gymnasium.Space[Any]) -> int:
 
 
 def unbounded_numbers(space: gymnasium.Space[Any]) -> npt.NDArray[np.bool_]:
-    """Return which components of an observation row have an infinite bound, [n].
+    """Return which components of an observation row lack a bound, [n].
+
+    A bound of ``UNBOUNDED`` or beyond, such as the largest number of a type, is none.
 
     >>> unbounded_numbers(Box(np.float32([0.0, -np.inf]), np.float32([1.0, np.inf]))).tolist()
     [False, True]
     """
     if isinstance(space, Box):
-        unbounded: npt.NDArray[np.bool_] = ~(np.isfinite(space.low) & np.isfinite(space.high)).reshape(-1)
-        return unbounded
+        return ~_has_bounds(*_flat_bounds(space))
     return np.zeros(observation_size(space), np.bool_)
+
+
+def _flat_bounds(space: Box) -> tuple[Floats, Floats]:
+    """The lower and the upper bound of each component, [n] each."""
+    low, high = (np.asarray(bound, np.float64).reshape(-1) for bound in (space.low, space.high))
+    return low, high
+
+
+def _has_bounds(low: Floats, high: Floats) -> npt.NDArray[np.bool_]:
+    has_bounds: npt.NDArray[np.bool_] = (low > -UNBOUNDED) & (high < UNBOUNDED)
+    return has_bounds
 
 
 def observation_rows(space: gymnasium.Space[Any], observations: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
@@ -82,8 +94,8 @@ def action_range(space: Box) -> tuple[Floats, Floats]:
     >>> action_range(Box(np.float32([10.0, -np.inf]), np.float32([20.0, 5.0])))
     (array([15.,  0.]), array([5., 1.]))
     """
-    low, high = (np.asarray(bound, np.float64).reshape(-1) for bound in (space.low, space.high))
-    low, high = np.where((low > -UNBOUNDED) & (high < UNBOUNDED), [low, high], [[-1.0], [1.0]])
+    low, high = _flat_bounds(space)
+    low, high = np.where(_has_bounds(low, high), [low, high], [[-1.0], [1.0]])
     return 0.5 * (low + high), 0.5 * (high - low)
 
 

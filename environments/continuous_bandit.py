@@ -23,17 +23,16 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from recrl.environments.cmdp import CMDPSpec, CostLimits, Floats
+from recrl.environments.options import Options
 from recrl.environments.saved_state import IDENTITY, SavedState, identity
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
 
-class ContinuousBanditOptions(BaseModel):
+class ContinuousBanditOptions(Options):
     """Settings of ``continuous-bandit``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     horizon: int = Field(default=10, ge=1, le=10_000, description="H, steps in an episode (ours).")
 

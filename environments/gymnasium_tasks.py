@@ -13,16 +13,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
+from pydantic import BaseModel, Field, JsonValue, field_validator
 
 from recrl.environments.gymnasium_adapter import Environment, SyncCMDPVectorEnv
+from recrl.environments.options import Options
 from recrl.environments.plugins import check_keywords, import_module, require_trust
 
 
-class GymnasiumOptions(BaseModel):
+class GymnasiumOptions(Options):
     """Settings of the task ``gymnasium``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: str = Field(description="The id registered with Gymnasium, or module:id to import the module first.")
     keywords: dict[str, JsonValue] = Field(

@@ -20,9 +20,10 @@ environment steps, p in [0, 1] the used fraction of B, k the number of costs.
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.options import Options
 from recrl.teachers.teacher import (
     ProgressReport,
     TeacherSpec,
@@ -32,10 +33,8 @@ from recrl.teachers.teacher import (
 )
 
 
-class CoolingConfig(BaseModel):
+class CoolingConfig(Options):
     """The settings of the cooling curriculum."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     temperature: float = Field(
         default=1.0,

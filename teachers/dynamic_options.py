@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from recrl.environments.options import Options
 from recrl.teachers.start_limits import START_FRACTION
 from recrl.teachers.windows import WindowUnit
 
@@ -25,10 +26,8 @@ PAPER = {
 }
 
 
-class DynamicConfig(BaseModel):
+class DynamicConfig(Options):
     """The settings of the dynamic curriculum."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: Literal["recommended", "paper"] = Field(
         default="recommended",

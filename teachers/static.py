@@ -13,9 +13,10 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.options import Options
 from recrl.teachers.start_limits import START_FRACTION, StartMeasurement
 from recrl.teachers.teacher import (
     ProgressReport,
@@ -140,16 +141,12 @@ def _fallen(before: float, after: float) -> float:
     return min(before, after) if math.isclose(before, after, rel_tol=1e-9, abs_tol=1e-9) else after
 
 
-class NoConfig(BaseModel):
+class NoConfig(Options):
     """Settings of a curriculum without options."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
-
-class DecayConfig(BaseModel):
+class DecayConfig(Options):
     """Settings of a decaying curriculum."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     start_fraction: float = Field(
         default=START_FRACTION,

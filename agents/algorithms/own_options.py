@@ -174,6 +174,7 @@ class CRPOConfig(TrustRegionConfig):
         **STARTER_AGENTS_SETTING,
         **STARTER_AGENTS_TRUST_REGION,
         "kl_penalty": 0.0,
+        "tolerance": 0.5,
     }
 
     kl_penalty: NonNegative = Field(

@@ -149,7 +149,15 @@ class RecentEpisodes:
         Args:
             costs: undiscounted, [F, k].
             lengths: steps, [F].
+
+        Raises:
+            ValueError: there are not as many costs as lengths.
         """
+        if len(costs) != len(lengths):
+            raise ValueError(
+                "episode_costs must have one row for each episode that ended in the rollout, "
+                f"{len(lengths)}, got {len(costs)}"
+            )
         if len(costs):
             self._updates.append((costs, lengths))
         while sum(len(each) for each, _ in self._updates[1:]) >= self._window:
@@ -186,7 +194,7 @@ class MeasuredCosts:
     Attributes:
         step_costs: per step, whose sums over an episode are constrained, [T, B, k].
         values: for comparison with the limits, [k]; NaN if unknown.
-        standard_errors: of the mean episode costs, [k], at least 0.
+        standard_errors: of ``values``, [k], at least 0; those of a CVaR for a given value at risk.
         episode_length: mean steps of an episode, at least 1; NaN if unknown.
     """
 
@@ -239,33 +247,32 @@ class MeanCost:
 
 
 class TailCost:
-    """Constraint on the CVaR of the episode cost.
+    """Constraint on the CVaR of the episode cost, over the episodes of the window.
 
     Args:
         level: alpha in [0, 1).
-        num_costs: k.
     """
 
-    def __init__(self, level: float, num_costs: int) -> None:
+    def __init__(self, level: float) -> None:
         self._level = level
-        self._value_at_risk = np.zeros(num_costs)
 
     def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
         """Return the tail costs, and the CVaR if it is within the limit, else a bound on it.
 
-        If no episode finished, the value at risk does not change and the CVaR is unknown.
+        Before a first episode has finished, the value at risk is taken to be 0 and the CVaR is unknown.
 
         Args:
             rollout: the steps.
             episodes: of the window.
             limits: d, [k], possibly infinite.
         """
-        values = np.full_like(limits, np.nan)
-        if episodes.finished:
-            self._value_at_risk = value_at_risk(episodes.costs, self._level)
-        threshold = np.minimum(self._value_at_risk, limits)
-        if episodes.finished:
+        values, at_risk = np.full_like(limits, np.nan), np.zeros_like(limits)
+        if len(episodes.costs):
+            at_risk = value_at_risk(episodes.costs, self._level)
+        threshold = np.minimum(at_risk, limits)
+        if len(episodes.costs):
             values = tail_bound(episodes.costs, threshold, self._level)
+        beyond = np.maximum(episodes.costs - threshold, 0.0) / (1.0 - self._level)
         costs = tail_costs(
             rollout.costs,
             carried=rollout.carried_costs,
@@ -273,12 +280,4 @@ class TailCost:
             threshold=threshold,
             level=self._level,
         )
-        return MeasuredCosts(costs, values, standard_errors(episodes.costs), episodes.mean_length)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The value at risk, [k]."""
-        return {"value_at_risk": self._value_at_risk.copy()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken."""
-        self._value_at_risk = np.array(state["value_at_risk"], np.float64)
+        return MeasuredCosts(costs, values, standard_errors(beyond), episodes.mean_length)

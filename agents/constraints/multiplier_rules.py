@@ -10,9 +10,10 @@ Notation: k costs.
 
 Which to use: ``projected_ascent`` is an integrator, so the cost oscillates about the limit; the proportional
 term of ``proportional_integral`` damps this. Neither winds down below 0 nor, under a positive limit,
-accumulates old violations, so both respond immediately to a changed limit. Under a limit of 0 no gap is
-negative, so their multipliers never fall. ``softplus_adam`` does both; it is here because the paper's
-agents use it.
+accumulates old violations, so both respond immediately to a changed limit. ``softplus_adam`` does both; it is
+here because the paper's agents use it. Under a limit of 0 no gap is negative. Then the multiplier of
+``projected_ascent`` and the integral of ``proportional_integral`` never fall: all cost that the agent can
+avoid is to be avoided.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ def start_projected_ascent(num_costs: int, initial: float) -> dict[str, Floats]:
 
 
 def projected_ascent(
-    state: MultiplierState, gaps: Floats, *, step_size: float | Floats, maximum: float
+    state: MultiplierState, gaps: Floats, *, step_size: float, maximum: float
 ) -> dict[str, Floats]:
     """Take a step of projected dual ascent: lambda <- clip(lambda + step_size (J - d), 0, maximum).
 
     Args:
         state: ``multipliers``.
         gaps: J - d, [k]; -inf where there is no constraint.
-        step_size: multiplier units per unit of episode cost, above 0, one number or [k].
+        step_size: multiplier units per unit of episode cost, above 0.
         maximum: the largest multiplier, possibly infinite.
     """
     return {"multipliers": np.clip(state["multipliers"] + step_size * gaps, 0.0, maximum)}
@@ -110,9 +111,9 @@ def proportional_integral(
     state: MultiplierState,
     gaps: Floats,
     *,
-    largest: float | Floats,
-    proportional: float | Floats,
-    integral: float | Floats,
+    largest: float,
+    proportional: float,
+    integral: float,
     maximum: float,
 ) -> dict[str, Floats]:
     """Take a step of a PI controller of the multiplier, with anti-wind-up (Stooke et al. 2020, algorithm 2).
@@ -132,8 +133,8 @@ def proportional_integral(
     Args:
         state: ``multipliers``, ``integral``.
         gaps: J - d in any unit, [k]; -inf where there is no constraint.
-        largest: the largest violation that counts, in that unit, one number or [k].
-        proportional: K_P, at least 0, multiplier units per unit of the gaps, one number or [k].
+        largest: the largest violation that counts, in that unit.
+        proportional: K_P, at least 0, multiplier units per unit of the gaps.
         integral: K_I, likewise.
         maximum: the largest multiplier, possibly infinite.
     """

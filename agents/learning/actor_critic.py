@@ -84,18 +84,15 @@ class ActorCritic:
         self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
-        self._constraint = (
-            TailCost(config.cvar_level, cmdp.num_costs)
-            if config.constraint == "cvar"
-            else MeanCost(config.constraint_window, cmdp.num_costs)
-        )
+        mean_cost = MeanCost(config.constraint_window, cmdp.num_costs)
+        self._constraint = TailCost(config.cvar_level) if config.constraint == "cvar" else mean_cost
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,
             "average": self._average,
             "critic_optimiser": self._critic_optimiser,
             "value_scale": self._value_scale,
             "recent_episodes": self._recent,
-            "constraint": self._constraint,
+            "mean_cost": mean_cost,
         }
         if taken := sorted(rule.parts.keys() & {"policy", "critics", "generator", *self._parts}):
             raise ValueError(f"a rule's parts need other names than the agent's own, got {', '.join(taken)}")
@@ -125,8 +122,10 @@ class ActorCritic:
         """Improve the policy by the rule, then fit the critics to the rollout.
 
         Raises:
+            ValueError: the number of limits or of episode costs does not fit.
             DivergedError: a reward, a loss or a parameter is not finite.
         """
+        step.limits.require_one_per_cost(self._cmdp.num_costs, self._cmdp.name)
         with self._on_its_device():
             metrics = self._learn(rollout, episode_costs, step)
         self._policy.publish()

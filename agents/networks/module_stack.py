@@ -69,9 +69,11 @@ def perceptron(
 
 
 class ModuleStack:
-    """C separate modules of one kind, each followed by a constant factor.
+    """C separate modules of one kind.
 
-    The factor is 1 at first and not learnt. It makes policies more random and rescales critics (``scale``).
+    ``scale`` makes policies more random and rescales critics. It multiplies the weights of the last layer, if
+    that is a linear one at the end of an ``nn.Sequential``. Any other module is followed by a factor, 1 at
+    first. The factor is learnt: noise of 1 multiplies it by 0, and it must be able to grow again.
 
     Args:
         modules: C of them, without buffers, in evaluation mode.
@@ -81,35 +83,44 @@ class ModuleStack:
     def __init__(self, modules: Sequence[nn.Module], parameters: FlatParameters) -> None:
         self._modules = modules
         self._names = [[name for name, _ in module.named_parameters()] for module in modules]
-        self.num_tensors = sum(map(len, self._names)) + 1
+        self._last_layer = _last_layer(modules[0])
+        num_tensors = sum(map(len, self._names))
         self._values = self._per_module(parameters.tensors)
-        self._slopes = self._per_module(parameters.gradients)
-        self._factors = parameters.tensors[self.num_tensors - 1]
-        self._factor_slopes = parameters.gradients[self.num_tensors - 1]
+        self._factors = None if self._last_layer else parameters.tensors[num_tensors]
+        self._used = num_tensors + (self._factors is not None)
+        self._places = parameters.gradients[: self._used]
+        self._leaves = parameters.tensors[: self._used]
 
     @classmethod
     def shapes(cls, modules: Sequence[nn.Module]) -> list[tuple[int, ...]]:
-        """The shapes of all parameters, module by module, then of the C factors."""
-        return [tuple(each.shape) for module in modules for each in module.parameters()] + [(len(modules),)]
+        """The shapes of all parameters, module by module, then of the C factors, if there are any."""
+        shapes = [tuple(each.shape) for module in modules for each in module.parameters()]
+        return shapes if _last_layer(modules[0]) else [*shapes, (len(modules),)]
 
     def initialise(self) -> None:
-        """Copy the modules' own initial parameters into the block; start with the factor 1."""
+        """Copy the modules' own initial parameters into the block; start with factors of 1."""
         for module, values in zip(self._modules, self._values, strict=True):
             for name, value in module.named_parameters():
                 values[name].copy_(value.detach())
-        self._factors.fill_(1.0)
+        if self._factors is not None:
+            self._factors.fill_(1.0)
 
     def to_module(self) -> nn.Module:
-        """Return a copy of the first network, with its factor."""
+        """Return a copy of the first network, with its factor if it has one."""
         module = copy.deepcopy(self._modules[0])
         with torch.no_grad():
             for name, value in module.named_parameters():
                 value.copy_(self._values[0][name])
-        return _Scaled(module, self._factors[0].detach().cpu().clone())
+        return module if self._factors is None else _Scaled(module, self._factors[0].detach().cpu().clone())
 
     def scale(self, factors: Tensor) -> None:
         """Multiply each network's outputs by a factor, [C] or a scalar."""
-        self._factors.mul_(factors)
+        if self._factors is not None:
+            self._factors.mul_(factors)
+            return
+        for values, factor in zip(self._values, factors.expand(len(self._modules)), strict=True):
+            for name in self._last_layer:
+                values[name].mul_(factor)
 
     def outputs(self, rows: Tensor) -> Tensor:
         """The outputs of every network, [C, U, out]; rows are [U, n]."""
@@ -129,12 +140,16 @@ class ModuleStack:
 
         J v is the derivative by u of (J^T u) . v: two backward sweeps (Pearlmutter 1994 needs one forward).
         """
-        leaves = self._leaves()
-        tangents = [part for parts in self._per_module(change) for part in parts.values()]
+        tangents = list(change[: self._used])
         slope = torch.zeros_like(activations[-1], requires_grad=True)
         with torch.enable_grad(), self._differentiable():
             back = torch.autograd.grad(
-                activations[1], leaves, slope, retain_graph=True, create_graph=True, materialize_grads=True
+                activations[1],
+                self._leaves,
+                slope,
+                retain_graph=True,
+                create_graph=True,
+                materialize_grads=True,
             )
             moved: Tensor = torch.autograd.grad(back, slope, tangents)[0]
         return moved
@@ -147,41 +162,47 @@ class ModuleStack:
             slope: dL / d outputs, [C, U, out].
             add: add to the gradient block instead of replacing it.
         """
-        places = [place for slopes in self._slopes for place in slopes.values()]
         with self._differentiable():
             found = torch.autograd.grad(
-                activations[1], self._leaves(), slope, retain_graph=True, materialize_grads=True
+                activations[1], self._leaves, slope, retain_graph=True, materialize_grads=True
             )
-        for place, gradient in zip(places, found, strict=True):
+        for place, gradient in zip(self._places, found, strict=True):
             place.add_(gradient) if add else place.copy_(gradient)
-        self._factor_slopes.zero_()
 
     def _forward(self, rows: Tensor, parameters: Sequence[Mapping[str, Tensor]]) -> Tensor:
         outputs = [
             functional_call(module, dict(values), (rows,))
             for module, values in zip(self._modules, parameters, strict=True)
         ]
-        return torch.stack(outputs) * self._factors[:, None, None]
+        stacked = torch.stack(outputs)
+        return stacked if self._factors is None else stacked * self._factors[:, None, None]
 
     @contextmanager
     def _differentiable(self) -> Iterator[None]:
         """Let views of the block require gradients only while a graph is made: optimisers write to them."""
-        leaves = self._leaves()
-        for leaf in leaves:
+        for leaf in self._leaves:
             leaf.requires_grad_(True)
         try:
             yield
         finally:
-            for leaf in leaves:
+            for leaf in self._leaves:
                 leaf.requires_grad_(False)
-
-    def _leaves(self) -> list[Tensor]:
-        return [value for values in self._values for value in values.values()]
 
     def _per_module(self, tensors: Sequence[Tensor]) -> list[dict[str, Tensor]]:
         """The first tensors of a block by module and name."""
         rest = iter(tensors)
         return [{name: next(rest) for name in names} for names in self._names]
+
+
+def _last_layer(module: nn.Module) -> list[str]:
+    """The names of the parameters that scale a module's outputs, if its last layer is linear; else none."""
+    own = dict(module.named_parameters())
+    prefix, last = "", module
+    while isinstance(last, nn.Sequential) and len(last):
+        prefix, last = f"{prefix}{len(last) - 1}.", last[-1]
+    names = [prefix + name for name, _ in last.named_parameters()]
+    # A layer that occurs twice has its parameters under its first name only: scaling them would change both.
+    return names if type(last) is nn.Linear and own.keys() >= set(names) else []
 
 
 class _Scaled(nn.Module):

@@ -175,7 +175,7 @@ def _recovery(problem: StepProblem, usable: tuple[int, ...]) -> DualSolution:
     """Return the step towards the nearest feasible point, to the edge of the trust region."""
     weights = projection_weights(problem.gram, problem.violations)
     recovered = tuple(i for i in usable if problem.violations[i] > 0.0)
-    if weights is None:
+    if weights is None or not weights.any():
         index = list(usable)
         lengths = problem.violations[index] / np.sqrt(np.diag(problem.gram)[index])
         worst = usable[int(np.argmax(lengths))]
@@ -200,7 +200,9 @@ def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
     array([0.5])
     """
     usable = [i for i in range(len(excesses)) if gram[i, i] > NO_INFLUENCE]
-    scale = max(float(np.abs(excesses[usable]).max(initial=0.0)), NO_INFLUENCE)
+    lengths = np.sqrt(np.diag(gram)[usable])
+    largest = float((excesses[usable] / lengths).max(initial=0.0))
+    tolerances = FEASIBILITY_TOLERANCE * largest * lengths
     for size in range(len(usable) + 1):
         for binding in itertools.combinations(usable, size):
             index = list(binding)
@@ -210,6 +212,6 @@ def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
             weights = np.zeros_like(excesses)
             weights[index] = np.linalg.solve(block, excesses[index])
             left = (excesses - gram @ weights)[usable]
-            if np.all(weights >= 0.0) and np.all(left <= FEASIBILITY_TOLERANCE * scale):
+            if np.all(weights >= 0.0) and np.all(left <= tolerances):
                 return weights
     return None

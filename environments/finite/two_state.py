@@ -25,20 +25,19 @@ n) / n.
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv
+from recrl.environments.options import Options
 
 CAMP, MINE = 0, 1
 COST_NAMES = ("wear", "noise")
 NUM_COSTS = {"two-state": 1, "two-state-2": 2}
 
 
-class TwoStateOptions(BaseModel):
+class TwoStateOptions(Options):
     """Settings of ``two-state`` and ``two-state-2``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     horizon: int = Field(default=10, ge=2, le=10_000, description="H, steps in an episode (ours).")
     arrival: float = Field(

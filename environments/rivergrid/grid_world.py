@@ -25,10 +25,11 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError, Integers
+from recrl.environments.options import Options
 from recrl.environments.rivergrid.instances import InstanceSettings, draw_instance, quickest_route
 from recrl.environments.rivergrid.maps import (
     GOAL,
@@ -51,10 +52,8 @@ CostName = Literal["river", "turns", "mud"]
 ObservationName = Literal["factored", "joint"]
 
 
-class RiverGridOptions(BaseModel):
+class RiverGridOptions(Options):
     """Options of ``rivergrid-1a`` and ``rivergrid-1b``, and common options of the other RiverGrid tasks."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     horizon: int = Field(
         default=HORIZON, ge=1, le=10_000, description="H, steps after which an episode is truncated (ours)."

@@ -27,8 +27,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from recrl.environments.options import Options
 from recrl.environments.rivergrid.maps import (
     DRY,
     GOAL,
@@ -49,10 +50,8 @@ Tiles = list[list[str]]
 Pose = tuple[int, int, int]  # x, y, heading
 
 
-class InstanceSettings(BaseModel):
+class InstanceSettings(Options):
     """Settings of a generated instance."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     map_seed: int = Field(ge=0, description="Seed of the map; equal settings give equal maps (ours).")
     width: int = Field(default=9, ge=5, le=32, description="Columns, walls included (9 in the paper's maps).")

@@ -17,9 +17,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from recrl.environments.cmdp import ObservationComponent
+from recrl.environments.options import Options
 from recrl.environments.safety_gym.task_definitions import (
     HORIZON,
     LIDAR_RANGE,
@@ -39,10 +40,8 @@ if TYPE_CHECKING:
     from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch, SafetyGymOutcome
 
 
-class SafetyGymOptions(BaseModel):
+class SafetyGymOptions(Options):
     """Settings of all Safety Gym tasks."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cost: Literal["indicator", "per_hazard"] = Field(
         default="indicator",

@@ -15,8 +15,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from recrl.environments.options import Options
 from recrl.environments.simulation.camera import Renderer
 from recrl.environments.simulation.mujoco_environments import (
     Description,
@@ -32,10 +33,8 @@ if TYPE_CHECKING:
 COST_NAMES = ("cost",)
 
 
-class VelocityOptions(BaseModel):
+class VelocityOptions(Options):
     """Settings of all velocity tasks."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     horizon: int = Field(
         default=HORIZON, ge=1, le=HORIZON, description="Steps in an episode (safety-gymnasium: 1,000)."

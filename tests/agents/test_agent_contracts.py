@@ -53,6 +53,14 @@ class Lessons:
         return self.agent.update(rollout, costs, self.step(limit, entropy_coefficient))
 
 
+def without_an_end(rollout: Rollout) -> Rollout:
+    """The steps of a rollout, as if none of them ended an episode."""
+    never = np.zeros_like(rollout.terminated)
+    return replace(
+        rollout, terminated=never, truncated=never, final_observations=rollout.final_observations[:0]
+    )
+
+
 def flattened(tree: Any) -> list[Any]:
     """The leaves of a state, arrays as bytes."""
     if isinstance(tree, dict):
@@ -89,7 +97,7 @@ def test_every_update_returns_the_same_metrics_and_no_infinity(agent: str, task:
         metrics = lessons.update(limit)
         assert not any(math.isinf(value) for value in metrics.values())
         keys.add(tuple(sorted(metrics)))
-    rollout, _ = lessons.collect()
+    rollout = without_an_end(lessons.collect()[0])
     none_finished = lessons.agent.update(rollout, np.empty((0, lessons.num_costs)), lessons.step())
     keys.add(tuple(sorted(none_finished)))
     assert len(keys) == 1
@@ -179,7 +187,7 @@ def test_noise_returns_the_same_metrics_and_keeps_the_agent_learning(agent: str,
     rows = rollout.observations.reshape(-1, rollout.observations.shape[-1])
     keys = {tuple(lessons.agent.add_noise(noise, rows)) for noise in (0.1, 1.0)}
     assert keys == {("noise_scale", "randomness_before", "randomness_after")}
-    assert math.isfinite(lessons.update()["kl"])
+    assert lessons.update()["kl"] > 0.0
 
 
 @every_agent
@@ -268,7 +276,7 @@ def test_a_bound_on_the_worst_episodes_returns_the_same_metrics_and_resumes(agen
     lessons, resumed = (Lessons(agent, "two-state-2", options) for _ in range(2))
     assert set(lessons.update()) == set(Lessons(agent, "two-state-2").update())
     resumed.agent.load_state_dict(decode(encode(lessons.agent.state_dict()), source="memory"))
-    rollout, _ = lessons.collect()
+    rollout = without_an_end(lessons.collect()[0])
     none_finished = np.empty((0, 2))
     expected = lessons.agent.update(rollout, none_finished, lessons.step())
     assert repr(resumed.agent.update(rollout, none_finished, lessons.step())) == repr(expected)

@@ -11,7 +11,14 @@ from recrl.agents.agent import DiscretePolicy, InvertedPolicy
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.errors import UnsupportedSpaceError
 from recrl.agents.registry import make_agent
-from recrl.agents.spaces import action_size, environment_actions, observation_rows, observation_size
+from recrl.agents.spaces import (
+    action_range,
+    action_size,
+    environment_actions,
+    observation_rows,
+    observation_size,
+    unbounded_numbers,
+)
 from recrl.environments.registry import make_vector
 
 CAMP, MINE = [1.0, 0.0], [0.0, 1.0]
@@ -251,3 +258,11 @@ def test_a_rollout_says_what_its_first_episodes_have_cost_before() -> None:
     policy, generator = Constantly(1), np.random.default_rng(0)
     carried = [collector.collect(policy, generator)[0].carried_costs.tolist() for _ in range(3)]
     assert carried == [[[0.0], [0.0]], [[2.0], [2.0]], [[1.0], [1.0]]]
+
+
+@pytest.mark.parametrize("bound", [np.inf, np.finfo(np.float32).max, 1e30])
+def test_a_bound_of_a_types_size_is_none(bound: float) -> None:
+    space = Box(np.array([0.0, -bound, 0.0], np.float32), np.array([1.0, 1.0, bound], np.float32))
+    assert unbounded_numbers(space).tolist() == [False, True, True]
+    middle, half = action_range(space)
+    assert (middle.tolist(), half.tolist()) == ([0.5, 0.0, 0.0], [0.5, 1.0, 1.0])

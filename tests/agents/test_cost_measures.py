@@ -132,17 +132,33 @@ def episodes_of(*costs: float, finished: int | None = None, length: int = 10) ->
 NONE = Episodes(np.empty((0, 1)), np.empty(0, np.int64), finished=0)
 
 
-def test_without_a_finished_episode_the_value_at_risk_stays_and_nothing_is_known() -> None:
-    form = TailCost(0.5, 1)
-    limit = np.array([9.0])
-    form.measure(rollout_of(np.zeros(1)), episodes_of(1.0, 2.0, 3.0), limit)
-    found = form.measure(rollout_of(np.array([1.0, 3.0])), episodes_of(7.0, finished=0), limit)
+@pytest.mark.parametrize("finished", [0, 1, 3])
+def test_the_worst_episodes_are_those_of_the_window_whichever_of_them_are_new(finished: int) -> None:
+    """The value at risk of 1, 2, 3 at level 0.5 is 2: the CVaR is 2 + (1 / 3) / 0.5."""
+    episodes = episodes_of(1.0, 2.0, 3.0, finished=finished)
+    found = TailCost(0.5).measure(rollout_of(np.array([1.0, 3.0])), episodes, np.array([9.0]))
     assert found.step_costs.ravel().tolist() == [0.0, 4.0]
+    assert found.values.tolist() == pytest.approx([2.0 + 2.0 / 3.0])
+
+
+def test_before_a_first_episode_all_cost_counts_and_the_worst_episodes_are_unknown() -> None:
+    found = TailCost(0.5).measure(rollout_of(np.array([1.0, 3.0])), NONE, np.array([9.0]))
+    assert found.step_costs.ravel().tolist() == [2.0, 6.0]
     assert math.isnan(found.values[0])
-    resumed = TailCost(0.5, 1)
-    resumed.load_state_dict(form.state_dict())
-    again = resumed.measure(rollout_of(np.array([1.0, 3.0])), NONE, limit)
-    assert again.step_costs.ravel().tolist() == [0.0, 4.0]
+    assert found.standard_errors.tolist() == [0.0]
+
+
+def test_the_standard_error_is_that_of_the_constrained_value() -> None:
+    """The spread of many estimates of one CVaR, and the mean of the reported standard errors."""
+    generator, level, found = np.random.default_rng(0), 0.9, list[tuple[float, float]]()
+    for _ in range(2_000):
+        costs = generator.exponential(5.0, size=(200, 1))
+        episodes = Episodes(costs, np.ones(200, np.int64), finished=200)
+        each = TailCost(level).measure(rollout_of(np.zeros(1)), episodes, np.array([math.inf]))
+        found.append((each.values[0], each.standard_errors[0]))
+    values, errors = np.array(found).T
+    assert errors.mean() == pytest.approx(values.std(), rel=0.1)
+    assert np.mean(values) == pytest.approx(5.0 * (1.0 + math.log(10.0)), rel=0.03)
 
 
 def test_the_mean_is_that_of_the_episodes_where_enough_finished() -> None:
@@ -269,7 +285,7 @@ def test_the_window_has_the_newest_update_and_earlier_ones_until_it_is_full() ->
 
 def test_where_the_limit_is_violated_all_cost_beyond_it_counts() -> None:
     """All episodes cost 9: the CVaR is flat; cost beyond the limit 5 is not, (9 - 5) / 0.25 beyond 5."""
-    form = TailCost(0.75, 1)
+    form = TailCost(0.75)
     found = form.measure(rollout_of(np.array([4.0, 3.0, 2.0])), episodes_of(9.0, 9.0), np.array([5.0]))
     assert found.step_costs.ravel().tolist() == [0.0, 8.0, 8.0]
     assert found.values.tolist() == [5.0 + 16.0]
@@ -283,7 +299,7 @@ def test_the_bound_is_within_the_limit_exactly_where_the_cvar_is(limit: float) -
     for _ in range(50):
         costs = generator.gamma(1.0, 2.0, size=(20, 1))
         episodes = Episodes(costs, np.ones(20, np.int64), finished=20)
-        values = TailCost(0.7, 1).measure(rollout_of(np.zeros(1)), episodes, np.array([limit])).values
+        values = TailCost(0.7).measure(rollout_of(np.zeros(1)), episodes, np.array([limit])).values
         exact = conditional_value_at_risk(costs, 0.7)
         assert values[0] >= exact[0]
         if exact[0] <= limit:

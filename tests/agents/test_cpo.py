@@ -8,7 +8,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, LocalModel, acceptance
+from recrl.agents.algorithms.crpo import improvement
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
@@ -170,3 +171,73 @@ def test_the_integral_does_not_grow_while_steps_are_rejected(monkeypatch: pytest
     monkeypatch.setattr("recrl.agents.algorithms.cpo.acceptance", lambda *_: lambda: False)
     values = [metrics["violation_integral_0"] for metrics in updates(1.0, 0.05, 3)]
     assert values == pytest.approx([0.05, 0.05, 0.05])
+
+
+def test_the_trust_region_bounds_the_divergence_of_the_new_policy_from_the_old() -> None:
+    policy, batch, advantages = sampled(Box(-1.0, 1.0, (2,)))
+    constraints = Constraints(np.full(2, 10.0), np.zeros(2), np.zeros(2), LENGTH)
+    experience = Experience.of(policy, batch, advantages, constraints)
+    model = LocalModel(policy, experience, advantages)
+    policy.parameters.values[-2:] += 0.7  # the logarithms of the standard deviations
+    policy.parameters.values[:-2] *= 1.1
+    old, new = (
+        torch.distributions.Normal(each.mean, each.log_std.exp())  # type: ignore[union-attr]
+        for each in (experience.old, policy.distribution(batch.unique_observations))
+    )
+    expected = torch.distributions.kl_divergence(old, new).sum(1).mean()
+    assert model.measure()[1] == pytest.approx(float(expected), rel=1e-5)
+
+
+class Measured:
+    """A model whose surrogates are 0 before the step, and given ones after it."""
+
+    def __init__(self, after: list[float], divergence: float) -> None:
+        self.after, self.divergence = np.array(after), divergence
+
+    def start(self) -> Floats:
+        return np.zeros(3)
+
+    def measure(self) -> tuple[Floats, float]:
+        return self.after, self.divergence
+
+
+def is_accepted(
+    after: list[float], violations: list[float], *, recovered: tuple[int, ...] = (), divergence: float = DELTA
+) -> bool:
+    model, nothing = Measured(after, divergence), np.zeros(2)
+    case = StepCase.RECOVERY if recovered else StepCase.CONSTRAINED
+    solution = DualSolution(case, 0.0, nothing, nothing, recovered)
+    active = ActiveConstraints(np.array([0, 1]), np.array(violations))
+    return acceptance(model, active, solution, DELTA)()  # type: ignore[arg-type]
+
+
+def test_a_step_is_accepted_if_the_reward_does_not_fall_and_the_costs_keep_their_limits() -> None:
+    slack = [-0.2, -9.0]
+    assert is_accepted([0.0, 0.2, 8.0], slack)
+    assert not is_accepted([-0.001, 0.0, 0.0], slack)
+    assert not is_accepted([1.0, 0.21, 0.0], slack)
+    assert not is_accepted([1.0, 0.0, 0.0], slack, divergence=1.01 * DELTA)
+
+
+def test_while_a_limit_is_violated_the_reward_may_fall_and_that_cost_may_not_rise() -> None:
+    violated = [0.1, -0.2]
+    assert is_accepted([-1.0, 0.0, 0.2], violated)
+    assert not is_accepted([1.0, 0.001, 0.0], violated)
+    assert not is_accepted([1.0, 0.0, 0.21], violated)
+
+
+def test_recovery_is_accepted_by_the_recovered_costs_and_those_within_their_limits() -> None:
+    assert is_accepted([-1.0, 5.0, -0.1], [0.1, 0.2], recovered=(1,))
+    assert not is_accepted([1.0, -0.1, 0.1], [0.1, 0.2], recovered=(1,))
+    assert not is_accepted([1.0, 0.3, -0.1], [-0.2, 0.2], recovered=(1,))
+
+
+def test_crpos_step_is_accepted_if_what_it_is_for_does_not_get_worse() -> None:
+    def accepted(after: list[float], corrected: int | None, divergence: float = DELTA) -> bool:
+        return improvement(Measured(after, divergence), corrected, DELTA)()  # type: ignore[arg-type]
+
+    assert accepted([0.0, 9.0, 9.0], None)
+    assert not accepted([-0.001, -9.0, -9.0], None)
+    assert accepted([-9.0, 9.0, 0.0], 1)
+    assert not accepted([9.0, -9.0, 0.001], 1)
+    assert not accepted([0.0, 0.0, 0.0], None, 1.01 * DELTA)

@@ -77,6 +77,14 @@ def test_where_constraints_contradict_one_another_recovery_lowers_the_furthest_f
     assert step(solution, NORTH, costs) == pytest.approx(-EAST)
 
 
+def test_a_violation_beside_a_hugely_slack_constraint_is_still_mended() -> None:
+    problem = StepProblem(1.0, np.zeros(2), np.diag([1.0, 1e-5]), np.array([-2.5e6, 1e-3]), 0.01)
+    solution = solve_dual(problem)
+    assert solution.case is StepCase.RECOVERY
+    assert solution.recovered == (1,)
+    assert solution.constraint_weights == pytest.approx([0.0, math.sqrt(2.0 * 0.01 / 1e-5)])
+
+
 def test_a_cost_that_no_step_can_change_is_left_out() -> None:
     costs = np.zeros((1, 2))
     for violation in (-1.0, 1.0):

@@ -61,7 +61,7 @@ class Both:
             for piece in pieces
             for part in (piece[number, :-1].T, piece[number, -1])
         ]
-        return [*ordered, torch.zeros(NETWORKS)]
+        return ordered
 
 
 @pytest.fixture
@@ -85,14 +85,77 @@ def test_outputs_and_derivatives_are_those_of_the_standard_perceptron(both: Both
     )
 
 
-def test_a_factor_scales_the_outputs_and_is_not_learnt(both: Both) -> None:
+def test_scaling_changes_the_last_layer(both: Both) -> None:
     rows = torch.randn(ROWS, SIZES[0])
     before = both.stack.outputs(rows)
     both.stack.scale(torch.tensor([2.0, 0.5]))
     torch.testing.assert_close(both.stack.outputs(rows), before * torch.tensor([2.0, 0.5])[:, None, None])
-    kept = both.stack.activations(rows)
-    both.stack.pull_back(kept, torch.ones_like(kept[-1]))
-    assert both.block.gradients[-1].tolist() == [0.0, 0.0]
+    first = both.fast_block.tensors[0]
+    torch.testing.assert_close(both.block.tensors[0], first[0, :-1].T)
+
+
+def of_no_known_end(num_inputs: int, num_outputs: int) -> nn.Module:
+    """A network whose last layer is not found: it is followed by a factor."""
+    return Ended(with_layer_norm(num_inputs, num_outputs))
+
+
+class Ended(nn.Module):
+    def __init__(self, layers: nn.Module) -> None:
+        super().__init__()
+        self.layers = layers
+
+    def forward(self, rows: Tensor) -> Tensor:
+        outputs: Tensor = self.layers(rows)
+        return outputs
+
+
+def with_one_layer_twice(num_inputs: int, num_outputs: int) -> nn.Module:
+    """The scale of its last layer is that of its first one."""
+    layer = nn.Linear(num_inputs, num_outputs)
+    return nn.Sequential(layer, nn.Tanh(), layer)
+
+
+@pytest.mark.parametrize("factory", [of_no_known_end, with_one_layer_twice])
+def test_a_factor_scales_other_networks_and_is_learnt(factory: Callable[[int, int], nn.Module]) -> None:
+    torch.manual_seed(2)
+    modules = [factory(3, 3) for _ in range(2)]
+    block = FlatParameters(ModuleStack.shapes(modules))
+    stack = ModuleStack(modules, block)
+    stack.initialise()
+    rows, slope = torch.randn(ROWS, 3), torch.randn(2, ROWS, 3)
+    before = stack.outputs(rows)
+    stack.scale(torch.tensor([2.0, 0.0]))
+    torch.testing.assert_close(stack.outputs(rows), before * torch.tensor([2.0, 0.0])[:, None, None])
+    stack.pull_back(stack.activations(rows), slope)
+    torch.testing.assert_close(block.gradients[-1], (before * slope).sum(dim=(1, 2)))
+    change = torch.zeros_like(block.values)
+    change[-2:] = torch.tensor([3.0, 4.0])
+    moved = stack.output_change(stack.activations(rows), block.pieces(change))
+    torch.testing.assert_close(moved, before * torch.tensor([3.0, 4.0])[:, None, None])
+    torch.testing.assert_close(stack.to_module()(rows), 2.0 * before[0])
+
+
+@pytest.mark.parametrize("noise_form", ["match-mixture", "temperature"])
+@pytest.mark.parametrize(
+    "options",
+    [{"activation": "tanh"}, {"activation": "relu"}, OWN, {"network": f"{__name__}:of_no_known_end"}],
+    ids=["tanh", "relu", "own", "no-known-end"],
+)
+def test_a_policy_that_noise_made_uniform_learns_again(options: dict[str, Any], noise_form: str) -> None:
+    environments = make_vector("two-state", 8)
+    settings = {"noise_form": noise_form, **options}
+    agent = make_agent("ppo-lag", environments.cmdp, settings, np.random.SeedSequence(7))
+    collector, generator = Collector(environments, num_steps=20), np.random.default_rng(2)
+    collector.reset(seed=1)
+    rollout, _ = collector.collect(agent, generator)
+    agent.add_noise(1.0, rollout.observations.reshape(-1, rollout.observations.shape[-1]))
+    entropies = []
+    for _ in range(30):
+        rollout, episodes = collector.collect(agent, generator)
+        metrics = agent.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits((1e6,))))
+        entropies.append(metrics["entropy"])
+    assert entropies[0] == pytest.approx(np.log(2.0), abs=0.02)
+    assert entropies[-1] < 0.5
 
 
 def trained(agent: str, task: str, options: dict[str, Any], *, updates: int = 3) -> Any:

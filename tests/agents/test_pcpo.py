@@ -203,6 +203,15 @@ def test_crpos_steps_are_as_long_as_the_trust_region_far_from_limits_and_without
     assert crpo_sizes([-1.0, 0.0], 0.01, 0.0) == pytest.approx((1.0, 1.0))
 
 
+def test_a_limit_beyond_the_reach_of_crpos_step_does_not_shorten_it() -> None:
+    """A second cost with the gradient (0, 1): with both at hand nothing is left to gain, with one 0.8 is."""
+    g, costs = np.array([0.6, 0.8]), np.eye(2)
+    config = CRPOConfig(kl_penalty=1.0)
+    for second, left in ((-0.5, 0.0), (-1.5, 0.8)):
+        problem = StepProblem(1.0, -costs @ g, costs @ costs.T, np.array([-0.06, second]), 0.5)
+        assert reward_step(problem, config).gradient_weight == pytest.approx(0.06 / 0.6 + left / 2.0)
+
+
 def test_crpo_rests_where_nothing_can_be_changed() -> None:
     nothing = StepProblem(0.0, np.zeros(1), np.zeros((1, 1)), np.array([0.1]), 0.5)
     assert reward_step(nothing, CRPOConfig()).gradient_weight == 0.0

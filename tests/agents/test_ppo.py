@@ -13,7 +13,7 @@ from recrl.agents.algorithms.ppo import ProximalPolicyOptimisation
 from recrl.agents.algorithms.trpo import TrustRegionPolicyOptimisation, trust_region_step
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.advantages import penalised_advantages
-from recrl.agents.learning.distributions import Categorical
+from recrl.agents.learning.distributions import Categorical, Distribution, mean_divergence
 from recrl.agents.learning.gradient_ascent import (
     Objective,
     gradient_ascent,
@@ -179,3 +179,22 @@ def test_the_lagrangians_advantages_are_the_ones_computed_by_hand() -> None:
     rewards, costs = np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.0, 4.0]])
     found = penalised_advantages(rewards, costs, np.array([1.0, 2.0]))
     assert found.tolist() == [-0.25, -2.25]
+
+
+def test_the_ascent_stops_by_the_divergence_of_the_new_policy_from_the_old(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    policy, batch, advantages = sampled(SPACES[1])
+    experience = Experience.of(
+        policy, batch, advantages, Constraints(np.zeros(2), np.zeros(2), np.zeros(2), 10.0)
+    )
+    compared = []
+
+    def spied(old: Distribution, new: Distribution, weights: torch.Tensor) -> torch.Tensor:
+        compared.append(old is experience.old and new is not experience.old)
+        return mean_divergence(old, new, weights)
+
+    monkeypatch.setattr("recrl.agents.learning.gradient_ascent.mean_divergence", spied)
+    rule_of("ppo", policy).improve(policy, experience, np.random.default_rng(0))
+    assert compared
+    assert all(compared)

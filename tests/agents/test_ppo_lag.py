@@ -53,7 +53,8 @@ def test_the_multiplier_answers_before_the_policy_moves() -> None:
 
 @pytest.mark.parametrize("rule", ["projected", "proportional-integral"])
 def test_equal_shares_of_the_limit_have_equal_multipliers_whatever_the_limit(rule: str) -> None:
-    options = {"multiplier_rule": rule, "multiplier_step": 0.02, "multiplier_proportional": 0.0}
+    without_proportion = {"multiplier_proportional": 0.0} if rule == "proportional-integral" else {}
+    options = {"multiplier_rule": rule, "multiplier_step": 0.02, **without_proportion}
     found = [improved(share * 2.0, share, **options)["multiplier_0"] for share in (1.0, 5.0, 25.0)]
     # Twice the limit too much; the integral sums up one limit at most.
     assert found == pytest.approx([0.04 * EXCHANGE if rule == "projected" else 0.02 * EXCHANGE] * 3)

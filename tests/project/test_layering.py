@@ -15,7 +15,7 @@ NAMES = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILE
 # For each package, what its modules may import of ours; a package's own modules are always allowed.
 ALLOWED = {
     "environments": (),
-    "teachers": ("recrl.environments.cmdp", "recrl.environments.plugins"),
+    "teachers": ("recrl.environments.cmdp", "recrl.environments.options", "recrl.environments.plugins"),
     "agents": ("recrl.environments",),
     "analysis": (
         "recrl.environments",
