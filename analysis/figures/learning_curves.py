@@ -33,8 +33,7 @@ DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
 LEAST_SHOWN = 0.2  # of a limit, above and below it
 LEAST_SHOWN_RETURN = 2.0 * SOLVED_GAP  # above and below J*(d_d)
-LINE_BELOW_LINE = 0.035  # of a panel's height, between the marks of two curricula's infinite limits
-SIGN_BESIDE_SIGN = 8.0  # points, between their signs of infinity
+LINE_BELOW_LINE = 0.07  # of a panel's height, between the marks of two curricula's infinite limits
 
 
 def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN) -> Figure:
@@ -261,17 +260,7 @@ def _mark_infinite_limits(axes: Axes, last: float, style: MethodStyle, *, number
     edge = axes.get_xaxis_transform()
     height = 1.0 - LINE_BELOW_LINE * number
     axes.plot([0.0, last], [height, height], **style.line, transform=edge, clip_on=False)
-    axes.annotate(
-        "∞",
-        (last, height),
-        xycoords=edge,
-        xytext=(3.0 + SIGN_BESIDE_SIGN * number, 0.0),
-        textcoords="offset points",
-        color=style.colour,
-        va="center",
-        fontsize=9.0,
-        annotation_clip=False,
-    )
+    axes.text(last, height, " ∞", color=style.colour, va="center", fontsize=9.0, transform=edge)
 
 
 def _column_titles(suffixes: Sequence[str]) -> list[str]:

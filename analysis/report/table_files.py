@@ -40,7 +40,9 @@ SUMS_NOTE = (
     "Sums over the policies of the training phase, one expected episode each; means over n seeds. A policy "
     "without a finished episode counts with the cost of the one before. Limits in force: the sum of the "
     "limits that the curriculum set, and of the measured cost where the limit was infinite. Net above: the "
-    "cost minus these limits, or minus the deployment limit; negative below."
+    "cost minus these limits, or minus the deployment limit; negative below. Positive parts: only the "
+    "policies whose measured mean is above the limit in force; biased upwards where few episodes end per "
+    "policy."
 )
 BOUND_NOTES = {
     "bound": "Bound: if every update solves CPO's problem (CPO only).",
@@ -171,7 +173,10 @@ def _claims(weighed: pd.DataFrame) -> ShownTable:
 def _bounds(costs: pd.DataFrame, suffix: str) -> ShownTable:
     """Return the cumulative cost of training, with the bounds that are known."""
     table = bound_table(costs)
-    notes = [SUMS_NOTE, *(note for title, note in BOUND_NOTES.items() if title in table)]
+    notes = [
+        SUMS_NOTE,
+        *(note for title, note in BOUND_NOTES.items() if title in table),
+    ]
     heading = COST_AND_BOUNDS if len(notes) > 1 else COST_AND_LIMITS
     which = f" (cost{suffix})" if suffix else ""
     return ShownTable(f"{heading}{which}", table, " ".join(notes))

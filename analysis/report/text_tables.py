@@ -18,6 +18,7 @@ SUM_COLUMNS = {
     "cost": "cost_sum",
     "limits in force": "limit_sum",
     "net above limits in force": "over_limits_sum",
+    "positive parts": "overshoot_sum",
     "net above the limit": "over_deploy_sum",
 }
 BOUND_COLUMNS = {
@@ -92,6 +93,7 @@ def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
         line = dict(zip(("task", "agent", "curriculum"), map(str, group), strict=True))
         line |= {"n": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
+        line["episodes per policy"] = number(float(runs["episodes_per_policy"].mean()))
         for title, name in (*SUM_COLUMNS.items(), *known):
             line[title] = number(float(runs[name].mean()))
         lines.append(line)
@@ -105,7 +107,8 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
         limit = float(row["largest_train_limit"])
         lines.append(
             dict(zip(("task", "agent", "curriculum"), (str(row[name]) for name in GROUP), strict=True))
-            | {"above its limit, per policy": number(row["over_limit"])}
+            | {"episodes per policy": number(row["episodes_per_policy"])}
+            | {"overshoot per policy": number(row["overshoot"])}
             | {"net above d_d, worst run": number(row["measured_over_deploy"])}
             | {"d_t of the runs": number(row["used_train_limit"])}
             | {"largest d_t": "any" if math.isinf(limit) else "none" if math.isnan(limit) else number(limit)}

@@ -9,14 +9,15 @@ Undiscounted (the unit of all limits here), one row per trial:
     limit_sum        sum_b D_b, the limits in force (the cost itself where they were infinite)
     over_limits_sum  cost_sum - limit_sum, the net cost above the limits in force
     over_deploy_sum  cost_sum - n d_d, the net cost above the deployment limit
+    overshoot_sum    sum_b max(0, C_b - D_b), the positive parts of the measured means above the limits
     bound            H c_max + sum_{b<n} min(D_b + excess_b, H c_max), an upper bound on the expected cost of
                      the n policies if every update solves CPO's problem: policy b + 1 solves the problem
                      with limit D_b (``bounds.undiscounted_excess``), the first policy solves none
     ceiling_sum      n H c_max, the trivial bound of n policies
 
-The two net costs are negative if the policies cost less than their limits. Policies below a limit count
-against policies above it. A sum of max(0, C_b - D_b) would not do that, but C_b is a mean of few episodes, so
-that sum is far above 0 even if every policy has exactly the cost of its limit.
+In the two net costs, policies below a limit count against policies above it, so they may be negative. In
+``overshoot_sum`` they do not, but it is biased upwards. C_b is a mean of few episodes, so the sum is far
+above 0 even if the expected cost of every policy is that of its limit.
 
 If no episode ends while a policy is in use, its C_b is that of the policy before. At the beginning of
 training it is that of the first policy with an episode. ``metrics.training_totals`` counts the others.
@@ -174,8 +175,8 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
     """Return the largest d_t within a budget of cost above d_d: one row per GROUP with a bound.
 
     This is the inverse of Proposition 1 (``bounds.largest_train_limit``). The proven excess of an update is
-    too large for any budget. So every policy is assumed to cost as much above its limit as the policies of
-    the group's worst run on average, and at least the limit.
+    too large for any budget. So the measured mean overshoot of the group's worst run is used. With few
+    episodes per policy it is too large (see the module), and the returned limit too small.
 
     Args:
         rows: of ``cumulative_costs``.
@@ -183,7 +184,7 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
         budget: expected net cost above d_d, summed over all episodes of a training phase, at least 0.
 
     Returns:
-        GROUP, policies, episodes_per_policy, over_limit (assumed, per policy); used_train_limit (the largest
+        GROUP, policies, episodes_per_policy, overshoot (assumed, per policy); used_train_limit (the largest
         of the runs); measured_over_deploy (of the worst run, over all episodes); largest_train_limit (NaN if
         d_t = d_d exceeds the budget, infinite if d_t does not matter).
     """
@@ -195,18 +196,18 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
         if (curriculum := names[str(group[2])]) not in MEAN_WEIGHTS:
             continue
         policies, episodes = int(runs["policies"].iloc[0]), float(runs["episodes_per_policy"].mean())
-        over_limit = max(0.0, float((runs["over_limits_sum"] / runs["policies"]).max()))
+        overshoot = float((runs["overshoot_sum"] / runs["policies"]).max())
         deploy = float(runs["deploy_limit"].iloc[0])
         allowed = policies * deploy + budget / episodes
         try:
             limit = largest_train_limit(
-                curriculum, allowed, deploy, excesses=[over_limit] * policies, clock="start"
+                curriculum, allowed, deploy, excesses=[overshoot] * policies, clock="start"
             )
         except ValueError:  # less than the bound for d_t = d_d
             limit = math.nan
         lines.append(
             dict(zip(GROUP, group, strict=True))
-            | {"policies": policies, "episodes_per_policy": episodes, "over_limit": over_limit}
+            | {"policies": policies, "episodes_per_policy": episodes, "overshoot": overshoot}
             | {"used_train_limit": float(runs["train_limit"].max())}
             | {"measured_over_deploy": float((runs["over_deploy_sum"] * runs["episodes_per_policy"]).max())}
             | {"largest_train_limit": limit}
@@ -273,6 +274,7 @@ def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:
         "limit_sum": float(limits.sum()),
         "over_limits_sum": float((costs - limits).sum()),
         "over_deploy_sum": float((costs - deploy).sum()),
+        "overshoot_sum": float(np.maximum(costs - limits, 0.0).sum()),
         "bound": _sum(policies["bound"]),
         "ceiling_sum": _sum(policies["ceiling"]),
         "discounted_excess_sum": _sum(policies["discounted_excess"]),

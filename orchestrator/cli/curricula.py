@@ -55,9 +55,9 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
         show(text_tables.admissible_table(allowed), console)
         say(
             console,
-            "An estimate, not a bound: each policy is taken to exceed its limit by the mean excess of the "
-            "worst run. "
-            "Curricula whose limits are not known in advance are left out.",
+            "An estimate, not a bound: each policy is taken to exceed its limit as in the worst run. That "
+            "overshoot is the positive part of each update's sampled mean. With few episodes per policy it "
+            "is too large, and d_t too small. Curricula whose limits are not known in advance are left out.",
         )
     return ExitCode.OK
 
