@@ -1,7 +1,7 @@
 """Return against cost of the final policies, with the limit and the best return J*(d).
 
-The region above the limit is shaded. A policy in it may be feasible within the tolerance, and one outside may
-exceed the limit of another cost, so only the fill of a mark says what is feasible. No policy lies above the
+The region above the limit is shaded. A policy in it may be feasible within the tolerance. One outside may
+exceed the limit of another cost. So only the fill of a mark says what is feasible. No policy lies above the
 frontier, except by the sampling error of episodes.
 
 The points are the stochastic final policies (``Measure.STOCHASTIC``), exact if the task is finite. The

@@ -83,7 +83,7 @@ def training_totals(sweep: Sweep) -> pd.DataFrame:
     Returns:
         KEY, episodes, steps; cost_i_total (the paper's SUM-J_C,i: all cost of training, within the limit or
         not); excess_i_total (its part above d_d, episode by episode); updates_with_cost_i (policy updates in
-        which an episode ended, so that there is a mean cost); updates_over_i (those of them with a mean cost
+        which an episode ended, so that there is a mean cost); updates_over_i (such updates with a mean cost
         above the limit in force).
     """
     trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
