@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.labels import KEY
+from recrl.analysis.data.labels import KEY, listed
 from recrl.environments.cmdp import Floats
 from recrl.environments.finite.exact_solver import evaluate_policy
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv
@@ -21,6 +21,8 @@ from recrl.environments.registry import find_task, make_vector, task_options
 from recrl.orchestrator.errors import USERS_ERRORS
 
 STOCHASTIC, DETERMINISTIC = "stochastic", "deterministic"
+MISFIT = "policy tables that do not fit their task, so that the values are sampled"
+NAMED = 3  # largest number of trials in a note
 
 
 def exact_values(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]) -> pd.DataFrame:
@@ -32,13 +34,13 @@ def exact_values(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]
 
     Returns:
         KEY, policy (STOCHASTIC or DETERMINISTIC), episode_return, cost_i. Tables that do not fit their
-        model are left out.
+        model are left out (``misfit_note``).
     """
     lines = []
     for key, run in policies.groupby(list(KEY), observed=True, sort=False):
         labels = dict(zip(KEY, key, strict=True))
         model = models.get(str(labels["task"]))
-        table = None if model is None else _table(run, model)
+        table = None if model is None else policy_table(run, model)
         if model is None or table is None:
             continue
         for policy, probabilities in ((STOCHASTIC, table), (DETERMINISTIC, _greedy(table))):
@@ -46,6 +48,22 @@ def exact_values(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]
             costs = {f"cost_{i}": float(cost) for i, cost in enumerate(value.costs)}
             lines.append({**labels, "policy": policy, "episode_return": value.episode_return, **costs})
     return pd.DataFrame(lines, columns=None if lines else [*KEY, "policy", "episode_return"])
+
+
+def misfit_note(policies: pd.DataFrame, models: Mapping[str, FiniteCMDP | None]) -> str:
+    """Name the trials whose policy table does not fit their task; empty if there are none.
+
+    Args:
+        policies: of a ``Sweep``.
+        models: as for ``exact_values``.
+    """
+    titles = []
+    for key, run in policies.groupby(list(KEY), observed=True, sort=False):
+        labels = dict(zip(KEY, key, strict=True))
+        model = models.get(str(labels["task"]))
+        if model is not None and policy_table(run, model) is None:
+            titles.append("{task} {agent} {method} seed {seed}".format(**labels))
+    return f"{MISFIT}: {listed(titles, NAMED)}" if titles else ""
 
 
 def finite_model(name: str, options: Mapping[str, Any]) -> FiniteCMDP | None:
@@ -72,8 +90,13 @@ def _model(name: str, canonical: str) -> FiniteCMDP | None:
     return environment.finite_cmdp() if isinstance(environment, FiniteVectorEnv) else None
 
 
-def _table(run: pd.DataFrame, model: FiniteCMDP) -> Floats | None:
-    """Return pi, [S, A], with rows normalised after rounding; None if it does not fit the model."""
+def policy_table(run: pd.DataFrame, model: FiniteCMDP) -> Floats | None:
+    """Return pi, [S, A], with rows normalised after rounding; None if it does not fit the model.
+
+    Args:
+        run: rows of ``Sweep.policies``, of one trial.
+        model: of the task.
+    """
     columns = [f"action_{j}" for j in range(model.num_actions)]
     if len(run) != model.num_states or not set(columns) <= set(run):
         return None

@@ -2,7 +2,7 @@
 
 A zip archive of plain text, so that any tool can open it:
 
-    sweep.json         name, notes, grid file, the trials (spec, status, provenance), digests of the tables
+    sweep.json         name, notes, grid file, the trials (spec, status, provenance), digests of all members
     phases.csv, ...    the other data frames of ``recrl.analysis.data.sweep_data``;
                        instead of KEY, ``trial`` is the position of the trial in sweep.json
 
@@ -20,22 +20,25 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from recrl.analysis.data.exact_values import DETERMINISTIC, STOCHASTIC
 from recrl.analysis.data.labels import TRIAL
 from recrl.analysis.data.sweep_data import (
     EVENT_COLUMNS,
     PHASE_COLUMNS,
+    PHASE_COST_COLUMNS,
     ROWS,
     Sweep,
     TrialFacts,
     assemble,
     drawn_columns,
 )
+from recrl.environments.cmdp import Phase
 from recrl.orchestrator.errors import DamagedError, RecrlError, missing
 from recrl.orchestrator.files.archives import UNREADABLE, unpacked
 from recrl.orchestrator.files.atomic_files import write_atomically
@@ -59,13 +62,18 @@ REQUIRED = {
     "policies": ("state", "action_0"),
 }
 COSTLY = {
-    "phases": ("cost",),
-    "updates": ("cost", "limit"),
-    "evaluations": ("cost",),
+    "phases": tuple(f"{kind}_{{}}{end}" for kind, end in PHASE_COST_COLUMNS),
+    "updates": ("cost_{}", "limit_{}"),
+    "evaluations": ("cost_{}",),
     "events": (),
     "policies": (),
 }
-TEXTS = ("phase", "policy", "event")
+MEASURED = {  # columns without missing numbers, and those per cost
+    "phases": (("episodes", "episode_return"), ("cost_{}", "cost_{}_total", "excess_{}_total")),
+    "evaluations": (("episode_return",), ("cost_{}",)),
+}
+CHOICES = {"phase": [phase.value for phase in Phase], "policy": [STOCHASTIC, DETERMINISTIC]}
+TEXTS = (*CHOICES, "event")
 OTHER_VERSION = "is a compact file of another version of recrl, or was changed"
 LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every member: the earliest possible in zip
 
@@ -93,7 +101,9 @@ def save(sweep: Sweep, path: Path) -> Path:
             index=False, lineterminator="\n"
         )
     digests = {name: Extent.of(text.encode()).sha256 for name, text in tables.items()}
-    told = json.dumps({**_told(sweep), "digests": digests}, indent=1, allow_nan=False) + "\n"
+    facts = _told(sweep)
+    digests["sweep.json"] = _digest(json.loads(json.dumps(facts, allow_nan=False)))
+    told = json.dumps({**facts, "digests": digests}, indent=1, allow_nan=False) + "\n"
     members = {"sweep.json": told, **tables}
     size = sum(len(text.encode()) for text in members.values())
     if size > MAX_BYTES:
@@ -118,7 +128,7 @@ def load(path: Path) -> Sweep:
 
     Raises:
         OtherVersionError: this version cannot read the content.
-        DamagedError: a table is not what was written.
+        DamagedError: a member is not what was written.
         RecrlError: the file is missing or no zip archive, or unpacks to more than MAX_BYTES.
     """
     names = ("sweep.json", *(f"{name}.csv" for name in ROWS))
@@ -137,15 +147,20 @@ def load(path: Path) -> Sweep:
         raise OtherVersionError(f"{path}: {OTHER_VERSION}: its format must be {FORMAT}, got {found!r:.60}")
     try:
         checked = _SweepFile.model_validate(told)
-        for name, data in zip(names[1:], frames, strict=True):
-            if Extent.of(data).sha256 != checked.digests.get(name):
+        digests = {name: Extent.of(data).sha256 for name, data in zip(names[1:], frames, strict=True)}
+        if "sweep.json" in checked.digests:  # earlier versions wrote none
+            digests["sweep.json"] = _digest(
+                {name: value for name, value in told.items() if name != "digests"}
+            )
+        for name, digest in digests.items():
+            if digest != checked.digests.get(name):
                 raise DamagedError(f"{path}: its {name} is not what was written; export the sweep again")
         facts = [_facts(trial, checked.provenance) for trial in told["trials"]]
+        _check_facts(facts)
         for name, frame in rows.items():
             _check_rows(name, frame, facts)
+        _check_limits(rows["updates"], facts)
         checked_name(checked.name)
-        if any(it.start_limits and len(it.start_limits) != len(it.spec.deploy_limits) for it in facts):
-            raise ValueError("start_limits must be as many as deploy_limits")
     except ValidationError as error:
         place, sentence = next(sentences(error, None))
         where = ".".join(map(str, place))
@@ -181,11 +196,42 @@ class _SweepFile(BaseModel):
     digests: dict[str, str]
 
 
-def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> None:
-    """Check that a data frame has the required columns, and numbers in numeric ones.
+def _check_facts(facts: Sequence[TrialFacts]) -> None:
+    """Check what the specifications of the trials alone do not.
 
     Raises:
-        ValueError: a column is missing or not numeric.
+        ValueError: a trial occurs twice, or has not as many start_limits as limits.
+    """
+    counts = Counter(it.spec.trial_id for it in facts)
+    for it in facts:
+        if counts[it.spec.trial_id] > 1:
+            raise ValueError(f"the trial {it.spec.title} is there {counts[it.spec.trial_id]} times")
+        if it.start_limits and len(it.start_limits) != len(it.spec.deploy_limits):
+            raise ValueError("start_limits must be as many as deploy_limits")
+
+
+def _check_limits(updates: pd.DataFrame, facts: Sequence[TrialFacts]) -> None:
+    """Check that the limits in force in the deployment phase are those of the specifications.
+
+    Raises:
+        ValueError: they are not, beyond the rounding of ``updates``.
+    """
+    deployed = updates[updates["phase"] == Phase.DEPLOYMENT.value] if len(updates) else updates
+    for position, run in deployed.groupby(TRIAL):
+        spec = facts[cast(int, position)].spec
+        for i, limit in enumerate(spec.deploy_limits):
+            if not np.allclose(run[f"limit_{i}"], limit, rtol=10.0 ** (1 - DIGITS)):
+                raise ValueError(
+                    f"{spec.title}: deploy_limits has {limit:g}, but updates.csv has the limit "
+                    f"{run[f'limit_{i}'].iloc[0]:g} in the deployment phase"
+                )
+
+
+def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> None:
+    """Check that a data frame has the required columns, and what the statistics need in them.
+
+    Raises:
+        ValueError: a column is missing or not numeric, or has unknown words or missing numbers.
     """
     columns = list(map(str, rows))
     if TRIAL not in columns:
@@ -193,15 +239,28 @@ def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> N
     if not len(rows):
         return
     costs = max(len(it.spec.deploy_limits) for it in facts) if facts else 0
-    for column in (*REQUIRED[name], *(f"{kind}_{i}" for kind in COSTLY[name] for i in range(costs))):
+    for column in (*REQUIRED[name], *(it.format(i) for it in COSTLY[name] for i in range(costs))):
         if column not in columns:
             raise ValueError(f"{name}.csv has no column {column!r}")
     for column in columns:
         if column not in TEXTS and not pd.api.types.is_numeric_dtype(rows[column].dtype):
             raise ValueError(f"{name}.csv: the column {column!r} must hold numbers")
+        if column in CHOICES and not rows[column].isin(CHOICES[column]).all():
+            raise ValueError(f"{name}.csv: the column {column!r} must hold {' or '.join(CHOICES[column])}")
     trials = rows[TRIAL].to_numpy()
     if trials.dtype.kind != "i" or trials.min() < 0 or trials.max() >= len(facts):
         raise ValueError(f"{name}.csv: the column {TRIAL!r} must be positions from 0 to {len(facts) - 1}")
+    num_costs = np.array([len(it.spec.deploy_limits) for it in facts])[trials]
+    always, per_cost = MEASURED.get(name, ((), ()))
+    for i in range(costs):
+        for column in (*always, *(it.format(i) for it in per_cost)):
+            if not np.isfinite(rows.loc[num_costs > i, column]).all():
+                raise ValueError(f"{name}.csv: the column {column!r} lacks numbers")
+
+
+def _digest(facts: dict[str, Any]) -> str:
+    """Return the digest of everything in sweep.json besides the digests."""
+    return Extent.of(json.dumps(facts, sort_keys=True).encode()).sha256
 
 
 def _told(sweep: Sweep) -> dict[str, Any]:

@@ -46,11 +46,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.exact_values import exact_values, finite_model
+from recrl.analysis.data.exact_values import MISFIT, exact_values, finite_model, misfit_note
 from recrl.analysis.data.labels import DOUBLES, GROUP, KEY, TRIAL, keys_of
 from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.analysis.data.phase_totals import phase_totals
 from recrl.environments.cmdp import Phase
+from recrl.environments.finite.finite_cmdp import FiniteCMDP
 from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
@@ -172,14 +173,16 @@ class Sweep:
         return {label: it.spec.task.options for label, it in zip(self.task_labels, self.facts, strict=True)}
 
     @cached_property
-    def exact(self) -> pd.DataFrame:
-        """Exact values of the final policies of finite tasks, from ``exact_values``."""
+    def models(self) -> Mapping[str, FiniteCMDP | None]:
+        """The model of each task with policy tables, by its label; None if it cannot be built here."""
         tabulated = {str(label) for label in self.policies["task"].unique()}
         tasks = dict(zip(self.task_labels, (it.spec.task for it in self.facts), strict=True))
-        models = {
-            label: finite_model(it.name, it.options) for label, it in tasks.items() if label in tabulated
-        }
-        return exact_values(self.policies, models)
+        return {label: finite_model(it.name, it.options) for label, it in tasks.items() if label in tabulated}
+
+    @cached_property
+    def exact(self) -> pd.DataFrame:
+        """Exact values of the final policies of finite tasks, from ``exact_values``."""
+        return exact_values(self.policies, self.models)
 
     @cached_property
     def agent_options(self) -> Mapping[tuple[str, str], Mapping[str, Any]]:
@@ -289,7 +292,7 @@ def assemble(
         _trial_row(it, optimum) | {TRIAL: i}
         for i, (it, optimum) in enumerate(zip(facts, optima, strict=True))
     ]
-    return Sweep(
+    sweep = Sweep(
         name=name,
         trials=keys.put_before(pd.DataFrame(trials), TRIAL_COLUMNS),
         phases=keys.put_before(rows["phases"], PHASE_COLUMNS, phase_columns),
@@ -301,11 +304,13 @@ def assemble(
         grid=grid,
         notes=tuple(dict.fromkeys((*(it for it in notes if not is_made_again(it)), *doubles, *unknown))),
     )
+    misfit = misfit_note(sweep.policies, sweep.models)
+    return replace(sweep, notes=(*sweep.notes, misfit)) if misfit else sweep
 
 
 def is_made_again(note: str) -> bool:
     """Whether ``assemble`` made a note from the trials, and will make it again if it still holds."""
-    return any(text in note for text in (DOUBLES, UNKNOWN_OPTIMUM, NO_OPTIMUM))
+    return any(text in note for text in (DOUBLES, UNKNOWN_OPTIMUM, NO_OPTIMUM, MISFIT))
 
 
 def joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:

@@ -35,6 +35,8 @@ def doubts(sweep: Sweep) -> list[str]:
     changed = [it for it in sweep.facts if other_code(attempts(it), it.spec)]
     complete = sum(it.status is TrialState.COMPLETE for it in changed)
     code = other_code_sentence(complete, len(changed) - complete)
+    if code and sweep.folder is None:
+        code += ", in a sweep's own folder"
     return [*filter(None, (code, mixed_code_sentence(sweep))), *curriculum_warnings(sweep)]
 
 

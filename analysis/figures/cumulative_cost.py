@@ -25,10 +25,10 @@ from recrl.environments.cmdp import Floats
 
 # Colour, dashes and name of every sum except the measured one.
 REFERENCES: dict[str, tuple[str, Literal["-"] | tuple[float, Sequence[float]], str]] = {
-    "limit": (IN_FORCE_COLOUR, "-", "limits in force"),
+    "limit": (IN_FORCE_COLOUR, "-", "limits in force, the cost where infinite"),
     "discounted_bound": ("#5b3a8c", (0.0, (1.2, 1.2)), "Proposition 1, discounted cost"),
     "bound": ("black", (0.0, (6.0, 1.5, 1.2, 1.5)), "bound, undiscounted cost"),
-    "ceiling": ("#8a8a8a", "-", "trivial bound: every step at the largest cost"),
+    "ceiling": ("#8a8a8a", (0.0, (7.0, 3.0)), "trivial bound: every step at the largest cost"),
 }
 
 

@@ -1,10 +1,10 @@
 """Diagnostics of a curriculum: limit, cost, multiplier, critics and step size over training, for each method.
 
-One figure per task and agent, one column per method. From top to bottom: the agent's own cost and the limit
-in force; the mean multipliers, if the agent has them; the explained variance of the reward and cost critics;
-the mean KL divergence of its updates. Ticks below the costs mark policy noise in some run. Crosses below the
-KL divergence mark CPO's recovery steps, which only decrease the cost. A dotted line is the target of the KL
-divergence, if the agent has one.
+One figure per task, agent and cost, one column per method. From top to bottom: the agent's own cost and the
+limit in force; the mean multipliers, if the agent has them; the explained variance of the reward and cost
+critics; the mean KL divergence of its updates. Ticks below the costs mark policy noise in some run. Crosses
+below the KL divergence mark CPO's recovery steps, which only decrease the cost. A dotted line is the target
+of the KL divergence, if the agent has one.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
@@ -94,10 +95,10 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
         panels.cost_axis(grid[0, 0], limit, float(largest))
         low, high = grid[0, 0].get_ylim()
         for axes in grid[0]:
-            panels.infeasible_region(axes, limit)
+            panels.shade_above_limit(axes, limit)
         grid[0, 0].set_ylim(low, max(high, 1.2 * limit))
         for axes, quantity in zip(grid[:, 0], rows, strict=True):
-            axes.set_ylabel(_label(quantity), fontsize=7.0)
+            axes.set_ylabel(_label(quantity, cost_suffix(sweep, cost, task)), fontsize=7.0)
             if quantity.startswith(EXPLAINED):
                 axes.set_ylim(LEAST_EXPLAINED, 1.05)
             if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
@@ -113,12 +114,19 @@ def _target(sweep: Sweep, task: str, agent: str) -> float | None:
     return float(target) if isinstance(target, int | float) else None
 
 
-def _label(quantity: str) -> str:
-    """Return the label of an axis."""
-    if quantity.startswith(EXPLAINED):
-        signal = quantity.removeprefix(EXPLAINED).split("_")[0]
-        return f"explained\nvariance, {signal}"
-    return {"kl": "KL divergence"}.get(quantity, quantity.split("_", maxsplit=1)[0])
+def _label(quantity: str, suffix: str) -> str:
+    """Return the label of an axis.
+
+    Args:
+        quantity: the column that is drawn.
+        suffix: of ``cost_suffix`` for the figure's cost.
+    """
+    if quantity == "kl":
+        return "KL divergence"
+    kind = quantity.removeprefix(EXPLAINED).split("_")[0]
+    if kind != "reward":
+        kind += suffix
+    return f"explained\nvariance, {kind}" if quantity.startswith(EXPLAINED) else kind
 
 
 def _panel(axes: Axes, updates: pd.DataFrame, quantity: str, edges: Floats, style: MethodStyle) -> None:
@@ -163,7 +171,7 @@ def _legend(figure: Figure, title: str, seeds: int, target: float | None) -> Non
         Line2D([], [], color="0.2", linewidth=1.1, label=line),
         Line2D([], [], color=IN_FORCE_COLOUR, linewidth=0.9, label="limit in force, every run"),
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, label="limit $d_d$"),
-        panels.infeasible_patch(),
+        panels.above_limit_patch(),
         Line2D([], [], color="black", linewidth=0.8, linestyle=panels.DASHED, label="deployment begins"),
         Line2D([], [], color="0.2", linestyle="none", marker=NOISE_MARK, label="noise added (below cost)"),
         Line2D([], [], color="0.2", linestyle="none", marker=RECOVERY_MARK, label="recovery step (below KL)"),

@@ -1,8 +1,11 @@
-"""Return against cost of the final policies, with the feasible region and the best return J*(d).
+"""Return against cost of the final policies, with the limit and the best return J*(d).
 
-A policy to the right of the limit is infeasible. None lies above the frontier, except by the sampling error
-of episodes. The points are the stochastic final policies (``Measure.STOCHASTIC``), exact if the task is
-finite. The deployment phase, which averages many policies, is not drawn.
+The region above the limit is shaded. A policy in it may be feasible within the tolerance. One outside may
+exceed the limit of another cost. So only the fill of a mark says what is feasible. No policy lies above the
+frontier, except by the sampling error of episodes.
+
+The points are the stochastic final policies (``Measure.STOCHASTIC``), exact if the task is finite. The
+deployment phase, which averages many policies, is not drawn.
 """
 
 from __future__ import annotations
@@ -68,7 +71,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
                 _points(axes, chosen[chosen["agent"] == agent], look, far=far)
                 for limit in sorted(set(chosen[LIMIT])):
                     axes.axvline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED)
-                    axes.axvspan(limit, far, **panels.INFEASIBLE)
+                    axes.axvspan(limit, far, **panels.ABOVE_LIMIT)
                 axes.set_title(f"{task}, {agent}", loc="left", pad=3.0)
                 axes.set_xlabel(f"episode cost{cost_suffix(sweep, i, task)}")
             line[0].set_ylabel("return")
@@ -185,7 +188,7 @@ def _legend(
     ]
     references: list[Line2D | Patch] = [
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, label="limit $d_d$"),
-        panels.infeasible_patch(),
+        panels.above_limit_patch(),
     ]
     if known:
         best = Line2D([], [], color=OPTIMUM_COLOUR, linewidth=0.9, label="best return $J^*(d)$, where known")

@@ -10,7 +10,9 @@ deployment limit and logarithmic above, which its label mentions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -31,7 +33,7 @@ DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
 LEAST_SHOWN = 0.2  # of a limit, above and below it
 LEAST_SHOWN_RETURN = 2.0 * SOLVED_GAP  # above and below J*(d_d)
-WORTH_MARKING = 0.03  # of a trial: shorter periods of infinite limits (the measurement of d_t) are not marked
+LINE_BELOW_LINE = 0.07  # of a panel's height, between the marks of two curricula's infinite limits
 
 
 def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN) -> Figure:
@@ -70,7 +72,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN)
             axes.set_xlabel("environment steps")
         present = [method for method in look if (updates["method"] == method).any()]
         optimum = bool(trials["optimal_return"].notna().any())
-        seeds = int(updates.groupby(["task", "method"], observed=True)["seed"].nunique().min())
+        seeds = updates.groupby(["task", "method"], observed=True)["seed"].nunique().tolist()
         title = f"{agent}: {averaging.describe(seeds)}"
         panels.legend(figure, look, present, optimum=optimum, title=title)
     return figure
@@ -80,8 +82,8 @@ def curricula(sweep: Sweep) -> Figure:
     """Draw the paper's Figure 5: the limits in force; one row per task and cost, one column per agent.
 
     Every run is a thin line, the mean over seeds a thick one; the agent's own cost, a mean over seeds too,
-    is a faint line. Infinite limits are drawn along the upper edge with the sign of infinity, unless they
-    only last during the measurement of d_t.
+    is a faint line. Infinite limits are drawn along the upper edge with the sign of infinity, one line below
+    the other. Those during the measurement of d_t are left out once it is known.
 
     Args:
         sweep: with at least one update.
@@ -176,7 +178,7 @@ def _shade(panels_of_cost: Sequence[Axes], limit: float) -> None:
     """Shade the region above the limit, without changing the axes."""
     for axes in panels_of_cost:
         low, high = axes.get_ylim()
-        panels.infeasible_region(axes, limit)
+        panels.shade_above_limit(axes, limit)
         axes.set_ylim(low, max(high, limit * 1.05))
 
 
@@ -205,6 +207,7 @@ def _curriculum_panel(
     boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
     count = int(total // trials["steps_per_update"].min())
     edges = step_grid(boundary, total, updates=count, bins=BINS)
+    infinite = 0
     for position, (method, style) in enumerate(look.items()):
         chosen = updates[updates["method"] == method]
         for _, run in chosen.groupby("seed"):
@@ -224,14 +227,40 @@ def _curriculum_panel(
         axes.plot(cost.steps, cost.centre, color=style.colour, linewidth=1.0, alpha=0.35, zorder=1.8)
         curve = mean_curve(chosen, f"limit_{i}", edges)
         panels.draw_curve(axes, curve, style, place=(position, len(look)), wider=0.3)
-        last = float(chosen["end_step"].where(np.isinf(chosen[f"limit_{i}"])).max())
-        if last >= WORTH_MARKING * total:
-            edge = axes.get_xaxis_transform()
-            axes.plot([0.0, last], [1.0, 1.0], **style.line, transform=edge, clip_on=False)
-            axes.text(last, 1.0, " ∞", color=style.colour, va="top", fontsize=9.0, transform=edge)
+        last = _end_of_infinite_limits(chosen, trials, i)
+        if np.isfinite(last):
+            _mark_infinite_limits(axes, last, style, number=infinite)
+            infinite += 1
     panels.step_axis(axes, 0.0, total)
     panels.reference_lines(axes, trials, f"cost_{i}")
     panels.phase_boundary(axes, boundary, total)
+
+
+def _end_of_infinite_limits(updates: pd.DataFrame, trials: pd.DataFrame, i: int) -> float:
+    """Return the last step of a method's infinite limits, NaN if it has none but while d_t is measured.
+
+    A trial with a finite ``start_limit_i`` has measured its d_t, or was given it. Then the infinite limits at
+    its beginning are those of the measurement.
+    """
+    starts = trials[f"start_limit_{i}"]
+    start: dict[tuple[Any, ...], float] = dict(
+        zip(zip(trials["method"], trials["seed"], strict=True), starts, strict=True)
+    )
+    ends = [math.nan]
+    for key, run in updates.groupby(["method", "seed"], observed=True):
+        infinite = np.isinf(run[f"limit_{i}"].to_numpy(np.float64))
+        if np.isfinite(start[tuple(key)]):
+            infinite &= np.maximum.accumulate(~infinite)
+        ends += run["end_step"].to_numpy(np.float64)[infinite].tolist()
+    return float(np.nanmax(ends)) if len(ends) > 1 else math.nan
+
+
+def _mark_infinite_limits(axes: Axes, last: float, style: MethodStyle, *, number: int) -> None:
+    """Draw infinite limits until the step ``last``; ``number`` others are already drawn."""
+    edge = axes.get_xaxis_transform()
+    height = 1.0 - LINE_BELOW_LINE * number
+    axes.plot([0.0, last], [height, height], **style.line, transform=edge, clip_on=False)
+    axes.text(last, height, " ∞", color=style.colour, va="center", fontsize=9.0, transform=edge)
 
 
 def _column_titles(suffixes: Sequence[str]) -> list[str]:

@@ -20,7 +20,7 @@ LOG_AXIS_FROM = 10.0  # times the limit
 MARKERS_A_LINE = 6
 METHODS_A_LINE, REFERENCES_A_LINE = 4, 2  # of a legend: a phone shows the left half of a figure
 DASHED = (0.0, (4.0, 2.0))
-INFEASIBLE: dict[str, Any] = {"color": "#c0392b", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.5}
+ABOVE_LIMIT: dict[str, Any] = {"color": "#c0392b", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.5}
 Entry = TypeVar("Entry")
 FAR_ABOVE = 1e6  # times the limit: the shaded region has no upper end
 
@@ -80,10 +80,10 @@ def reference_lines(axes: Axes, trials: pd.DataFrame, quantity: str) -> None:
         axes.axhline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=DASHED, zorder=4.0)
 
 
-def infeasible_region(axes: Axes, limit: float) -> None:
+def shade_above_limit(axes: Axes, limit: float) -> None:
     """Shade the costs above a deployment limit."""
     if np.isfinite(limit):
-        axes.axhspan(limit, FAR_ABOVE * max(limit, 1.0), **INFEASIBLE)
+        axes.axhspan(limit, FAR_ABOVE * max(limit, 1.0), **ABOVE_LIMIT)
 
 
 def widen(axes: Axes, centre: float, least: float) -> None:
@@ -173,9 +173,9 @@ def panel_title(trials: pd.DataFrame, updates: pd.DataFrame, *, separator: str =
     return f"{task}{separator}{count} seed{'s' if high > 1 else ''}, {total} steps"
 
 
-def infeasible_patch() -> Patch:
-    """Return the legend's entry for the infeasible region."""
-    return Patch(facecolor=INFEASIBLE["color"], alpha=0.2, linewidth=0.0, label="infeasible (above $d_d$)")
+def above_limit_patch() -> Patch:
+    """Return the legend's entry for the region above the deployment limit."""
+    return Patch(facecolor=ABOVE_LIMIT["color"], alpha=0.2, linewidth=0.0, label="above $d_d$")
 
 
 def legend(
@@ -193,7 +193,7 @@ def legend(
     ]
     references: list[Line2D | Patch] = [
         Line2D([], [], color=LIMIT_COLOUR, linewidth=1.1, linestyle=DASHED, label="limit $d_d$"),
-        infeasible_patch(),
+        above_limit_patch(),
         Line2D([], [], color="black", linewidth=0.8, linestyle=DASHED, label="deployment begins"),
     ]
     if optimum:

@@ -21,6 +21,7 @@ from matplotlib.colors import LogNorm, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from recrl.analysis.data.exact_values import policy_table
 from recrl.analysis.data.labels import occurring
 from recrl.analysis.data.number_texts import number
 from recrl.analysis.data.sweep_data import Sweep
@@ -68,18 +69,25 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
     """Draw the final policies of an agent on the maps of its RiverGrid tasks.
 
     Args:
-        sweep: its trials with a policy table are drawn.
+        sweep: its trials with a policy table that fits the task are drawn.
         agent: the agent's label.
 
     Returns:
         The figure, or None if there is no such trial.
     """
     policies = sweep.policies[sweep.policies["agent"] == agent]
-    tasks = occurring(policies["task"])
+    tasks, methods = occurring(policies["task"]), occurring(policies["method"])
     maps = {task: found for task in tasks if (found := river_task(sweep, task)) is not None}
-    methods = occurring(policies["method"])
-    if not maps:
+    behaviours = {
+        (task, method): behaviour
+        for task, found in maps.items()
+        for method in methods
+        for chosen in [policies[(policies["task"] == task) & (policies["method"] == method)]]
+        if (behaviour := mean_behaviour(chosen, *found)) is not None
+    }
+    if not behaviours:
         return None
+    maps = {task: found for task, found in maps.items() if any(task == drawn for drawn, _ in behaviours)}
     rows, columns, panels_of_a_map = _layout(len(maps), len(methods))
     scale = LogNorm(vmin=0.1, vmax=max(options.horizon for _, options in maps.values()))
     with styles.context():
@@ -88,12 +96,10 @@ def policy_maps(sweep: Sweep, agent: str) -> Figure | None:
         for axes in grid.flat:
             axes.set_axis_off()
             axes.set(xticks=[], yticks=[])  # invisible ticks would still take space in the layout
-        for number, (task, (river_map, options)) in enumerate(maps.items()):
+        for number, (task, (river_map, _)) in enumerate(maps.items()):
             panels = grid.reshape(-1)[number * panels_of_a_map :][:panels_of_a_map]
             for axes, method in zip(panels, methods, strict=False):
-                chosen = policies[(policies["task"] == task) & (policies["method"] == method)]
-                if len(chosen):
-                    behaviour = mean_behaviour(chosen, river_map, options)
+                if (behaviour := behaviours.get((task, method))) is not None:
                     draw_map(axes, river_map)
                     _draw_behaviour(axes, river_map, behaviour, scale)
                     _title(axes, method, behaviour)
@@ -134,8 +140,12 @@ def river_task(sweep: Sweep, task: str) -> tuple[RiverMap, RiverGridOptions] | N
         return None
 
 
-def mean_behaviour(policies: pd.DataFrame, river_map: RiverMap, options: RiverGridOptions) -> MeanBehaviour:
+def mean_behaviour(
+    policies: pd.DataFrame, river_map: RiverMap, options: RiverGridOptions
+) -> MeanBehaviour | None:
     """Evaluate the policies of several runs exactly, and average.
+
+    Policy tables that do not fit the task are left out. The result is None if none fits.
 
     Args:
         policies: rows of ``Sweep.policies``, of one task, agent and method.
@@ -145,8 +155,10 @@ def mean_behaviour(policies: pd.DataFrame, river_map: RiverMap, options: RiverGr
     model = river_cmdp(river_map, costs=options.costs, horizon=options.horizon)
     values = []
     for _, run in policies.groupby("seed"):
-        table = run.sort_values("state")[[f"action_{j}" for j in range(model.num_actions)]]
-        values.append(evaluate_policy(model, table.to_numpy(np.float64)))
+        if (table := policy_table(run, model)) is not None:
+            values.append(evaluate_policy(model, table))
+    if not values:
+        return None
     return MeanBehaviour(
         visits=np.mean([value.visits for value in values], axis=0),
         episode_return=float(np.mean([value.episode_return for value in values])),

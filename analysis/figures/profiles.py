@@ -24,8 +24,6 @@ from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
 from recrl.orchestrator.spec import TrialState
 
-THRESHOLDS = 400
-
 
 def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     """Draw one row per task, one column per agent, one line per curriculum.
@@ -61,7 +59,13 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
                     if len(runs) + num_failed:
                         drawn.add(method)
                         shares = performance_profile(feasible_scores(runs, failed=num_failed), thresholds)
-                        axes.plot(thresholds, shares, **style.line, zorder=3.0 + bool(style.dashes))
+                        axes.plot(
+                            thresholds,
+                            shares,
+                            **style.line,
+                            drawstyle="steps-post",
+                            zorder=3.0 + bool(style.dashes),
+                        )
                 for optimum in sorted(set(chosen["optimal_return"].dropna())):
                     axes.axvline(optimum, color=OPTIMUM_COLOUR, linewidth=0.7, zorder=1.0)
                 axes.set_ylim(-0.05, 1.05)
@@ -92,9 +96,12 @@ def feasible_scores(rows: pd.DataFrame, *, failed: int = 0) -> Floats:
 
 
 def _thresholds(rows: pd.DataFrame) -> Floats:
-    """Return thresholds around the optimum and the returns of feasible runs, or all if none is."""
+    """Return all returns at which a line may fall, and the ends of the axis.
+
+    The ends are around the optimum and the returns of feasible runs, or of all runs if none is feasible.
+    """
     shown = rows[rows["feasible"]] if rows["feasible"].any() else rows
     values = np.concatenate([shown["episode_return"], rows["optimal_return"]])
     values = values[np.isfinite(values)]
     room = max(0.05 * float(values.max() - values.min()), SOLVED_GAP)
-    return np.linspace(values.min() - room, values.max() + room, THRESHOLDS)
+    return np.unique([values.min() - room, *shown["episode_return"], values.max() + room])

@@ -2,11 +2,11 @@
 
     report.html                 answer, verdicts, figures and, folded, the rest on one self-contained page
     report.md                   the same as text, with links to the figures
-    return-against-cost         final policies, the infeasible region, and the frontier J*(d) (PDF and PNG)
+    return-against-cost         final policies, the region above d_d, and the frontier J*(d) (PDF and PNG)
     learning-curves_<agent>     the paper's Figures 3 and 4 (PDF and PNG)
     curricula                   the paper's Figure 5 (PDF and PNG)
     diagnostics_<task>_<agent>  limit, cost, multiplier, explained variance of the critics and KL divergence
-                                of each curriculum (PDF and PNG)
+                                of each curriculum, one figure per cost (PDF and PNG)
     policies_<agent>            final policies and their visits on RiverGrid's maps (PDF and PNG)
     bounds_<agent>              cumulative cost of training against Proposition 1 (PDF and PNG)
     performance-profiles        fraction of final policies that are feasible and return more (PDF and PNG)
@@ -57,7 +57,14 @@ from recrl.analysis.figures.policy_map import policy_maps
 from recrl.analysis.figures.profiles import performance_profiles
 from recrl.analysis.report import html_page, table_formats, verdict_texts
 from recrl.analysis.report.html_page import Section
-from recrl.analysis.report.table_files import BOOTSTRAP_SEED, Tables, write_tables
+from recrl.analysis.report.table_files import (
+    BOOTSTRAP_SEED,
+    COST_AND_BOUNDS,
+    COST_AND_LIMITS,
+    Tables,
+    write_tables,
+)
+from recrl.analysis.statistics.cumulative_cost import is_bounded
 from recrl.analysis.statistics.curves import MEAN, CurveAverage, interquartile
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
@@ -66,12 +73,11 @@ from recrl.orchestrator.spec import TrialState
 
 RELOAD_SECONDS = 120  # of the page of a sweep that runs
 CAPTIONS = {
-    "return-against-cost": "Final policies: return against cost. Left of the limit is feasible, the shaded "
-    "region is not; filled marks are feasible within the tolerance, hollow ones are not; a failed trial has "
-    "no mark",
+    "return-against-cost": "Final policies: return against cost. The shaded region is above the limit; "
+    "filled marks are feasible, every cost within the tolerance of its limit, hollow ones are not; a failed "
+    "trial has no mark",
     "learning-curves": "Return and cost while training, and magnified in the deployment phase (learning goes "
     "on). Costs in the shaded region are above the limit",
-    "bounds": "Cumulative cost of training against its bounds",
     "curricula": "Cost limits in force",
     "diagnostics": "Limit, cost, multiplier, explained variance of the critics, and KL divergence",
     "policies": "Final policies and their visits",
@@ -89,19 +95,22 @@ class Drawing:
     """A figure that can be drawn.
 
     Attributes:
-        kind: the key of its caption in CAPTIONS.
+        kind: the beginning of its file's name, and the key of its caption in CAPTIONS.
         make: draws it; returns None without data.
         about: the labels that the figure is about, which its caption begins with; may be empty.
+        shows: the caption of a kind that is not in CAPTIONS, because it depends on the sweep.
     """
 
     kind: str
     make: Callable[[], Figure | None]
     about: tuple[str, ...] = ()
+    shows: str = ""
 
     @property
     def caption(self) -> str:
         """The caption: the labels as in the grid, and what the figure shows."""
-        return f"{', '.join(self.about)}: {CAPTIONS[self.kind]}" if self.about else CAPTIONS[self.kind]
+        shows = self.shows or CAPTIONS[self.kind]
+        return f"{', '.join(self.about)}: {shows}" if self.about else shows
 
 
 class NothingToDrawError(RecrlError):
@@ -264,17 +273,21 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Drawi
         curves = partial(learning_curves.learning_curves, sweep, agent, averaging=averaging)
         add(Drawing("learning-curves", curves, (agent,)), agent)
     add(Drawing("curricula", partial(learning_curves.curricula, sweep)))
+    about: tuple[str, ...]
     for task, agent in cells:
-        diagnosed = partial(curriculum_diagnostics, sweep, task, agent)
-        add(Drawing("diagnostics", diagnosed, (task, agent)), task, agent)
+        for i in range(int(sweep.trials.loc[sweep.trials["task"] == task, "num_costs"].max())):
+            suffix = cost_suffix(sweep, i, task)
+            diagnosed = partial(curriculum_diagnostics, sweep, task, agent, cost=i)
+            about = (task, agent, *_cost_label(suffix))
+            add(Drawing("diagnostics", diagnosed, about), task, agent, *_file_label(i))
     for agent in agents:
         add(Drawing("policies", partial(policy_maps, sweep, agent), (agent,)), agent)
     for agent in agents:
         for i in range(sweep.num_costs):
-            suffix = cost_suffix(sweep, i)
-            about = (agent, f"cost{suffix}") if suffix else (agent,)
-            labels = (agent, f"cost-{i}") if i else (agent,)  # the number of the CSV files
-            add(Drawing("bounds", partial(cumulative_bounds, sweep, agent, cost=i), about), *labels)
+            about = (agent, *_cost_label(cost_suffix(sweep, i)))
+            shows = COST_AND_BOUNDS if is_bounded(sweep, agent, cost=i) else COST_AND_LIMITS
+            summed = partial(cumulative_bounds, sweep, agent, cost=i)
+            add(Drawing("bounds", summed, about, shows), agent, *_file_label(i))
     add(Drawing("performance-profiles", partial(performance_profiles, sweep, Measure.STOCHASTIC)))
     return made
 
@@ -282,6 +295,16 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Drawi
 def curve_averages() -> dict[str, CurveAverage]:
     """Return the kinds of lines and bands, by their names on the command line."""
     return {"mean": MEAN, "iqm": interquartile(np.random.default_rng(BOOTSTRAP_SEED))}
+
+
+def _cost_label(suffix: str) -> tuple[str, ...]:
+    """Return the label of one of several costs, from its ``cost_suffix``."""
+    return (f"cost{suffix}",) if suffix else ()
+
+
+def _file_label(i: int) -> tuple[str, ...]:
+    """Return what tells the files of several costs apart: the number of the CSV files' columns."""
+    return (f"cost-{i}",) if i else ()
 
 
 def _safe(label: str) -> str:
@@ -333,8 +356,8 @@ def missing(sweep: Sweep) -> list[str]:
     if few and few != [1]:  # one seed: the answers say so
         sentences.append(
             f"{' or '.join(map(str, few))} seeds: bootstrap intervals are too short below {ENOUGH_RUNS} "
-            f"seeds (marked {table_formats.TOO_FEW}); Student's hold for normal data, Wilson's cover within "
-            "about 3 points of 95%"
+            f"seeds (marked {table_formats.TOO_FEW}); Student's hold for normal data; Wilson's cover about "
+            "95% on average, but as low as 83% when the true fraction is near 0 or 1"
         )
     return sentences
 

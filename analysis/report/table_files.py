@@ -11,6 +11,7 @@ import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.labels import GROUP
+from recrl.analysis.data.number_texts import DASH
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import table_formats
@@ -24,6 +25,8 @@ from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 
 OUTCOMES = "outcomes.csv"
+COST_AND_BOUNDS = "Cumulative cost of training against its bounds"
+COST_AND_LIMITS = "Cumulative cost of training against the limits in force"
 BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 
@@ -33,25 +36,35 @@ TIES = (
 )
 SAMPLED = "That standard error is over the episodes of a trial; the one after ± is over seeds."
 FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
-BOUNDS_NOTE = (
-    "Sums over the policies of the training phase, one expected episode each; means over n seeds. Limits in "
-    "force: the sum of the limits that the curriculum set. Above limits in force, above the limit: the part "
-    "of the measured cost above them, and above the deployment limit. Bound: if every update solves CPO's "
-    "problem (CPO only). Discounted bound: Proposition 1 of the paper. Trivial bound: every step at the "
-    "largest cost."
+SUMS_NOTE = (
+    "Sums over the policies of the training phase, one expected episode each; means over n seeds. A policy "
+    "without a finished episode counts with the cost of the one before. Limits in force: the sum of the "
+    "limits that the curriculum set, and of the measured cost where the limit was infinite. Net above: the "
+    "cost minus these limits, or minus the deployment limit; negative below. Positive parts: only the "
+    "policies whose measured mean is above the limit in force; biased upwards where few episodes end per "
+    "policy."
+)
+BOUND_NOTES = {
+    "bound": "Bound: if every update solves CPO's problem (CPO only).",
+    "discounted bound": "Discounted bound: Proposition 1 of the paper (CPO only).",
+    "trivial bound": "Trivial bound: every step at the largest cost.",
+}
+CLAIMS_NOTE = (
+    "Counted are seeds. A claim about several curricula holds in a seed if it holds in the trials of all of "
+    "them."
 )
 COMPARED_CLAIMS_NOTE = (
     "Comparisons count the seeds that have both trials. Costs of training are those of the training phase. A "
     "difference is the mean over seeds with Student's 95% interval; beside it the fraction of the other "
     "curriculum's mean, where that is above 0 beyond its interval. Feasible pairs: seeds whose two final "
-    "policies are feasible; the others count, too. The paper's gains are at the end of the training phase."
+    "policies are feasible. The paper's gains are at the end of the training phase."
 )
-FAILED_CLAIMS_NOTE = "In a failed trial, or a seed with one, a claim does not hold."
+FAILED_CLAIMS_NOTE = "In a seed with a failed trial a claim does not hold."
 FAILED_NOTE = (
     "A failed trial counts as neither feasible nor solved; the means are over the n complete trials."
 )
 NO_GAIN = (
-    "–: a policy of a pair is infeasible, with the curriculum or with none; more return is then no gain."
+    "–: a policy of a pair is infeasible, with one curriculum or the other; more return is then no gain."
 )
 
 
@@ -117,14 +130,8 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
     if len(weighed):
         written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
-        notes = [COMPARED_CLAIMS_NOTE] if weighed["difference"].notna().any() else []
-        notes += [FAILED_CLAIMS_NOTE] if weighed["failed"].any() else []
-        shown.append(ShownTable("What the paper says of these tasks", claims_table(weighed), " ".join(notes)))
-    for i, costs in enumerate(bounds):
-        which = f" (cost{suffixes[i]})" if suffixes[i] else ""
-        if len(costs):
-            heading = f"Cumulative cost of training against its bounds{which}"
-            shown.append(ShownTable(heading, bound_table(costs), BOUNDS_NOTE))
+        shown.append(_claims(weighed))
+    shown += [_bounds(costs, suffix) for costs, suffix in zip(bounds, suffixes, strict=True) if len(costs)]
     written += [
         table_formats.write_csv(judged, folder / "verdicts.csv"),
         table_formats.write_csv(rows, folder / OUTCOMES),
@@ -148,6 +155,31 @@ def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:
     """
     rows = metrics.outcomes(sweep)
     return [table_formats.write_csv(rows, folder / OUTCOMES)] if len(rows) else []
+
+
+def _claims(weighed: pd.DataFrame) -> ShownTable:
+    """Return the counted claims of the paper."""
+    table = claims_table(weighed)
+    notes = [
+        CLAIMS_NOTE,
+        COMPARED_CLAIMS_NOTE if weighed["difference"].notna().any() else "",
+        NO_GAIN if (table == DASH).any(axis=None) else "",
+        FAILED_CLAIMS_NOTE if weighed["failed"].any() else "",
+        table_formats.not_corrected(table),
+    ]
+    return ShownTable("What the paper says of these tasks", table, " ".join(filter(None, notes)))
+
+
+def _bounds(costs: pd.DataFrame, suffix: str) -> ShownTable:
+    """Return the cumulative cost of training, with the bounds that are known."""
+    table = bound_table(costs)
+    notes = [
+        SUMS_NOTE,
+        *(note for title, note in BOUND_NOTES.items() if title in table),
+    ]
+    heading = COST_AND_BOUNDS if len(notes) > 1 else COST_AND_LIMITS
+    which = f" (cost{suffix})" if suffix else ""
+    return ShownTable(f"{heading}{which}", table, " ".join(notes))
 
 
 def _outcome_tables(
@@ -178,7 +210,8 @@ def _comparison_tables(
         table = table_formats.comparison_table(rows, suffixes)
         marked = table["P(higher return)"].str.contains(table_formats.TOO_FEW).any()
         dashed = bool((rows["feasible_pairs"] < rows["pairs"]).any())
-        note = " ".join([TIES, *([FEW] if marked else []), *([NO_GAIN] if dashed else [])])
+        notes = [TIES, FEW if marked else "", NO_GAIN if dashed else "", table_formats.not_corrected(table)]
+        note = " ".join(filter(None, notes))
         tables.append(
             ShownTable(f"{_heading(measure)}, minus none", table, note, table_formats.row_kinds(rows))
         )

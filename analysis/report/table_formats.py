@@ -7,6 +7,7 @@ is "3 of 5", from five seeds on with Wilson's 95% interval in percent.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.redaction import printable
 
 TOO_FEW = "†"
+INTERVAL = re.compile(r"[\[(][^\[\]()]*\d(?:, | to |–)[^\[\]()]*\d%?[\])]")
 LATEX = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -135,6 +137,16 @@ def with_interval(row: pd.Series, name: str) -> str:
     shown, low, high = (round(value, 2) + 0.0 for value in (estimate, low, high))  # no -0.00
     ends = "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
     return DASH if math.isnan(estimate) else f"{shown:.2f}{ends}"
+
+
+def not_corrected(table: pd.DataFrame) -> str:
+    """Return how many intervals a finished table has, and that they are not corrected; empty for at most one.
+
+    >>> not_corrected(pd.DataFrame({"share": ["4 of 5 (38–96%)", "–"], "gain": ["2 [1, 3]", "1 (n = 1)"]}))
+    'Intervals in this table: 2, of 95% each, not corrected for their number.'
+    """
+    count = sum(len(INTERVAL.findall(cell)) for cell in table.astype(str).to_numpy().ravel())
+    return f"Intervals in this table: {count}, of 95% each, not corrected for their number." * (count > 1)
 
 
 def markdown(table: pd.DataFrame) -> str:

@@ -9,39 +9,67 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
-from recrl.analysis.data.number_texts import number
+from recrl.analysis.data.number_texts import DASH, number
 from recrl.analysis.statistics.intervals import share_text
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.files.trial_store import TrialStore
+
+SUM_COLUMNS = {
+    "cost": "cost_sum",
+    "limits in force": "limit_sum",
+    "net above limits in force": "over_limits_sum",
+    "positive parts": "overshoot_sum",
+    "net above the limit": "over_deploy_sum",
+}
+BOUND_COLUMNS = {
+    "bound": "bound",
+    "discounted bound": "discounted_bound",
+    "trivial bound": "ceiling_sum",
+}
 
 
 def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
     """Format the result of ``count_claims``: "mixed", "4 of 5 (38–96%)", "+1.2 (+0.3 to +2.1)", "+40%".
 
-    There is a column of failed trials if there are any.
+    Only a claim about single trials holds or does not. A comparison of returns has a dash where a policy of
+    a pair is infeasible, because more return is then no gain. There is a column of failed seeds if there are
+    any.
     """
-    shares = zip(weighed["held"], weighed["trials"], weighed["share_low"], weighed["share_high"], strict=True)
-    beside = zip(weighed["deployment_held"], weighed["deployment_trials"], strict=True)
+    shares = zip(weighed["held"], weighed["seeds"], weighed["share_low"], weighed["share_high"], strict=True)
+    beside = zip(weighed["deployment_held"], weighed["deployment_seeds"], strict=True)
+    compared = weighed["difference"].notna()
+    gains = compared & weighed["feasible_pairs"].notna()
+    ended = weighed["seeds"] - weighed["failed"]
+    no_gain = gains & (weighed["feasible_pairs"] < ended)
+    no_gain_deployed = gains & (
+        weighed["deployment_feasible_pairs"] < weighed["deployment_seeds"] - weighed["failed"]
+    )
     columns = {
         "section": weighed["section"],
         "claim": weighed["claim"],
         "agent": weighed["agent"],
         "holds here": [
-            "yes" if held == trials else "mixed" if held else "no"
-            for held, trials in zip(weighed["held"], weighed["trials"], strict=True)
+            "" if pair else "yes" if held == seeds else "mixed" if held else "no"
+            for held, seeds, pair in zip(weighed["held"], weighed["seeds"], compared, strict=True)
         ],
-        "holds in": [share_text(*share) for share in shares],
+        "holds in": [
+            DASH if dashed else share_text(*share) for share, dashed in zip(shares, no_gain, strict=True)
+        ],
         "deployment phase (learning goes on)": [
-            f"{held} of {trials}" if trials else "" for held, trials in beside
+            "" if not seeds else DASH if dashed else f"{held} of {seeds}"
+            for (held, seeds), dashed in zip(beside, no_gain_deployed, strict=True)
         ],
     }
     if (weighed["failed"] > 0).any():
         columns["failed"] = weighed["failed"].astype(str)
-    if weighed["difference"].notna().any():
-        pairs = zip(weighed["feasible_pairs"], weighed["trials"] - weighed["failed"], strict=True)
+    if compared.any():
+        pairs = zip(weighed["feasible_pairs"], ended, strict=True)
         columns["feasible pairs"] = [f"{known} of {all_}" if pd.notna(known) else "" for known, all_ in pairs]
-        columns["difference"] = [_difference_text(row) for _, row in weighed.iterrows()]
-        relative = weighed["relative_difference"]
+        columns["difference"] = [
+            DASH if dashed else _difference_text(row)
+            for (_, row), dashed in zip(weighed.iterrows(), no_gain, strict=True)
+        ]
+        relative = weighed["relative_difference"].mask(no_gain)
         columns["relative"] = [f"{value:+.0%}" if math.isfinite(value) else "" for value in relative]
         columns["paper, over its three tasks"] = weighed["paper"]
     return pd.DataFrame(columns)
@@ -56,20 +84,17 @@ def _difference_text(row: pd.Series) -> str:
 
 
 def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """Format the sums of ``cumulative_costs``: one row per GROUP, means over its runs."""
+    """Format the sums of ``cumulative_costs``: one row per GROUP, means over its runs.
+
+    A bound that is known for no row has no column.
+    """
+    known = [(title, name) for title, name in BOUND_COLUMNS.items() if rows[name].notna().any()]
     lines = []
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
         line = dict(zip(("task", "agent", "curriculum"), map(str, group), strict=True))
         line |= {"n": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
-        for title, name in (
-            ("cost", "cost_sum"),
-            ("limits in force", "limit_sum"),
-            ("above limits in force", "overshoot_sum"),
-            ("above the limit", "violation_sum"),
-            ("bound", "bound"),
-            ("discounted bound", "discounted_bound"),
-            ("trivial bound", "ceiling_sum"),
-        ):
+        line["episodes per policy"] = number(float(runs["episodes_per_policy"].mean()))
+        for title, name in (*SUM_COLUMNS.items(), *known):
             line[title] = number(float(runs[name].mean()))
         lines.append(line)
     return pd.DataFrame(lines)
@@ -82,8 +107,9 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
         limit = float(row["largest_train_limit"])
         lines.append(
             dict(zip(("task", "agent", "curriculum"), (str(row[name]) for name in GROUP), strict=True))
+            | {"episodes per policy": number(row["episodes_per_policy"])}
             | {"overshoot per policy": number(row["overshoot"])}
-            | {"violation of the worst run": number(row["measured_violation"])}
+            | {"net above d_d, worst run": number(row["measured_over_deploy"])}
             | {"d_t of the runs": number(row["used_train_limit"])}
             | {"largest d_t": "any" if math.isinf(limit) else "none" if math.isnan(limit) else number(limit)}
         )

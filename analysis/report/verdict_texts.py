@@ -11,13 +11,14 @@ import pandas as pd
 from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.number_texts import DASH, number, with_error
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report.table_formats import with_interval
+from recrl.analysis.report.table_formats import not_corrected, with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.spec import TrialState
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
+DIFFERENCE = "difference to none"
 SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
 FAILED, PENDING, UNEVALUATED = "failed", "no result yet", "not evaluated"
 WARNINGS = {
@@ -77,6 +78,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     several = bool((verdicts["seeds"] > 1).any())
     interval = ", with its 95% interval (Student's t)" if several else ""
     errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
+    intervals = not_corrected(verdict_table(verdicts)[[DIFFERENCE]])
     return [
         f"The verdict, the return and the cost are those of the final policy, without learning: "
         f"{measured_how(verdicts)}.",
@@ -88,6 +90,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         *([pending] if verdicts["pending"].any() else []),
         f"The difference to none is a mean over the seeds that both have{interval}. It is left out where one "
         "of these policies is infeasible, with the curriculum or with none.",
+        *([intervals] if intervals else []),
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
         *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
     ]
@@ -202,7 +205,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
             line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         line["optimum"] = number(row["optimal_return"])
-        line["difference to none"] = _difference_text(row)
+        line[DIFFERENCE] = _difference_text(row)
         line["n"] = str(row["seeds"])
         earned = with_error(row["deployment_return"], row["deployment_return_se"])
         paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"], digits=3) for it in costs]

@@ -1,7 +1,8 @@
 """Count in how many seeds the paper's claims hold.
 
 RiverGrid (sections 5, 5.1 and 5.3): on figure 1a every path crosses the river, and 1b has a safe path. Each
-sentence is a predicate of a trial's final policy.
+sentence is a predicate of a trial's final policy. A claim about several curricula holds in a seed if it holds
+in the trials of all of them: trials with the same seed are not independent.
 
 Safety Gym (section 6): which agents keep the limit is a predicate, too. Which of two curricula returns more,
 or costs more in training, is a comparison of the two trials of each seed. It has the mean paired difference,
@@ -9,9 +10,9 @@ and beside it the paper's relative gains. Only trials with the labels ``ppo-lag`
 counted are which static curriculum is the best in how many tasks, and that the costs of training of
 ``dynamic`` and ``linear`` are comparable.
 
-The fraction of trials or seeds has Wilson's interval. Beside it is the count for the deployment phase, in
-which learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``. A failed
-trial has no final policy: a claim does not hold in it, nor in a seed of which one of the two trials failed.
+The fraction of seeds has Wilson's interval. Beside it is the count for the deployment phase, in which
+learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``. A failed trial
+has no final policy and an incomplete training: a claim does not hold in a seed with one.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from recrl.analysis.data.labels import KEY
 from recrl.analysis.statistics.intervals import (
     Interval,
     mean_interval,
@@ -40,6 +42,7 @@ PAPER_TASKS = ("CarButton2", "CarGoal2", "CarPush2")
 PAPER_AGENTS = ("ppo-lag", "cpo")
 RETURN = "episode_return"
 TRAINING_COST = "training_cost"
+FEASIBLE_PAIRS = ("feasible_pairs", "deployment_feasible_pairs")
 
 
 def violates(rows: pd.DataFrame) -> pd.Series[bool]:
@@ -142,26 +145,29 @@ CLAIMS = (
 
 
 def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
-    """Count the trials or seeds in which each claim holds, one row per claim and agent.
+    """Count the seeds in which each claim holds, one row per claim and agent.
 
     Args:
         rows: of ``metrics.outcomes``.
-        training: of ``metrics.training_totals``; costs of training are compared if there is one cost.
+        training: of ``metrics.training_totals``; costs of training are compared if there is one cost, and
+            only those of complete trials.
         trials: of the sweep, complete or not.
 
     Returns:
-        section, claim, agent, trials (complete and failed ones; of a comparison: seeds with both trials, or
-        with a failed one), failed (trials, or seeds with one), held, share, share_low, share_high (95%);
-        deployment_trials and deployment_held, the same for the deployment phase. Of a comparison also
-        difference, the mean over the seeds with both trials, with Student's interval; relative_difference,
-        where the other curriculum's mean is above 0 beyond its interval; and the paper's range. Of a
-        comparison of returns feasible_pairs, the seeds whose final policies are both feasible; the others
-        count, too. No row without such trials.
+        section, claim, agent, seeds (all of whose trials have ended; of a comparison, that have both trials),
+        failed (seeds with a failed trial), held, share, share_low, share_high (95%); deployment_seeds and
+        deployment_held, the same for the deployment phase. Of a comparison also difference, the mean over the
+        seeds without a failed trial, with Student's interval; relative_difference, where the other
+        curriculum's mean is above 0 beyond its interval; and the paper's range. Of a comparison of returns
+        feasible_pairs and deployment_feasible_pairs, the seeds whose two policies are feasible; the others
+        count, too. No row without such seeds.
     """
     final, deployed = (
         rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     )
-    costs = training.assign(**{TRAINING_COST: training["cost_0_total"] / training["episodes"]})
+    complete = set(_keys(trials[trials["status"] == TrialState.COMPLETE.value]))
+    costs = training[np.array([key in complete for key in _keys(training)], dtype=bool)]
+    costs = costs.assign(**{TRAINING_COST: costs["cost_0_total"] / costs["episodes"]})
     lines = []
     for claim in CLAIMS:
         of_training = isinstance(claim, Comparison) and claim.quantity == TRAINING_COST
@@ -177,11 +183,15 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFram
                 if isinstance(claim, Comparison)
                 else _held(own, same, its, claim)
             )
-            if counted["trials"]:
+            if counted["seeds"]:
                 named = {"section": claim.section, "claim": claim.text, "agent": str(agent)}
                 lines.append(named | counted)
     table = pd.DataFrame(lines)
-    return table.astype({"feasible_pairs": "Int64"}) if lines else table
+    return table.astype(dict.fromkeys(FEASIBLE_PAIRS, "Int64")) if lines else table
+
+
+def _keys(rows: pd.DataFrame) -> list[tuple[Any, ...]]:
+    return list(rows[list(KEY)].itertuples(index=False, name=None))
 
 
 def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
@@ -192,50 +202,63 @@ def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
 
 def _held(final: pd.DataFrame, deployed: pd.DataFrame, trials: pd.DataFrame, claim: Claim) -> dict[str, Any]:
     nothing = _ends(Interval(math.nan, math.nan, math.nan, 0, True))
-    failed = int((trials["status"] == TrialState.FAILED.value).sum())
-    counted = _counted(claim.holds(final), claim.holds(deployed), failed=failed)
-    return {**counted, **nothing, "relative_difference": math.nan, "paper": "", "feasible_pairs": None}
+    failed = _failed_seeds(trials)
+    held, beside = (_of_all(rows, claim, trials) for rows in (final, deployed))
+    counted = _counted(held, beside, failed=len(failed))
+    pairs = dict.fromkeys(FEASIBLE_PAIRS)
+    return {**counted, **nothing, "relative_difference": math.nan, "paper": "", **pairs}
+
+
+def _of_all(rows: pd.DataFrame, claim: Claim, trials: pd.DataFrame) -> pd.Series[bool]:
+    """Whether a claim holds in all trials of a seed, for the seeds whose trials all have an outcome."""
+    planned = trials.drop_duplicates(list(KEY)).groupby("seed").size()
+    holds = claim.holds(rows).groupby(rows["seed"])
+    measured = holds.size()
+    ended = measured.index[measured == planned.reindex(measured.index)]
+    return holds.all().loc[ended]
+
+
+def _failed_seeds(trials: pd.DataFrame) -> set[int]:
+    return set(trials.loc[trials["status"] == TrialState.FAILED.value, "seed"])
 
 
 def _compared(
     final: pd.DataFrame, deployed: pd.DataFrame, trials: pd.DataFrame, claim: Comparison
 ) -> dict[str, Any]:
+    of_training = claim.quantity == TRAINING_COST
+    deployed = deployed.iloc[:0] if of_training else deployed
     differences, base = _differences(final, claim)
-    feasible_pairs = None
-    if claim.quantity == TRAINING_COST:
-        deployed = deployed.iloc[:0]
-    else:
-        infeasible = final.loc[~final["feasible"].astype(bool), "seed"]
-        feasible_pairs = int((~differences.index.isin(infeasible)).sum())
-    failed = set(trials.loc[trials["status"] == TrialState.FAILED.value, "seed"])
+    beside = _differences(deployed.assign(**{claim.quantity: deployed[RETURN]}), claim)[0]
+    pairs = [
+        None if of_training else int((~of.index.isin(rows.loc[~rows["feasible"].astype(bool), "seed"])).sum())
+        for of, rows in ((differences, final), (beside, deployed))
+    ]
     both = set.intersection(
         *(set(trials.loc[trials["method"] == name, "seed"]) for name in (claim.method, claim.against))
     )
-    without_pair = (failed & both) - set(differences.index)
-    beside = _differences(deployed.assign(**{claim.quantity: deployed[RETURN]}), claim)[0]
     interval, ground = mean_interval(_numbers(differences)), mean_interval(_numbers(base))
     relative = interval.estimate / ground.estimate if ground.low > 0.0 else math.nan
     return {
-        **_counted(differences > ROUNDING, beside > ROUNDING, failed=len(without_pair)),
+        **_counted(differences > ROUNDING, beside > ROUNDING, failed=len(_failed_seeds(trials) & both)),
         **_ends(interval),
         "relative_difference": relative,
         "paper": claim.paper,
-        "feasible_pairs": feasible_pairs,
+        **dict(zip(FEASIBLE_PAIRS, pairs, strict=True)),
     }
 
 
 def _counted(held: pd.Series[bool], deployed: pd.Series[bool], *, failed: int) -> dict[str, Any]:
-    """Count where a claim holds; a failed trial or seed is one where it does not."""
-    count, trials = int(held.sum()), len(held) + failed
-    share = wilson_interval(count, trials)
+    """Count where a claim holds; a seed with a failed trial is one where it does not."""
+    count, seeds = int(held.sum()), len(held) + failed
+    share = wilson_interval(count, seeds)
     return {
-        "trials": trials,
+        "seeds": seeds,
         "failed": failed,
         "held": count,
         "share": share.estimate,
         "share_low": share.low,
         "share_high": share.high,
-        "deployment_trials": len(deployed) + failed if len(deployed) else 0,
+        "deployment_seeds": len(deployed) + failed if len(deployed) else 0,
         "deployment_held": int(deployed.sum()),
     }
 

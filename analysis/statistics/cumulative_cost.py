@@ -7,12 +7,20 @@ Undiscounted (the unit of all limits here), one row per trial:
 
     cost_sum         sum_b C_b, the measured mean episode cost of each policy
     limit_sum        sum_b D_b, the limits in force (the cost itself where they were infinite)
-    overshoot_sum    sum_b max(0, C_b - D_b), the cost above the limits in force
-    violation_sum    sum_b max(0, C_b - d_d), the cost above the deployment limit
+    over_limits_sum  cost_sum - limit_sum, the net cost above the limits in force
+    over_deploy_sum  cost_sum - n d_d, the net cost above the deployment limit
+    overshoot_sum    sum_b max(0, C_b - D_b), the positive parts of the measured means above the limits
     bound            H c_max + sum_{b<n} min(D_b + excess_b, H c_max), an upper bound on the expected cost of
                      the n policies if every update solves CPO's problem: policy b + 1 solves the problem
                      with limit D_b (``bounds.undiscounted_excess``), the first policy solves none
     ceiling_sum      n H c_max, the trivial bound of n policies
+
+In the two net costs, policies below a limit count against policies above it, so they may be negative. In
+``overshoot_sum`` they do not, but it is biased upwards. C_b is a mean of few episodes, so the sum is far
+above 0 even if the expected cost of every policy is that of its limit.
+
+If no episode ends while a policy is in use, its C_b is that of the policy before. At the beginning of
+training it is that of the first policy with an episode. ``metrics.training_totals`` counts the others.
 
 Discounted, as in the paper; do not add these to the above:
 
@@ -91,7 +99,6 @@ def policy_costs(
         end_step, cost, limit, ceiling, bound, discounted_excess (of the update that made the policy, 0 for
         the first), discounted_bound: the summands of the module's sums; NaN if unknown.
     """
-    # no episode ended: as for the policy before
     costs = updates[f"cost_{cost}"].ffill().bfill().to_numpy(np.float64)
     limits = updates[f"limit_{cost}"].to_numpy(np.float64)
     ceiling = math.inf if sizes is None else sizes.ceiling
@@ -165,19 +172,20 @@ def cumulative_costs(sweep: Sweep, *, cost: int | Mapping[str, int] = 0) -> pd.D
 
 
 def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.DataFrame:
-    """Return the largest d_t within a budget of cumulative violation: one row per GROUP with a bound.
+    """Return the largest d_t within a budget of cost above d_d: one row per GROUP with a bound.
 
     This is the inverse of Proposition 1 (``bounds.largest_train_limit``). The proven excess of an update is
-    too large for any budget. So the measured mean overshoot of the group's worst run is used.
+    too large for any budget. So the measured mean overshoot of the group's worst run is used. With few
+    episodes per policy it is too large (see the module), and the returned limit too small.
 
     Args:
         rows: of ``cumulative_costs``.
         sweep: of these rows.
-        budget: expected cost above d_d, summed over all episodes of a training phase, at least 0.
+        budget: expected net cost above d_d, summed over all episodes of a training phase, at least 0.
 
     Returns:
         GROUP, policies, episodes_per_policy, overshoot (assumed, per policy); used_train_limit (the largest
-        of the runs); measured_violation (of the worst run, over all episodes); largest_train_limit (NaN if
+        of the runs); measured_over_deploy (of the worst run, over all episodes); largest_train_limit (NaN if
         d_t = d_d exceeds the budget, infinite if d_t does not matter).
     """
     if not budget >= 0.0:
@@ -201,7 +209,7 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
             dict(zip(GROUP, group, strict=True))
             | {"policies": policies, "episodes_per_policy": episodes, "overshoot": overshoot}
             | {"used_train_limit": float(runs["train_limit"].max())}
-            | {"measured_violation": float((runs["violation_sum"] * runs["episodes_per_policy"]).max())}
+            | {"measured_over_deploy": float((runs["over_deploy_sum"] * runs["episodes_per_policy"]).max())}
             | {"largest_train_limit": limit}
         )
     return pd.DataFrame(lines)
@@ -226,6 +234,21 @@ def policies_of(sweep: Sweep, trial: pd.Series, updates: pd.DataFrame, *, cost: 
     return policy_costs(updates, cost=cost, sizes=sizes, discount=_discount(sweep, trial))
 
 
+def is_bounded(sweep: Sweep, agent: str, *, cost: int) -> bool:
+    """Whether any bound on the cost of an agent's trials is known: CPO's, or the trivial one of finite tasks.
+
+    Args:
+        sweep: of the trials.
+        agent: the agent's label.
+        cost: i, index of the cost.
+    """
+    trials = sweep.trials[(sweep.trials["agent"] == agent) & sweep.trials[f"deploy_limit_{cost}"].notna()]
+    return bool((trials["agent_name"] == "cpo").any()) or any(
+        task_sizes(str(name), sweep.task_options[str(task)], cost) is not None
+        for task, name in trials[["task", "task_name"]].drop_duplicates().itertuples(index=False)
+    )
+
+
 def task_sizes(name: str, options: Mapping[str, Any], cost: int) -> TaskSizes | None:
     """Return horizon and largest cost of a step of a finite task; None for others."""
     model = finite_model(name, options)
@@ -244,12 +267,14 @@ def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
 def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:
     """Sum over the policies of a trial."""
     costs, limits = policies["cost"].to_numpy(np.float64), policies["limit"].to_numpy(np.float64)
+    limits = np.where(np.isfinite(limits), limits, costs)
     return {
         "policies": len(costs),
         "cost_sum": float(costs.sum()),
-        "limit_sum": float(np.where(np.isfinite(limits), limits, costs).sum()),
+        "limit_sum": float(limits.sum()),
+        "over_limits_sum": float((costs - limits).sum()),
+        "over_deploy_sum": float((costs - deploy).sum()),
         "overshoot_sum": float(np.maximum(costs - limits, 0.0).sum()),
-        "violation_sum": float(np.maximum(costs - deploy, 0.0).sum()),
         "bound": _sum(policies["bound"]),
         "ceiling_sum": _sum(policies["ceiling"]),
         "discounted_excess_sum": _sum(policies["discounted_excess"]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,12 +50,18 @@ class CurveAverage:
     curve: Callable[[pd.DataFrame, str, Floats], Curve]
     enough_runs: int = 1
 
-    def describe(self, runs: int) -> str:
-        """Return the description, with a warning for too few runs; a single run has no band."""
-        if runs == 1:
+    def describe(self, runs: Collection[int]) -> str:
+        """Return the description, with a warning for too few runs; a single run has no band.
+
+        Args:
+            runs: number of runs of each line, at least one line.
+        """
+        if max(runs) == 1:
             return "one seed, no interval"
-        warning = f"; {runs} seeds are too few for it: the band is too narrow"
-        return self.description + (warning if runs < self.enough_runs else "")
+        fewest = min(count for count in runs if count > 1)
+        warning = f"; {fewest} seeds are too few for it: the band is too narrow"
+        single = "; a line without a band is one seed"
+        return self.description + warning * (fewest < self.enough_runs) + single * (min(runs) == 1)
 
 
 def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) -> Floats:

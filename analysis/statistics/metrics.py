@@ -26,7 +26,7 @@ from recrl.analysis.statistics.intervals import (
     stratified_bootstrap,
     wilson_interval,
 )
-from recrl.analysis.statistics.verdicts import costs_of, is_cost, solved, tie, within_limits
+from recrl.analysis.statistics.verdicts import is_cost, solved, tie, within_limits
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialState
 
@@ -57,8 +57,8 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
         KEY, measure, episodes, exact (whether computed, not sampled), episode_return, episode_return_se,
         cost_i, cost_i_se (standard errors over the trial's episodes, 0 where exact), trial_id, cpu_seconds
         (of the trial: MLflow tells its outcome from that of an earlier run), deploy_limit_i, optimal_return,
-        gap (J*(d_d) minus the return; the regret of a feasible trial), excess (the largest cost_i - d_d,i),
-        feasible, optimal (solved; False where J* is not known).
+        gap (J*(d_d) minus the return; the regret of a feasible trial), feasible, optimal (solved; False where
+        J* is not known).
     """
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
     final = _with_exact(_frozen(sweep, costs), sweep.exact)
@@ -69,9 +69,6 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
         complete[[*KEY, "trial_id", "cpu_seconds", *limits, "optimal_return"]], on=list(KEY)
     )
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
-    rows["excess"] = pd.DataFrame(
-        {i: rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"] for i in costs_of(rows)}
-    ).max(axis=1)
     rows["feasible"] = within_limits(rows)
     rows["optimal"] = solved(rows)
     order = {measure.value: position for position, measure in enumerate(Measure)}
@@ -85,8 +82,9 @@ def training_totals(sweep: Sweep) -> pd.DataFrame:
 
     Returns:
         KEY, episodes, steps; cost_i_total (the paper's SUM-J_C,i: all cost of training, within the limit or
-        not); excess_i_total (its part above d_d, episode by episode); updates_over_i (policy updates with a
-        mean cost above the limit in force).
+        not); excess_i_total (its part above d_d, episode by episode); updates_with_cost_i (policy updates in
+        which an episode ended, so that there is a mean cost); updates_over_i (such updates with a mean cost
+        above the limit in force).
     """
     trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
     phases = sweep.phases[sweep.phases["phase"] == Phase.TRAINING.value]
@@ -94,9 +92,11 @@ def training_totals(sweep: Sweep) -> pd.DataFrame:
     rows = phases[[*KEY, "episodes", "steps", *totals]].merge(trained[list(KEY)], on=list(KEY))
     updates = sweep.updates[sweep.updates["phase"] == Phase.TRAINING.value]
     for i in range(sweep.num_costs):
-        over = (updates[f"cost_{i}"] > updates[f"limit_{i}"]).rename(f"updates_over_{i}")
-        counts = over.groupby([updates[name] for name in KEY], observed=True).sum().reset_index()
-        rows = rows.merge(counts, on=list(KEY))
+        cost = updates[f"cost_{i}"]
+        counted = updates[list(KEY)].assign(
+            **{f"updates_with_cost_{i}": cost.notna(), f"updates_over_{i}": cost > updates[f"limit_{i}"]}
+        )
+        rows = rows.merge(counted.groupby(list(KEY), observed=True).sum().reset_index(), on=list(KEY))
     return rows
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.metrics import Measure
-from recrl.analysis.statistics.verdicts import is_cost
+from recrl.analysis.statistics.verdicts import is_cost, within_limit
 from recrl.orchestrator.spec import TrialState
 
 FINAL = Measure.STOCHASTIC
@@ -40,9 +40,9 @@ def count_verdicts(
     Returns:
         GROUP, seeds (evaluated final policies), solved, feasible (the solved ones included), infeasible;
         planned (all trials), failed, pending (neither complete nor failed: they wait, run or are damaged);
-        worst_excess (the largest cost above its limit among the infeasible seeds, or NaN); worst_share (the
-        same divided by that limit); for several costs worst_cost (the name of that cost, or empty) and
-        cost_name_i;
+        worst_excess (the largest cost above its limit among the infeasible seeds, or NaN; of several costs
+        the one furthest above its limit, as a fraction of the limit); worst_share (the same divided by that
+        limit); for several costs worst_cost (the name of that cost, or empty) and cost_name_i;
         episode_return and cost_i (means over seeds, with standard errors _se; NaN for one seed);
         deploy_limit_i, optimal_return, exact (whether every seed is; false without a seed), episodes (of a
         seed); deployment_return and deployment_cost_i (likewise, with _se); no_curriculum and hard_landing
@@ -103,16 +103,19 @@ def _states(status: pd.Series[str]) -> dict[str, int]:
 def _worst(
     seeds: pd.DataFrame, limits: Mapping[str, float], named: Mapping[str, str]
 ) -> dict[str, float | str]:
-    """Return the largest excess among the infeasible seeds, its fraction of the limit, and its cost."""
-    broken = seeds[~seeds["feasible"].astype(bool)]
-    excess = [
-        (float((broken[name] - limit).max()), limit, named.get(name, "")) for name, limit in limits.items()
-    ]
-    worst, limit, cost = max((it for it in excess if it[0] > 0.0), default=(math.nan, math.nan, ""))
-    found: dict[str, float | str] = {
-        "worst_excess": worst,
-        "worst_share": worst / limit if limit > 0.0 else math.nan,
-    }
+    """Return the largest excess among the infeasible seeds, its fraction of the limit, and its cost.
+
+    Costs may have different units, so the fractions are compared. Any excess of a limit of 0 is the largest.
+    """
+    found: dict[str, float | str] = {"worst_excess": math.nan, "worst_share": math.nan}
+    largest, cost = 0.0, ""
+    for name, limit in limits.items():
+        broken = seeds.loc[~within_limit(seeds, name.removeprefix("cost_")), name]
+        excess = float((broken - limit).max())
+        share = excess / limit if limit > 0.0 else math.inf
+        if excess > 0.0 and share > largest:
+            largest, cost = share, named.get(name, "")
+            found = {"worst_excess": excess, "worst_share": share if limit > 0.0 else math.nan}
     if len(limits) == 1:
         return found
     return (

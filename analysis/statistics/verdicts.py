@@ -20,17 +20,29 @@ ROUNDING = 1e-9  # of a difference of two returns: 9.5 - 9.3 is more than 0.2
 
 
 def within_limits(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether every mean cost is at most its limit plus ``tolerance``; missing costs count as feasible.
+    """Whether every mean cost is at most its limit plus ``tolerance``.
 
     Args:
-        rows: cost_i, deploy_limit_i (NaN if the task lacks it), and cost_i_se if costs are sampled.
+        rows: of ``within_limit``, for every cost.
     """
     within: pd.Series[bool] = pd.Series(True, index=rows.index)
     for i in costs_of(rows):
-        limit = rows[f"deploy_limit_{i}"]
-        errors = rows[f"cost_{i}_se"] if f"cost_{i}_se" in rows else pd.Series(0.0, index=rows.index)
-        within = within & ((rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna())
+        within = within & within_limit(rows, i)
     return within
+
+
+def within_limit(rows: pd.DataFrame, i: str) -> pd.Series[bool]:
+    """Whether the mean cost i is at most its limit plus ``tolerance``.
+
+    A missing limit is kept by every policy. A missing cost keeps no limit.
+
+    Args:
+        rows: cost_i, deploy_limit_i (NaN if the task lacks it), and cost_i_se if costs are sampled.
+        i: index of the cost, as in the columns' names.
+    """
+    limit = rows[f"deploy_limit_{i}"]
+    errors = rows[f"cost_{i}_se"] if f"cost_{i}_se" in rows else pd.Series(0.0, index=rows.index)
+    return (rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna()
 
 
 def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[float]:

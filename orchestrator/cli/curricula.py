@@ -49,14 +49,15 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
         allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
         say(
             console,
-            f"\nThe largest training limit d_t within {request.budget:g} of cost above the deployment limit "
-            "d_d over all episodes:",
+            f"\nThe largest training limit d_t within {request.budget:g} of net cost above the deployment "
+            "limit d_d over all episodes:",
         )
         show(text_tables.admissible_table(allowed), console)
         say(
             console,
-            "An estimate, not a bound: each policy is taken to exceed its limit as in the worst run. "
-            "Curricula whose limits are not known in advance are left out.",
+            "An estimate, not a bound: each policy is taken to exceed its limit as in the worst run. That "
+            "overshoot is the positive part of each update's sampled mean. With few episodes per policy it "
+            "is too large, and d_t too small. Curricula whose limits are not known in advance are left out.",
         )
     return ExitCode.OK
 

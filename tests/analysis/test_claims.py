@@ -22,13 +22,13 @@ def counted(
     return claims.count_claims(rows, training, trials)
 
 
-def outcome(task: str, method: str, episode_return: float, cost: float) -> dict[str, object]:
+def outcome(task: str, method: str, episode_return: float, cost: float, seed: int = 0) -> dict[str, object]:
     limit, optimum = {"rivergrid-1a": (5.0, 9.5), "rivergrid-1b": (1.0, 9.1)}.get(task, (5.0, 9.0))
     return {
         "task": task,
         "agent": "cpo",
         "method": method,
-        "seed": 0,
+        "seed": seed,
         "measure": "stochastic",
         "episode_return": episode_return,
         "cost_0": cost,
@@ -39,14 +39,14 @@ def outcome(task: str, method: str, episode_return: float, cost: float) -> dict[
 
 def held(*outcomes: dict[str, object]) -> dict[str, tuple[int, int]]:
     weighed = counted(pd.DataFrame(outcomes))
-    counts = zip(weighed["held"].astype(int), weighed["trials"].astype(int), strict=True)
+    counts = zip(weighed["held"].astype(int), weighed["seeds"].astype(int), strict=True)
     return dict(zip(weighed["claim"].astype(str), counts, strict=True))
 
 
 def test_a_plain_agent_that_does_not_arrive_stays() -> None:
     found = held(
         outcome("rivergrid-1a", "none", -20.0, 0.0),
-        outcome("rivergrid-1a", "none", 9.5, 5.0),
+        outcome("rivergrid-1a", "none", 9.5, 5.0, seed=1),
         outcome("rivergrid-1a", "dynamic", -20.0, 0.0),
     )
     assert found["the plain agent stays at the start on 1a"] == (1, 2)
@@ -57,9 +57,11 @@ def test_crossing_on_1b_violates_and_is_not_the_optimum_though_its_return_is_hig
     found = held(
         outcome("rivergrid-1b", "linear", 9.5, 5.0),
         outcome("rivergrid-1b", "cosine", 9.1, 1.009),
+        outcome("rivergrid-1b", "linear", 9.5, 5.0, seed=1),
+        outcome("rivergrid-1b", "cosine", 9.5, 5.0, seed=1),
         outcome("rivergrid-1b", "dynamic", 9.5, 5.0),
-        outcome("rivergrid-1b", "dynamic", 8.91, 0.1),
-        outcome("rivergrid-1b", "dynamic", 8.89, 0.1),
+        outcome("rivergrid-1b", "dynamic", 8.91, 0.1, seed=1),
+        outcome("rivergrid-1b", "dynamic", 8.89, 0.1, seed=2),
         outcome("rivergrid-1b", "none", 9.1, 1.06),
     )
     assert found == {
@@ -70,11 +72,28 @@ def test_crossing_on_1b_violates_and_is_not_the_optimum_though_its_return_is_hig
 
 
 def test_the_share_has_wilsons_interval() -> None:
-    weighed = counted(pd.DataFrame([outcome("rivergrid-1a", "linear", 9.5, 5.0)] * 5))
+    rows = pd.DataFrame([outcome("rivergrid-1a", "linear", 9.5, 5.0, seed) for seed in range(5)])
+    weighed = counted(rows)
     assert weighed["share_low"].item() == pytest.approx(0.5655, abs=1e-4)  # 1 / (1 + 1.96^2 / 5)
     assert claims_table(weighed)["holds in"].item() == "5 of 5 (57–100%)"
     table = claims_table(pd.concat([weighed, weighed.assign(held=3), weighed.assign(held=0)]))
     assert table["holds here"].tolist() == ["yes", "mixed", "no"]
+
+
+def test_three_curricula_of_a_seed_are_one_seed() -> None:
+    static = ("linear", "cosine", "exponential")
+    rows = [outcome("rivergrid-1b", method, 9.5, 5.0, seed) for method in static for seed in range(3)]
+    weighed = counted(pd.DataFrame(rows))
+    assert list(weighed[["held", "seeds"]].iloc[0]) == [3, 3]
+    assert claims_table(weighed)["holds in"].item() == "3 of 3"  # too few for an interval
+    pending = pd.DataFrame([outcome("rivergrid-1b", "cosine", 0.0, 0.0, 3)]).assign(status="running")
+    outcomes = pd.DataFrame([*rows, outcome("rivergrid-1b", "linear", 9.5, 5.0, 3)])
+    trials = pd.concat([outcomes.assign(status="complete"), pending])
+    weighed = claims.count_claims(outcomes.assign(feasible=False), NO_TRAINING, trials)
+    assert list(weighed[["held", "seeds", "failed"]].iloc[0]) == [3, 3, 0]  # seed 3 may still be either
+    lost = pending.drop(columns="status")
+    weighed = counted(outcomes, failed=lost)
+    assert list(weighed[["held", "seeds", "failed"]].iloc[0]) == [3, 4, 1]
 
 
 def test_the_deployment_phase_is_counted_beside_and_apart() -> None:
@@ -106,7 +125,7 @@ def test_a_comparison_counts_seeds_with_their_paired_difference_and_the_papers_r
     ]
     weighed = counted(pd.DataFrame(rows))
     line = weighed[weighed["claim"] == "linear returns more than none on CarGoal2"].iloc[0]
-    assert (line["held"], line["trials"], line["deployment_held"]) == (2, 3, 1)
+    assert (line["held"], line["seeds"], line["deployment_held"]) == (2, 3, 1)
     assert line["difference"] == pytest.approx(1.0)
     assert line["difference_high"] == pytest.approx(
         1.0 + 4.302653 / 3**0.5, abs=1e-5
@@ -114,6 +133,7 @@ def test_a_comparison_counts_seeds_with_their_paired_difference_and_the_papers_r
     assert line["relative_difference"] == pytest.approx(1.0 / 3.0)
     assert line["paper"] == "20% to 600%"
     shown = claims_table(weighed).set_index("claim").loc[line["claim"]]
+    assert (shown["holds here"], shown["holds in"]) == ("", "2 of 3")  # no verdict on a difference
     assert shown["difference"] == "+1.00 (-1.48 to +3.48)"
     assert shown["deployment phase (learning goes on)"] == "1 of 3"
     assert (shown["relative"], shown["paper, over its three tasks"]) == ("+33%", "20% to 600%")
@@ -123,7 +143,7 @@ def test_a_claim_does_not_hold_in_a_failed_trial() -> None:
     rows = pd.DataFrame([outcome("rivergrid-1b", "dynamic", 9.1, 1.0)])
     lost = [outcome("rivergrid-1b", "dynamic", 0.0, 0.0), outcome("rivergrid-1b", "none", 0.0, 0.0)]
     weighed = counted(rows, failed=pd.DataFrame(lost)).set_index("claim")
-    columns = ["held", "trials", "failed"]
+    columns = ["held", "seeds", "failed"]
     assert list(weighed.loc["the dynamic curriculum finds the optimum on 1b", columns]) == [1, 2, 1]
     assert list(weighed.loc["the plain agent finds the optimum on 1b", columns]) == [0, 1, 1]
     assert claims_table(weighed.reset_index())["failed"].tolist() == ["1", "1"]
@@ -134,10 +154,22 @@ def test_a_seed_with_a_failed_trial_is_no_gain_and_infeasible_pairs_are_counted_
     rows += [trial("linear", seed, 4.0) for seed in range(2)]
     weighed = counted(pd.DataFrame(rows), failed=pd.DataFrame([trial("linear", 2, 0.0)]))
     line = weighed.set_index("claim").loc["linear returns more than none on CarGoal2"]
-    assert list(line[["held", "trials", "failed", "feasible_pairs"]]) == [2, 3, 1, 1]
+    assert list(line[["held", "seeds", "failed", "feasible_pairs"]]) == [2, 3, 1, 1]
     assert line["difference"] == 1.0
     shown = claims_table(weighed).set_index("claim").loc["linear returns more than none on CarGoal2"]
-    assert (shown["holds in"], shown["failed"], shown["feasible pairs"]) == ("2 of 3", "1", "1 of 2")
+    assert (shown["failed"], shown["feasible pairs"]) == ("1", "1 of 2")
+    assert list(shown[["holds here", "holds in", "difference", "relative"]]) == ["", "–", "–", ""]
+
+
+def test_a_gain_in_the_deployment_phase_needs_feasible_pairs_of_its_own() -> None:
+    final = [trial(method, 0, 3.0) for method in ("none", "linear")]
+    deployed = [trial("none", 0, 3.0, measure="deployment")]
+    for cost, shown in ((20.0, "1 of 1"), (30.0, "–")):
+        rows = [*final, *deployed, trial("linear", 0, 4.0, cost, measure="deployment")]
+        weighed = counted(pd.DataFrame(rows)).set_index("claim", drop=False)
+        line = weighed.loc[["linear returns more than none on CarGoal2"]]
+        assert claims_table(line)["deployment phase (learning goes on)"].item() == shown
+        assert claims_table(line)["holds in"].item() == "0 of 1"
 
 
 def test_a_failed_trial_makes_no_comparison_that_the_sweep_does_not_have() -> None:
@@ -163,10 +195,10 @@ def test_dynamic_is_compared_with_each_static_curriculum_of_its_agent() -> None:
     weighed = counted(pd.DataFrame(rows)).set_index(["claim", "agent"])
     linear = weighed.loc["dynamic returns more than linear on CarGoal2"]
     assert linear["held"].to_dict() == {"ppo-lag": 1, "cpo": 0}  # no claim is about another label
-    assert linear["trials"].to_dict() == {"ppo-lag": 2, "cpo": 1}
+    assert linear["seeds"].to_dict() == {"ppo-lag": 2, "cpo": 1}
     assert linear["difference"].to_dict() == {"ppo-lag": 0.0, "cpo": -1.0}
     cosine = weighed.loc["dynamic returns more than cosine on CarGoal2"]
-    assert cosine["held"].to_dict() == cosine["trials"].to_dict() == {"ppo-lag": 1}
+    assert cosine["held"].to_dict() == cosine["seeds"].to_dict() == {"ppo-lag": 1}
     assert "dynamic returns more than exponential on CarGoal2" not in weighed.index.get_level_values(0)
 
 
@@ -184,7 +216,7 @@ def test_each_agent_and_curriculum_has_the_papers_own_range() -> None:
     }
 
 
-@pytest.mark.parametrize("base", [(-1.0, -2.0, -3.0), (-2.0, 0.0, 2.1), (3.0,)])
+@pytest.mark.parametrize("base", [(-1.0, -2.0, -3.0), (-2.0, 0.0, 2.1), (1.0, 2.0, 2.7), (3.0,)])
 def test_a_relative_gain_needs_a_base_above_zero_beyond_its_interval(base: tuple[float, ...]) -> None:
     rows = [trial("none", seed, value) for seed, value in enumerate(base)]
     rows += [trial("linear", seed, 5.0) for seed in range(len(base))]
@@ -196,8 +228,8 @@ def test_the_limit_is_a_claim_of_each_agent() -> None:
     rows = [trial("none", seed, 1.0, cost) for seed, cost in enumerate((20.0, 30.0))]
     rows += [trial("dynamic", 0, 1.0, 60.0, agent="cpo"), trial("dynamic", 0, 1.0, 60.0, agent="min-std")]
     weighed = counted(pd.DataFrame(rows)).set_index("claim")
-    assert tuple(weighed.loc["ppo-lag keeps d_d on CarGoal2", ["held", "trials"]]) == (1, 2)
-    assert tuple(weighed.loc["cpo violates d_d on CarGoal2", ["held", "trials"]]) == (1, 1)
+    assert tuple(weighed.loc["ppo-lag keeps d_d on CarGoal2", ["held", "seeds"]]) == (1, 2)
+    assert tuple(weighed.loc["cpo violates d_d on CarGoal2", ["held", "seeds"]]) == (1, 1)
     assert len(weighed) == 2
     table = claims_table(weighed.reset_index())
     assert table["deployment phase (learning goes on)"].tolist() == ["", ""]  # not measured here
@@ -213,7 +245,8 @@ def totals(**others: float) -> pd.DataFrame:
 
 
 def test_costs_of_training_are_compared_per_episode() -> None:
-    weighed = counted(pd.DataFrame([trial("linear", 0, 1.0)]), totals()).set_index("claim")
+    rows = [trial(method, 0, 1.0) for method in ("linear", "cosine", "exponential")]
+    weighed = counted(pd.DataFrame(rows), totals()).set_index("claim")
     found = weighed["difference"].dropna().to_dict()
     assert found == {
         "linear costs more in training than exponential on CarGoal2": pytest.approx(10.0),
@@ -225,6 +258,19 @@ def test_costs_of_training_are_compared_per_episode() -> None:
     assert table["deployment phase (learning goes on)"].tolist()[1:] == ["", "", ""]
 
 
+def test_costs_of_a_training_that_failed_or_goes_on_are_not_compared() -> None:
+    training = pd.concat([totals(), totals().assign(seed=1, cost_0_total=900.0)], ignore_index=True)
+    claim = "linear costs more in training than exponential on CarGoal2"
+    for status, expected in (("failed", [1, 2, 1]), ("running", [1, 1, 0])):
+        rows = pd.DataFrame([trial("linear", 0, 1.0)]).assign(feasible=True)
+        ended = (training["method"] != "linear") | (training["seed"] != 1)
+        trials = training.assign(status=ended.map({True: "complete", False: status}))
+        line = claims.count_claims(rows, training, trials).set_index("claim").loc[claim]
+        assert list(line[["held", "seeds", "failed"]]) == expected
+        assert line["difference"] == 10.0
+
+
 def test_costs_of_training_are_not_compared_by_one_of_several_costs() -> None:
-    weighed = counted(pd.DataFrame([trial("linear", 0, 1.0)]), totals(cost_1_total=1.0))
+    rows = [trial(method, 0, 1.0) for method in ("linear", "cosine", "exponential")]
+    weighed = counted(pd.DataFrame(rows), totals(cost_1_total=1.0))
     assert weighed["difference"].isna().all()

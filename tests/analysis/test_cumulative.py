@@ -10,7 +10,8 @@ import pytest
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
-from recrl.analysis.report.text_tables import admissible_table
+from recrl.analysis.report.drawing import drawings
+from recrl.analysis.report.text_tables import admissible_table, bound_table
 from recrl.analysis.statistics import cumulative_cost
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.main import main
@@ -80,7 +81,7 @@ def three_policies(finished: Sweep) -> Sweep:
 def test_sums_are_those_counted_by_hand(finished: Sweep) -> None:
     (row,) = cumulative_cost.cumulative_costs(three_policies(finished)).to_dict("records")
     assert (row["cost_sum"], row["limit_sum"]) == (38.0, 32.0)
-    assert (row["overshoot_sum"], row["violation_sum"]) == (10.0, 26.0)
+    assert (row["over_limits_sum"], row["over_deploy_sum"], row["overshoot_sum"]) == (6.0, 23.0, 10.0)
     assert row["episodes_per_policy"] == 4.0
     # two-state costs at most 1 a step for 10 steps: the first policy 10, then min(20, 10), min(10, 10)
     assert (row["bound"], row["ceiling_sum"]) == (30.0, 30.0)
@@ -93,11 +94,37 @@ def test_a_budget_is_spent_by_the_limit_it_allows(finished: Sweep) -> None:
     # (1 + 2/3 + 1/3) (d_t - 5)
     (row,) = cumulative_cost.admissible_limits(rows, sweep, budget=80.0).to_dict("records")
     assert row["largest_train_limit"] == pytest.approx(10.0)
-    assert row["measured_violation"] == 104.0
+    assert row["measured_over_deploy"] == 92.0
     (row,) = cumulative_cost.admissible_limits(rows, sweep, budget=39.0).to_dict("records")
     assert math.isnan(row["largest_train_limit"])
     table = admissible_table(pd.DataFrame([row]))
     assert table["largest d_t"].tolist() == ["none"]
+
+
+def test_a_budget_takes_the_worst_of_several_runs(finished: Sweep) -> None:
+    sweep = three_policies(finished)
+    row = cumulative_cost.cumulative_costs(sweep)
+    rows = pd.concat([row, row.assign(overshoot_sum=6.0, over_deploy_sum=-9.0)], ignore_index=True)
+    for order in (rows, rows.iloc[::-1]):
+        (found,) = cumulative_cost.admissible_limits(order, sweep, budget=80.0).to_dict("records")
+        assert found["overshoot"] == pytest.approx(10.0 / 3.0)
+        assert found["measured_over_deploy"] == 92.0
+        table = admissible_table(pd.DataFrame([found]))
+        assert table["episodes per policy"].tolist() == ["4.00"]  # few: the overshoot is biased
+
+
+def test_noise_of_few_episodes_is_no_cost_above_the_limits(finished: Sweep) -> None:
+    sweep = three_policies(finished)
+    noisy = sweep.updates.assign(cost_0=[15.0, 5.0, 10.0], limit_0=10.0)
+    (row,) = cumulative_cost.cumulative_costs(dataclasses.replace(sweep, updates=noisy)).to_dict("records")
+    assert (row["over_limits_sum"], row["over_deploy_sum"]) == (0.0, 15.0)
+    assert row["overshoot_sum"] == 5.0
+
+
+def test_a_policy_without_an_episode_costs_what_its_neighbour_does(finished: Sweep) -> None:
+    updates = three_policies(finished).updates.assign(cost_0=[math.nan, 6.0, math.nan])
+    policies = cumulative_cost.policy_costs(updates, cost=0, sizes=None, discount=None)
+    assert policies["cost"].tolist() == [6.0, 6.0, 6.0]
 
 
 def test_a_negative_budget_is_refused(finished: Sweep) -> None:
@@ -116,7 +143,7 @@ def test_the_command_says_it(river_grid: SweepStore, capsys: pytest.CaptureFixtu
     assert main(["bound", "--root", root, "--budget", "1000"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert "rivergrid-1a" in out
-    assert "\nThe largest training limit d_t within 1000 of cost above the deployment limit d_d " in out
+    assert "\nThe largest training limit d_t within 1000 of net cost above the deployment limit d_d " in out
 
 
 def test_the_command_counts_costs_from_0(river_grid: SweepStore, capsys: pytest.CaptureFixture[str]) -> None:
@@ -177,3 +204,52 @@ def test_the_figure_adds_up_what_the_table_sums(finished: Sweep) -> None:
     assert ends[3] == pytest.approx(chosen["cost_sum"].mean())
     assert ends[4] == pytest.approx(chosen["limit_sum"].mean())
     assert ends[-1] == pytest.approx(chosen["ceiling_sum"].mean())
+
+
+def test_every_line_of_the_figure_is_the_sum_that_its_label_names(river_grid: SweepStore) -> None:
+    sweep = sweep_data.load(river_grid)
+    (row,) = cumulative_cost.cumulative_costs(sweep).to_dict("records")
+    figure = cumulative_bounds(sweep, "cpo")
+    assert figure is not None
+    (axes,) = figure.axes
+    ends = {
+        str(line.get_label()): float(np.asarray(line.get_ydata(), dtype=float)[-1])
+        for line in axes.get_lines()
+        if not str(line.get_label()).startswith("_")
+    }
+    assert ends == {
+        "limits in force, the cost where infinite": pytest.approx(row["limit_sum"]),
+        "Proposition 1, discounted cost": pytest.approx(row["discounted_bound"]),
+        "bound, undiscounted cost": pytest.approx(row["bound"]),
+        "trivial bound: every step at the largest cost": pytest.approx(row["ceiling_sum"]),
+    }
+    assert len(set(ends.values())) == 4
+    ratio = row["bound"] / row["cost_sum"]
+    assert [text.get_text() for text in axes.texts] == [f"bound: {ratio:.3g} times\nthe measured cost"]
+    dashes = [line.get_linestyle() for line in axes.get_lines() if str(line.get_label()) in ends]
+    assert [it == "-" for it in dashes] == [True, False, False, False]
+
+
+def test_without_a_bound_none_is_announced(finished: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert {text for text in captions(finished, "bounds")} == {
+        "ppo-lag: Cumulative cost of training against its bounds",
+        "cpo: Cumulative cost of training against its bounds",
+    }
+    monkeypatch.setattr(cumulative_cost, "finite_model", lambda name, options: None)
+    assert captions(finished, "bounds")[0] == (
+        "ppo-lag: Cumulative cost of training against the limits in force"
+    )
+    rows = cumulative_cost.cumulative_costs(finished)
+    table = bound_table(rows[rows["agent"] == "ppo-lag"])
+    assert list(table)[5:] == [
+        "episodes per policy",
+        "cost",
+        "limits in force",
+        "net above limits in force",
+        "positive parts",
+        "net above the limit",
+    ]
+
+
+def captions(sweep: Sweep, kind: str) -> list[str]:
+    return [it.caption for it in drawings(sweep).values() if it.kind == kind]

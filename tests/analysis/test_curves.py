@@ -86,6 +86,15 @@ def test_a_band_is_the_bootstrap_interval_of_each_bin() -> None:
 
 def test_too_few_seeds_for_a_band_are_named() -> None:
     averaging = curves.interquartile(np.random.default_rng(0))
-    assert averaging.describe(10) == "interquartile mean and its 95% bootstrap band over seeds"
-    assert averaging.describe(5).endswith("; 5 seeds are too few for it: the band is too narrow")
-    assert curves.MEAN.describe(2) == "mean ± standard error over seeds"
+    assert averaging.describe([10]) == "interquartile mean and its 95% bootstrap band over seeds"
+    assert averaging.describe([12, 5]).endswith("; 5 seeds are too few for it: the band is too narrow")
+    assert curves.MEAN.describe([2]) == "mean ± standard error over seeds"
+
+
+def test_a_line_of_one_seed_does_not_hide_what_the_bands_of_the_others_are() -> None:
+    assert curves.MEAN.describe([1, 1]) == "one seed, no interval"
+    assert (
+        curves.MEAN.describe([3, 1]) == "mean ± standard error over seeds; a line without a band is one seed"
+    )
+    averaging = curves.interquartile(np.random.default_rng(0))
+    assert averaging.describe([12, 1]).endswith("over seeds; a line without a band is one seed")

@@ -1,5 +1,9 @@
 """A finished sweep in one file: what comes back, and what it leaves out."""
 
+import hashlib
+import io
+import json
+import re
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +21,7 @@ from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.report import drawing, table_files
 from recrl.analysis.statistics import metrics
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.faults.committing import commit_file
@@ -185,6 +189,158 @@ def test_a_file_of_another_format_is_named(finished: Sweep, tmp_path: Path, told
         match=r"of another version of recrl, or was changed: its format must be 2, got (1|3|None)$",
     ):
         export.load(path)
+
+
+def changed(sweep: Sweep, path: Path, member: str, change: Callable[[str], str]) -> Path:
+    """The compact file of a sweep with another content of one table, and the digest of that content."""
+    export.save(sweep, path)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name).decode() for name in archive.namelist()}
+    members[member] = change(members[member])
+    told = json.loads(members["sweep.json"])
+    if member != "sweep.json":
+        told["digests"][member] = hashlib.sha256(members[member].encode()).hexdigest()
+        del told["digests"]["sweep.json"]  # as in archives of earlier versions
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, text in (members | {"sweep.json": json.dumps(told)}).items():
+            archive.writestr(name, text)
+    return path
+
+
+@pytest.fixture
+def one_trial(made_up_sweep: Callable[..., SweepStore]) -> Sweep:
+    return sweep_data.load(made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none"], updates=20))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("deploy_limits", [40.0]), ("status", "failed"), ("cpu_seconds", 1.5)]
+)
+def test_a_change_of_the_trials_is_found(one_trial: Sweep, tmp_path: Path, name: str, value: object) -> None:
+    def change(text: str) -> str:
+        told = json.loads(text)
+        trial = told["trials"][0]
+        (trial if name in trial else trial["spec"])[name] = value
+        return json.dumps(told)
+
+    path = changed(one_trial, tmp_path / "sweep.zip", "sweep.json", change)
+    with pytest.raises(
+        DamagedError, match=r"its sweep\.json is not what was written; export the sweep again$"
+    ):
+        export.load(path)
+
+
+def without_digest(text: str) -> str:
+    told = json.loads(text)
+    del told["digests"]["sweep.json"]
+    return json.dumps(told)
+
+
+def test_an_earlier_archive_has_no_digest_of_its_trials(one_trial: Sweep, tmp_path: Path) -> None:
+    path = changed(one_trial, tmp_path / "sweep.zip", "sweep.json", without_digest)
+    assert export.load(path).facts == one_trial.facts
+
+
+def test_other_limits_than_those_of_the_deployment_phase_are_refused(
+    one_trial: Sweep, tmp_path: Path
+) -> None:
+    def change(text: str) -> str:
+        told = json.loads(without_digest(text))
+        told["trials"][0]["spec"]["deploy_limits"] = [40.0]
+        return json.dumps(told)
+
+    path = changed(one_trial, tmp_path / "sweep.zip", "sweep.json", change)
+    with pytest.raises(
+        RecrlError,
+        match=r"a cpo none seed 0: deploy_limits has 40, but updates\.csv has the limit 5 in the deployment",
+    ):
+        export.load(path)
+
+
+def test_a_trial_that_is_there_twice_is_refused(one_trial: Sweep, tmp_path: Path) -> None:
+    def change(text: str) -> str:
+        told = json.loads(without_digest(text))
+        return json.dumps({**told, "trials": told["trials"] * 2})
+
+    path = changed(one_trial, tmp_path / "sweep.zip", "sweep.json", change)
+    with pytest.raises(RecrlError, match=r"the trial a cpo none seed 0 is there 2 times$"):
+        export.load(path)
+
+
+def without(column: str) -> Callable[[pd.DataFrame], pd.DataFrame]:
+    return lambda rows: rows.drop(columns=column)
+
+
+def instead(column: str, word: str, other: str) -> Callable[[pd.DataFrame], pd.DataFrame]:
+    return lambda rows: rows.assign(**{column: rows[column].replace(word, other)})
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "sentence"),
+    [
+        ("phases", without("cost_0_total"), "phases.csv has no column 'cost_0_total'"),
+        ("phases", without("excess_0_total"), "phases.csv has no column 'excess_0_total'"),
+        ("phases", without("cost_0_std"), "phases.csv has no column 'cost_0_std'"),
+        (
+            "phases",
+            instead("phase", "deployment", "deploy"),
+            "phases.csv: the column 'phase' must hold training or deployment",
+        ),
+        (
+            "evaluations",
+            instead("policy", "stochastic", "sampled"),
+            "evaluations.csv: the column 'policy' must hold stochastic or deterministic",
+        ),
+        (
+            "evaluations",
+            lambda rows: rows.assign(cost_0=rows["cost_0"].where(rows.index % 2 == 0)),
+            "evaluations.csv: the column 'cost_0' lacks numbers",
+        ),
+        (
+            "phases",
+            lambda rows: rows.assign(excess_0_total=np.nan),
+            "phases.csv: the column 'excess_0_total' lacks numbers",
+        ),
+    ],
+)
+def test_rows_that_would_give_other_statistics_are_refused(
+    one_trial: Sweep,
+    tmp_path: Path,
+    name: str,
+    change: Callable[[pd.DataFrame], pd.DataFrame],
+    sentence: str,
+) -> None:
+    def rewritten(text: str) -> str:
+        return str(change(pd.read_csv(io.StringIO(text))).to_csv(index=False))
+
+    path = changed(one_trial, tmp_path / "sweep.zip", f"{name}.csv", rewritten)
+    with pytest.raises(RecrlError, match=f"{re.escape(sentence)}$"):
+        export.load(path)
+
+
+def test_costs_that_a_task_does_not_have_may_lack_numbers(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    few = {"seeds": 1, "agents": ["cpo"], "methods": ["none"], "updates": 20}
+    made_up_sweep(tasks=["a"], **few)
+    both = sweep_data.load(made_up_sweep(tasks=["b"], num_costs=2, **few))
+    assert both.evaluations["cost_1"].isna().mean() == 0.5
+    small = export.load(export.save(both, tmp_path / "both.zip"))
+    pd.testing.assert_frame_equal(small.evaluations, both.evaluations)
+
+
+def test_a_policy_table_that_does_not_fit_is_noted(
+    made_up_sweep: Callable[..., SweepStore], tmp_path: Path
+) -> None:
+    store = made_up_sweep(seeds=2, tasks=["a"], agents=["cpo"], methods=["none"], updates=20)
+    fitting, other = store.trials()
+    commit_file(fitting, "policy.csv", "action_0,action_1\n0.0,1.0\n0.6,0.4\n")
+    commit_file(other, "policy.csv", "action_0,action_1\n0.0,1.0\n")
+    sweep = sweep_data.load(store)
+    note = "policy tables that do not fit their task, so that the values are sampled: a cpo none seed 1"
+    assert sweep.notes == (note,)
+    assert export.load(export.save(sweep, tmp_path / "sweep.zip")).notes == (note,)  # and not twice
+    final = metrics.outcomes(sweep).query("measure == 'stochastic'")
+    assert final["exact"].tolist() == [True, False]
 
 
 def test_significant_digits() -> None:

@@ -20,6 +20,7 @@ from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
+from recrl.analysis.report.drawing import drawings
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 
@@ -101,6 +102,82 @@ def test_infinite_limits_are_marked(made_up_sweep: Callable[..., SweepStore]) ->
     store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none", "unconstrained"])
     panel = learning_curves.curricula(sweep_data.load(store)).axes[0]
     assert [text.get_text().strip() for text in panel.texts] == ["∞"]
+
+
+def test_infinite_limits_of_two_curricula_do_not_hide_each_other(finished: Sweep) -> None:
+    updates = finished.updates
+    infinite = updates["method"].isin(["linear", "dynamic"]) & (updates["end_step"] <= 8000)
+    sweep = dataclasses.replace(
+        finished, updates=updates.assign(limit_0=updates["limit_0"].mask(infinite, np.inf))
+    )
+    panel = learning_curves.curricula(sweep).axes[0]
+    marks = {
+        str(line.get_color()): list(np.asarray(line.get_ydata()))
+        for line in panel.get_lines()
+        if line.get_transform() == panel.get_xaxis_transform()
+        and len(np.asarray(line.get_xdata())) == 2
+        and line.get_color() != "black"
+    }
+    assert marks[STYLES["linear"].colour] == [1.0, 1.0]
+    assert 0.9 < marks[STYLES["dynamic"].colour][0] < 1.0
+    assert len({it.get_position() for it in panel.texts}) == 2
+
+
+def test_the_measurement_of_the_training_limit_is_not_marked(finished: Sweep) -> None:
+    updates = finished.updates
+    trials = finished.trials.assign(start_limit_0=60.0)
+    for measured, shown in ((1600, 0), (0, 2)):  # 10% of a trial, or a limit that is infinite later
+        of_linear = (updates["method"] == "linear") & (updates["end_step"] <= 1600) & (measured > 0)
+        of_linear |= (updates["method"] == "linear") & (updates["end_step"] == 4000) & (measured == 0)
+        infinite = updates.assign(limit_0=updates["limit_0"].mask(of_linear, np.inf))
+        figure = learning_curves.curricula(dataclasses.replace(finished, trials=trials, updates=infinite))
+        assert sum(len(axes.texts) for axes in figure.axes[:2]) == shown
+
+
+def test_a_cell_of_one_seed_does_not_change_what_the_bands_are_called(finished: Sweep) -> None:
+    updates = finished.updates
+    one = (updates["task"] == "river-a") & (updates["method"] == "none") & (updates["seed"] > 0)
+    figure = learning_curves.learning_curves(dataclasses.replace(finished, updates=updates[~one]), "cpo")
+    assert figure.legends[0].get_title().get_text() == (
+        "cpo: mean ± standard error over seeds; a line without a band is one seed"
+    )
+
+
+def test_the_shaded_region_is_called_above_the_limit(finished: Sweep) -> None:
+    figures = [return_against_cost(finished), learning_curves.learning_curves(finished, "cpo")]
+    figures += [learning_curves.curricula(finished), curriculum_diagnostics(finished, "river-a", "cpo")]
+    for figure in figures:
+        assert figure is not None
+        assert "above $d_d$" in legend_texts(figure)  # a policy there may be feasible within the tolerance
+
+
+def test_diagnostics_of_each_of_several_costs(made_up_sweep: Callable[..., SweepStore]) -> None:
+    store = made_up_sweep(seeds=1, num_costs=2, tasks=["a"], agents=["cpo"], methods=["none"], updates=20)
+    sweep = sweep_data.load(store)
+    sweep = dataclasses.replace(
+        sweep, updates=sweep.updates.assign(cost_1=3.0, explained_variance_cost_1=0.5)
+    )
+    figures = {stem: it for stem, it in drawings(sweep).items() if it.kind == "diagnostics"}
+    assert list(figures) == ["diagnostics_a_cpo", "diagnostics_a_cpo_cost-1"]
+    assert [it.about for it in figures.values()] == [("a", "cpo", "cost 0"), ("a", "cpo", "cost 1")]
+    figure = figures["diagnostics_a_cpo_cost-1"].make()
+    assert figure is not None
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels[0] == "cost 1"
+    assert "explained\nvariance, cost 1" in labels
+    assert set(np.asarray(lines_of(figure.axes[0], STYLES["none"].colour)[0].get_ydata())) == {3.0}
+
+
+def test_diagnostics_draw_the_explained_variance_of_their_own_cost_critic(finished: Sweep) -> None:
+    critics = {"reward": 0.9, "cost_0": 0.5, "cost_1": 0.1}
+    updates = finished.updates.assign(**{f"explained_variance_{name}": it for name, it in critics.items()})
+    figure = curriculum_diagnostics(dataclasses.replace(finished, updates=updates), "river-a", "cpo")
+    drawn = {
+        axes.get_ylabel(): set(np.asarray(lines_of(axes, STYLES["none"].colour)[0].get_ydata()).round(6))
+        for axes in figure.axes[::3]
+    }
+    assert drawn["explained\nvariance, reward"] == {0.9}
+    assert drawn["explained\nvariance, cost"] == {0.5}
 
 
 def test_a_running_sweep_says_how_many_seeds_have_arrived(made_up_sweep: Callable[..., SweepStore]) -> None:

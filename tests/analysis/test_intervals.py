@@ -185,6 +185,18 @@ def test_five_of_five_seeds_are_not_certainty() -> None:
     assert interval.low == pytest.approx(1.0 / (1.0 + 1.959964**2 / 5.0), abs=1e-6)  # 0.57
 
 
+def test_wilsons_interval_covers_about_95_percent_on_average_and_less_near_0_and_1() -> None:
+    shares = np.linspace(0.001, 0.999, 999)
+    for runs in (5, 10, 20):
+        ends = [wilson_interval(count, runs) for count in range(runs + 1)]
+        covered = np.array([[it.low <= share <= it.high for it in ends] for share in shares])
+        chances = stats.binom.pmf(np.arange(runs + 1), runs, shares[:, None])
+        coverage = (chances * covered).sum(axis=1)
+        assert coverage.mean() == pytest.approx(0.95, abs=0.01)
+        assert 0.83 <= coverage.min() < 0.845
+        assert not 0.05 < shares[coverage.argmin()] < 0.95
+
+
 def test_no_runs_have_no_share() -> None:
     assert math.isnan(wilson_interval(0, 0).estimate)
 

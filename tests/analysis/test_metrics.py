@@ -65,14 +65,29 @@ def test_feasible_allows_one_percent_or_one_standard_error() -> None:
     assert verdicts.within_limits(rows).tolist() == [True, False, True, False, True, True, False]
 
 
+def test_a_missing_limit_is_kept_and_a_missing_cost_keeps_no_limit() -> None:
+    rows = pd.DataFrame({"cost_0": [math.nan, 1.0], "deploy_limit_0": [5.0, math.nan]})
+    assert verdicts.within_limits(rows).tolist() == [False, True]
+
+
 def test_the_standard_error_of_the_deployment_phase_counts(finished: Sweep) -> None:
     phases = finished.phases.copy()
     deployed = phases["phase"] == "deployment"
     phases.loc[deployed, ["cost_0", "cost_0_std", "episodes"]] = [5.1, 2.0, 100.0]  # standard error 0.2
     rows = metrics.outcomes(dataclasses.replace(finished, phases=phases))
-    rows = rows[rows["measure"] == "deployment"]
-    assert rows["feasible"].all()
-    assert rows["excess"].tolist() == pytest.approx([0.1] * len(rows))
+    assert rows.loc[rows["measure"] == "deployment", "feasible"].all()
+
+
+def test_the_tolerance_of_a_sampled_final_policy_is_the_standard_error_of_its_mean(finished: Sweep) -> None:
+    index = finished.evaluations["index"]
+    for costs, feasible in ((index % 2 * 4.0 + 3.6, True), (index % 2 * 4.0 + 3.7, False)):
+        # ten episodes, half of them 2 below the mean and half above: s = 2.108, standard error 0.667
+        rows = metrics.outcomes(
+            dataclasses.replace(finished, evaluations=finished.evaluations.assign(cost_0=costs))
+        )
+        rows = rows[rows["measure"] == "stochastic"]
+        assert rows["cost_0_se"].tolist() == pytest.approx([2.0 / 3.0] * len(rows))
+        assert (rows["feasible"] == feasible).all()
 
 
 def test_solved_is_who_is_near_the_optimum_and_within_every_limit() -> None:
@@ -135,6 +150,14 @@ def test_training_totals_by_hand(finished: Sweep, finished_sweep: SweepStore) ->
     updates = trial.updates()
     trained = updates[updates["phase"] == "training"]
     assert row["updates_over_0"] == sum(trained["cost_0"] > trained["limit_0"])
+    assert row["updates_with_cost_0"] == len(trained)
+
+
+def test_updates_without_an_episode_are_not_counted_as_within_the_limit(finished: Sweep) -> None:
+    known = finished.updates["update"] % 2 == 0
+    updates = finished.updates.assign(cost_0=np.where(known, 100.5, np.nan))
+    totals = metrics.training_totals(dataclasses.replace(finished, updates=updates))
+    assert set(totals["updates_with_cost_0"]) == set(totals["updates_over_0"]) == {19}  # of 38
 
 
 def test_summary_averages_over_seeds(finished: Sweep) -> None:

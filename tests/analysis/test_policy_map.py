@@ -54,6 +54,7 @@ def river_task_of(spec: TrialSpec) -> Choice:
 
 def test_swimming_and_walking_average_to_what_is_counted_by_hand(river_sweep: Sweep) -> None:
     behaviour = mean_behaviour(river_sweep.policies, parse_map(MAPS["1b"]), OPTIONS)
+    assert behaviour is not None
     assert behaviour.runs == 2
     # swim: 5 steps at -0.1, then 10, five of them in the water; walk: 3 turns and 8 forward, the last to G
     assert behaviour.episode_return == pytest.approx(((10.0 - 0.5) + (10.0 - 1.0)) / 2)
@@ -70,6 +71,15 @@ def test_arrows_go_where_the_policies_go(river_sweep: Sweep) -> None:
     squares = {(int(x), int(y)) for x, y in np.asarray(arrows.get_offsets())}
     # through the water on row 6; down, along row 7 and up to G; at the turns there are dots
     assert squares == {(x, 6) for x in range(1, 7)} | {(x, 7) for x in range(1, 8)}
+
+
+def test_a_table_that_does_not_fit_is_not_on_the_map(river_sweep: Sweep) -> None:
+    last = river_sweep.policies.index[-1]
+    figure = policy_maps(dataclasses.replace(river_sweep, policies=river_sweep.policies.drop(last)), "cpo")
+    assert figure is not None
+    assert figure.axes[0].get_title() == "linear, 1 run\nreturn 9.50, cost 5.00"
+    none = river_sweep.policies.assign(action_0=0.7)
+    assert policy_maps(dataclasses.replace(river_sweep, policies=none), "cpo") is None
 
 
 def test_an_agent_without_a_table_has_no_map(river_sweep: Sweep) -> None:

@@ -24,6 +24,8 @@ def test_a_profile_falls_by_a_run_at_the_return_of_each_run(finished: Sweep) -> 
     returns = rows["episode_return"].to_numpy()
     assert shares == pytest.approx([(returns > threshold).mean() for threshold in thresholds])
     assert (shares[0], shares[-1]) == (1.0, 0.0)
+    assert set(returns) < set(thresholds)
+    assert line.get_drawstyle() == "steps-post"  # vertical at a return, and level up to the next one
 
 
 def test_infeasible_runs_count_as_the_worst(finished: Sweep) -> None:

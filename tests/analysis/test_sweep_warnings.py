@@ -39,6 +39,14 @@ def test_seeds_of_a_cell_that_ran_different_code_are_one_sentence(finished: Swee
     assert sentence in drawing.missing(sweep)
 
 
+def test_an_export_is_advised_what_only_its_folder_can_do(finished: Sweep) -> None:
+    sweep = with_code(finished, {})
+    advice = "launch --rerun-changed runs them again"
+    assert doubts(sweep)[0].endswith(advice)
+    export = dataclasses.replace(sweep, folder=None)
+    assert doubts(export)[0].endswith(f"{advice}, in a sweep's own folder")
+
+
 def test_code_that_differs_from_that_of_the_baseline_is_named(finished: Sweep) -> None:
     assert mixed_code_sentence(with_code(finished, {"river-a cpo linear": "old"})) == (
         "the code that trials ran differs between none and curricula compared with it (river-a cpo linear); "

@@ -86,6 +86,44 @@ def test_the_worst_cost_is_the_one_that_is_furthest_over_its_limit() -> None:
     assert {"cost 0", "limit 1"} <= set(table)
 
 
+def test_the_worst_cost_is_none_within_its_tolerance_and_costs_are_compared_by_their_limits() -> None:
+    limits = {"deploy_limit_0": 5.0, "deploy_limit_1": 1000.0, "feasible": False}
+    sampled = {"cost_0_se": 0.0, "cost_1_se": 20.0}
+    tolerated = judged([outcome("none", 0, 9.5, 5.5, cost_1=1015.0, **limits, **sampled)]).iloc[0]
+    assert list(tolerated[["worst_excess", "worst_share", "worst_cost"]]) == [0.5, 0.1, "0"]
+    both = judged([outcome("none", 0, 9.5, 5.5, cost_1=1050.0, **limits, **sampled)]).iloc[0]
+    assert list(both[["worst_excess", "worst_cost"]]) == [0.5, "0"]  # 10%, and not 5% of 1000
+    none_allowed = {**limits, "deploy_limit_1": 0.0}
+    zero = judged([outcome("none", 0, 9.5, 50.0, cost_1=0.1, **none_allowed)]).iloc[0]
+    assert (zero["worst_excess"], zero["worst_cost"]) == (0.1, "1")
+    assert math.isnan(zero["worst_share"])
+
+
+def test_warnings_of_a_curriculum_are_summed_over_its_seeds() -> None:
+    trials = trials_of(ROWS)
+    linear = trials["method"] == "linear"
+    flags = trials[list(KEY)].assign(no_curriculum=linear, hard_landing=linear & (trials["seed"] == 0))
+    table = count_verdicts(pd.DataFrame(ROWS), NONE_COMPARED, flags, trials).set_index("method")
+    assert table["no_curriculum"].to_dict() == {"none": 0, "linear": 2, "dynamic": 0}
+    assert table["hard_landing"].to_dict() == {"none": 0, "linear": 1, "dynamic": 0}
+
+
+def test_several_intervals_are_said_to_be_uncorrected() -> None:
+    rows = [
+        outcome(method, seed, value + 0.1 * seed, 5.0)
+        for method, value in (("none", 9.0), ("linear", 9.2), ("dynamic", 9.3))
+        for seed in range(2)
+    ]
+    trials = trials_of(rows)
+    flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
+    compared = metrics.comparisons(pd.DataFrame(rows), np.random.default_rng(0))
+    table = count_verdicts(pd.DataFrame(rows), compared, flags, trials)
+    sentence = "Intervals in this table: 2, of 95% each, not corrected for their number."
+    assert sentence in verdict_texts.explanation(table)
+    one = table[table["method"] != "linear"]
+    assert not any("not corrected" in sentence for sentence in verdict_texts.explanation(one))
+
+
 def test_the_table_says_the_verdict_in_words() -> None:
     table = verdict_texts.verdict_table(judged(ROWS))
     assert table["verdict"].tolist() == [
