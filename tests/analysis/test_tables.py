@@ -10,6 +10,7 @@ import pandas as pd
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_files, table_formats
 from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.analysis.statistics.metrics import Measure
 
 
@@ -96,6 +97,35 @@ def test_a_dash_in_place_of_a_gain_is_explained_where_there_is_one(finished: Swe
 
     assert not all("deployment" in heading for heading in explained(100.0))
     assert all("deployment" in heading for heading in explained(0.0))
+
+
+def test_tables_with_several_intervals_say_that_they_are_not_corrected(
+    finished: Sweep, tmp_path: Path
+) -> None:
+    notes = {it.heading: it.note for it in table_files.write_tables(finished, tmp_path)[1].shown}
+    # eight pairs of cells, each with intervals of return, cost and probability
+    sentence = "Intervals in this table: 24, of 95% each, not corrected for their number."
+    assert sentence in notes["Final policy, stochastic, minus none"]
+    weighed = pd.DataFrame(
+        {"section": "6", "claim": ["one", "another"], "agent": "cpo", "held": 5, "seeds": 5}
+    )
+    weighed = weighed.assign(share_low=0.57, share_high=1.0, deployment_held=0, deployment_seeds=0, failed=0)
+    weighed = weighed.assign(difference=math.nan, feasible_pairs=pd.NA, deployment_feasible_pairs=pd.NA)
+    note = table_files._claims(weighed).note
+    assert note.startswith("Counted are seeds.")
+    assert note.endswith("Intervals in this table: 2, of 95% each, not corrected for their number.")
+
+
+def test_a_table_of_costs_without_a_bound_does_not_announce_one(finished: Sweep) -> None:
+    costs = cumulative_costs(finished)
+    bounded = table_files._bounds(costs, "")
+    assert bounded.heading == "Cumulative cost of training against its bounds"
+    assert "and of the measured cost where the limit was infinite" in bounded.note
+    assert "Trivial bound: " in bounded.note and "trivial bound" in bounded.table
+    unknown = costs.assign(bound=math.nan, discounted_bound=math.nan, ceiling_sum=math.nan)
+    shown = table_files._bounds(unknown, " fuel")
+    assert shown.heading == "Cumulative cost of training against the limits in force (cost fuel)"
+    assert "ound" not in shown.note and not any("bound" in str(name) for name in shown.table)
 
 
 def test_a_task_has_rows_of_its_own_measures_only(finished: Sweep) -> None:

@@ -88,10 +88,10 @@ def test_the_worst_cost_is_the_one_that_is_furthest_over_its_limit() -> None:
 
 def test_the_worst_cost_is_none_within_its_tolerance_and_costs_are_compared_by_their_limits() -> None:
     limits = {"deploy_limit_0": 5.0, "deploy_limit_1": 1000.0, "feasible": False}
-    sampled = {"cost_0_se": 0.0, "cost_1_se": 20.0}
-    tolerated = judged([outcome("none", 0, 9.5, 5.5, cost_1=1015.0, **limits, **sampled)]).iloc[0]
+    sampled = {"cost_0_se": 0.0, "cost_1_se": 200.0}
+    tolerated = judged([outcome("none", 0, 9.5, 5.5, cost_1=1150.0, **limits, **sampled)]).iloc[0]
     assert list(tolerated[["worst_excess", "worst_share", "worst_cost"]]) == [0.5, 0.1, "0"]
-    both = judged([outcome("none", 0, 9.5, 5.5, cost_1=1050.0, **limits, **sampled)]).iloc[0]
+    both = judged([outcome("none", 0, 9.5, 5.5, cost_1=1050.0, cost_1_se=1.0, **limits)]).iloc[0]
     assert list(both[["worst_excess", "worst_cost"]]) == [0.5, "0"]  # 10%, and not 5% of 1000
     none_allowed = {**limits, "deploy_limit_1": 0.0}
     zero = judged([outcome("none", 0, 9.5, 50.0, cost_1=0.1, **none_allowed)]).iloc[0]

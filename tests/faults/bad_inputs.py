@@ -521,9 +521,10 @@ def _pack(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> None
 
 
 def _edit(changes: dict[str, Any], *place: str | int, without: str = "") -> None:
-    """Change some keys of sweep.json, at a place in it."""
+    """Change some keys of sweep.json, at a place in it, without its digest."""
     members = _read_good()
     told = json.loads(members["sweep.json"])
+    del told["digests"]["sweep.json"]
     inner = told
     for part in place:
         inner = inner[part]

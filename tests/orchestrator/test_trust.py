@@ -152,6 +152,7 @@ def test_a_name_from_a_file_leads_nowhere_else(tmp_path: Path, name: str, foreig
     with zipfile.ZipFile("small.zip") as archive:
         members = {member: archive.read(member) for member in archive.namelist()}
     told = json.loads(members["sweep.json"])
+    del told["digests"]["sweep.json"]  # who changes a file can leave it out
     members["sweep.json"] = json.dumps({**told, "name": name}).encode()
     (foreign / "work").mkdir()
     evil = foreign / "work" / "small.zip"
