@@ -110,7 +110,7 @@ def test_tables_with_several_intervals_say_that_they_are_not_corrected(
         {"section": "6", "claim": ["one", "another"], "agent": "cpo", "held": 5, "seeds": 5}
     )
     weighed = weighed.assign(share_low=0.57, share_high=1.0, deployment_held=0, deployment_seeds=0, failed=0)
-    weighed = weighed.assign(difference=math.nan, feasible_pairs=pd.NA, deployment_feasible_pairs=pd.NA)
+    weighed = weighed.assign(difference=math.nan, feasible_pairs=None, deployment_feasible_pairs=None)
     note = table_files._claims(weighed).note
     assert note.startswith("Counted are seeds.")
     assert note.endswith("Intervals in this table: 2, of 95% each, not corrected for their number.")
