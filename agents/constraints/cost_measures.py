@@ -266,12 +266,10 @@ class TailCost:
             episodes: of the window.
             limits: d, [k], possibly infinite.
         """
-        values, at_risk = np.full_like(limits, np.nan), np.zeros_like(limits)
-        if len(episodes.costs):
-            at_risk = value_at_risk(episodes.costs, self._level)
+        known = len(episodes.costs) > 0
+        at_risk = value_at_risk(episodes.costs, self._level) if known else np.zeros_like(limits)
         threshold = np.minimum(at_risk, limits)
-        if len(episodes.costs):
-            values = tail_bound(episodes.costs, threshold, self._level)
+        values = tail_bound(episodes.costs, threshold, self._level) if known else np.full_like(limits, np.nan)
         beyond = np.maximum(episodes.costs - threshold, 0.0) / (1.0 - self._level)
         costs = tail_costs(
             rollout.costs,

@@ -84,17 +84,22 @@ class ActorCritic:
         self._recent = RecentEpisodes(config.constraint_window, cmdp.num_costs)
         self._rule = rule
         self._generator = generator
-        mean_cost = MeanCost(config.constraint_window, cmdp.num_costs)
-        self._constraint = TailCost(config.cvar_level) if config.constraint == "cvar" else mean_cost
+        self._constraint = (
+            TailCost(config.cvar_level)
+            if config.constraint == "cvar"
+            else MeanCost(config.constraint_window, cmdp.num_costs)
+        )
         self._parts: dict[str, Stateful] = {
             "encoder": self._encoder,
             "average": self._average,
             "critic_optimiser": self._critic_optimiser,
             "value_scale": self._value_scale,
             "recent_episodes": self._recent,
-            "mean_cost": mean_cost,
         }
-        if taken := sorted(rule.parts.keys() & {"policy", "critics", "generator", *self._parts}):
+        if isinstance(self._constraint, MeanCost):
+            self._parts["constraint"] = self._constraint
+        reserved = {"policy", "critics", "generator", "constraint", *self._parts}
+        if taken := sorted(rule.parts.keys() & reserved):
             raise ValueError(f"a rule's parts need other names than the agent's own, got {', '.join(taken)}")
         self._parts |= rule.parts
 

@@ -10,6 +10,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.number_texts import DASH, number
+from recrl.analysis.statistics.claims import CLAIMS, Comparison
 from recrl.analysis.statistics.intervals import share_text
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -37,7 +38,7 @@ def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
     """
     shares = zip(weighed["held"], weighed["seeds"], weighed["share_low"], weighed["share_high"], strict=True)
     beside = zip(weighed["deployment_held"], weighed["deployment_seeds"], strict=True)
-    compared = weighed["difference"].notna()
+    compared = weighed["claim"].isin([claim.text for claim in CLAIMS if isinstance(claim, Comparison)])
     gains = compared & weighed["feasible_pairs"].notna()
     ended = weighed["seeds"] - weighed["failed"]
     no_gain = gains & (weighed["feasible_pairs"] < ended)

@@ -89,3 +89,11 @@ def test_advantages_and_targets_are_those_of_a_loop_over_the_steps(
     measured = found.explained_variances()
     names = ("explained_variance_reward", "explained_variance_cost_0", "explained_variance_cost_1")
     assert [measured[name] for name in names] == pytest.approx(explained, rel=1e-4)
+
+
+@pytest.mark.parametrize(("constraint", "own"), [("mean", {"constraint"}), ("cvar", set())])
+def test_the_parts_of_a_state_have_their_names(constraint: str, own: set[str]) -> None:
+    """Checkpoints of earlier versions are evaluated, too: a new name would make them unreadable."""
+    agent, _ = learnt_agent({"constraint": constraint})
+    parts = {"policy", "critics", "generator", "encoder", "average", "critic_optimiser", "value_scale"}
+    assert set(agent.state_dict()) == parts | {"recent_episodes", "optimiser", "multipliers"} | own

@@ -53,7 +53,6 @@ OTHERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "multiplier_rule": ("projected", {}),
     "multiplier_step": (5.0, {}),
     "multiplier_unit": ("cost", {}),
-    "network": ("recrl.agents.networks.test_only:missing", {}),
     "noise_form": ("temperature", {}),
     "normalise_observations": ("all", {}),
     "penalty": ("separate", {"clip": 0.001}),

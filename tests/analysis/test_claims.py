@@ -270,6 +270,15 @@ def test_costs_of_a_training_that_failed_or_goes_on_are_not_compared() -> None:
         assert line["difference"] == 10.0
 
 
+def test_a_comparison_all_of_whose_seeds_failed_holds_nowhere_and_has_no_verdict() -> None:
+    claim = "linear costs more in training than exponential on CarGoal2"
+    rows = pd.DataFrame([trial("linear", 0, 1.0)]).assign(feasible=True)
+    trials = totals().assign(status="failed")
+    weighed = claims.count_claims(rows, totals(), trials)
+    shown = claims_table(weighed).set_index("claim").loc[claim]
+    assert list(shown[["holds here", "holds in", "difference"]]) == ["", "0 of 1", ""]
+
+
 def test_costs_of_training_are_not_compared_by_one_of_several_costs() -> None:
     rows = [trial(method, 0, 1.0) for method in ("linear", "cosine", "exponential")]
     weighed = counted(pd.DataFrame(rows), totals(cost_1_total=1.0))
