@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from recrl.orchestrator.spec import TrialSpec
@@ -27,8 +28,15 @@ class Executor(Protocol):
         ...
 
 
+@dataclass(frozen=True)
 class InlineExecutor:
-    """Executor that runs the trials one after the other in this process."""
+    """Executor that runs the trials one after the other in this process.
+
+    Attributes:
+        on_gpu: whether they learn on CUDA.
+    """
+
+    on_gpu: bool = False
 
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """See ``Executor.run``."""
@@ -38,4 +46,4 @@ class InlineExecutor:
             if stop.is_set():
                 return
             with place.working_copy(spec, stop.is_set) as trial:
-                run_recorded(spec, trial, should_stop=stop.is_set)
+                run_recorded(spec, trial, should_stop=stop.is_set, on_gpu=self.on_gpu)

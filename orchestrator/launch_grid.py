@@ -214,7 +214,11 @@ def _executor(grid: GridSpec, place: SweepPlace, options: LaunchOptions) -> Exec
     if options.ship_package and not options.address:
         raise RecrlError("--ship-package: needs an --address to ship to")
     if options.executor == "inline":
-        return InlineExecutor()
+        if on_gpu := grid.resources.gpus_per_trial > 0.0:
+            from recrl.orchestrator.trial.device import device_name  # noqa: PLC0415  (imports torch)
+
+            device_name(on_gpu=True)  # an error before any trial
+        return InlineExecutor(on_gpu=on_gpu)
     if place.uri.startswith("memory://"):
         raise RecrlError(f"{place.uri}: is memory of a single process; use --executor inline")
     from recrl.orchestrator.ray.ray_executor import RayExecutor  # noqa: PLC0415  (imports ray)

@@ -41,7 +41,7 @@ class Categorical:
 
     def at(self, rows: Tensor) -> Categorical:
         """Return the distribution at some rows only, int64 [V]."""
-        return Categorical(self.log_probs.index_select(0, rows))
+        return Categorical(self.log_probs[rows])
 
     def divergence(self, other: Categorical) -> Tensor:
         """KL(self || other) = sum_a p_a (log p_a - log q_a) at each row, [U]."""
@@ -78,14 +78,14 @@ class Gaussian:
             actions: [D, m].
             rows: the row of each pair, int64 [D], or None if pair i was taken at row i.
         """
-        mean = self.mean if rows is None else self.mean.index_select(0, rows)
+        mean = self.mean if rows is None else self.mean[rows]
         standardised = (actions - mean) * torch.exp(-self.log_std)
         constant = self.log_std.sum() + 0.5 * math.log(2.0 * math.pi) * len(self.log_std)
         return -0.5 * standardised.square().sum(1) - constant
 
     def at(self, rows: Tensor) -> Gaussian:
         """Return the distribution at some rows only, int64 [V]."""
-        return Gaussian(self.mean.index_select(0, rows), self.log_std)
+        return Gaussian(self.mean[rows], self.log_std)
 
     def divergence(self, other: Gaussian) -> Tensor:
         """KL(self || other) at each row, summed over the action components, [U].

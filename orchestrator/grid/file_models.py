@@ -220,7 +220,9 @@ class Resources(_Written):
     """Resources of a trial; no result depends on them."""
 
     cpus_per_trial: Number = Field(default=1.0, gt=0.0, le=1024.0, description="Cores of a running trial.")
-    gpus_per_trial: Number = Field(default=0.0, ge=0.0, le=64.0, description="GPUs of a running trial.")
+    gpus_per_trial: Number = Field(
+        default=0.0, ge=0.0, le=64.0, description="GPUs of a running trial. Above 0 it learns on CUDA."
+    )
     custom_per_trial: CustomResources = Field(
         default_factory=dict,
         description="Custom resources of a running trial, by the names given to a cluster's nodes "

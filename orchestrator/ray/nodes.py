@@ -74,6 +74,27 @@ def check_nodes(probe: str, uri: str = "") -> None:
         )
 
 
+def check_gpus() -> None:
+    """Check that PyTorch was built for GPUs on every node that has some, before any trial.
+
+    Raises:
+        ClusterError: one sentence with every node whose PyTorch was not.
+    """
+    task = ray.remote(_torch_without_gpu())
+    asked = {}
+    for node in _nodes():
+        if node["Resources"].get("GPU", 0.0) > 0.0:
+            only = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            asked[task.options(num_cpus=0, scheduling_strategy=only).remote()] = node["NodeManagerAddress"]
+    ready, _ = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_SECONDS) if asked else ([], [])
+    found = {asked[answer]: ray.get(answer) for answer in ready}
+    if problems := [f"{address} has torch {there}" for address, there in found.items() if there]:
+        raise ClusterError(
+            f"resources.gpus_per_trial is above 0, but {', '.join(sorted(problems))}, "
+            "which cannot use its GPUs; install torch with CUDA there, or set gpus_per_trial to 0"
+        )
+
+
 def differences(address: str, here: Mapping[str, str], there: Mapping[str, str], place: str) -> list[str]:
     """Return a sentence for each difference of a node.
 
@@ -102,6 +123,17 @@ def _nodes() -> list[dict[str, Any]]:
 
 def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "")
+
+
+def _torch_without_gpu() -> Callable[[], str]:
+    """Return the function that runs on the nodes: the version of a PyTorch without GPUs, else empty."""
+
+    def look() -> str:
+        import torch  # noqa: PLC0415  (the driver does without)
+
+        return "" if torch.version.cuda or torch.version.hip else torch.__version__
+
+    return look
 
 
 def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:

@@ -43,7 +43,7 @@ from recrl.orchestrator.files.sweep_store import SILENCE_SECONDS
 from recrl.orchestrator.launch_plan import usable_cores
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
-from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit
+from recrl.orchestrator.ray.nodes import check_gpus, check_nodes, trials_that_fit
 from recrl.orchestrator.ray.process_state import environment, own_signal_handlers
 from recrl.orchestrator.ray.services import LostServices
 from recrl.orchestrator.ray.teacher_service import start_teacher_service
@@ -102,6 +102,8 @@ class RayExecutor:
         with environment(QUIET | WORKER), lost.watched(self._cluster()), place.new_stop_sign() as stop_sign:
             if self.address:
                 check_nodes(stop_sign.place, stop_sign.uri)
+            if self.gpus_per_trial:
+                check_gpus()
             queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
             watchdog = HangWatchdog(place, self.silence_of(place))
             watch = DriverWatch(place, queue, stop=stop, stop_sign=stop_sign, watchdog=watchdog, lost=lost)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +46,14 @@ class TuneTrial(tune.Trainable):
         from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
         if not self._stop_sign.is_set():
-            with _given_gpu(), self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:
+            with self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:
                 run_recorded(
                     self._spec,
                     trial,
                     should_stop=self._stop_sign.is_set,
                     teacher=self._teacher,
                     commit_seconds=self._commit_seconds,
+                    on_gpu=bool(ray.get_gpu_ids()),
                 )
         return {"done": True}
 
@@ -65,15 +65,6 @@ class TuneTrial(tune.Trainable):
         self._commit_seconds: float = config["commit_seconds"]
         name = config["teacher_service"]
         self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
-
-
-def _given_gpu() -> AbstractContextManager[Any]:
-    """Make new agents on the GPU that Ray assigned to this worker, if it is usable."""
-    if not ray.get_gpu_ids():
-        return nullcontext()
-    import torch  # noqa: PLC0415  (the driver does without)
-
-    return torch.device("cuda") if torch.cuda.is_available() else nullcontext()
 
 
 def spec_of(trial: Any) -> TrialSpec:

@@ -26,6 +26,7 @@ from recrl.orchestrator.provenance.code_changes import code_of
 from recrl.orchestrator.provenance.versions import collect as collect_provenance
 from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.trial.device import device_name, learning_on
 from recrl.orchestrator.trial.heartbeat import Heartbeat
 from recrl.orchestrator.trial.trial import Trial, open_environments
 from recrl.teachers.registry import make_teacher
@@ -141,12 +142,21 @@ def run_recorded(
     should_stop: Callable[[], bool],
     teacher: Teacher | None = None,
     commit_seconds: float = COMMIT_SECONDS,
+    on_gpu: bool = False,
 ) -> TrialState:
     """Call ``run_trial``, and record the run in the trial's folder.
 
     A trial that raises is FAILED in its own files, with the traceback in ``error.txt``. Nothing is raised
     here, so that a failure does not stop other trials. With a full disk the trial waits instead, and the same
     launch continues from its last commit once there is room.
+
+    Args:
+        spec: the trial.
+        store: the trial's folder.
+        should_stop: see ``run_trial``.
+        teacher: sets the limits; made from the spec if None.
+        commit_seconds: see ``run_trial``.
+        on_gpu: whether to learn on CUDA. A trial that cannot is FAILED.
 
     Returns:
         The new status of the trial.
@@ -167,14 +177,15 @@ def run_recorded(
         return TrialState.WAITING
     with _log_to(store):
         try:
-            writer.add_provenance(provenance)
-            return run_trial(
-                spec,
-                writer,
-                teacher or make_teacher(spec.teacher),
-                should_stop=should_stop,
-                commit_seconds=commit_seconds,
-            )
+            writer.add_provenance({**provenance, "device": device_name(on_gpu=on_gpu)})
+            with learning_on(gpu=on_gpu):
+                return run_trial(
+                    spec,
+                    writer,
+                    teacher or make_teacher(spec.teacher),
+                    should_stop=should_stop,
+                    commit_seconds=commit_seconds,
+                )
         except LostLeaseError as error:
             logger.warning("%s", error)
         except TeacherUnavailableError:

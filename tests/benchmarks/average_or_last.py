@@ -42,22 +42,22 @@ def policies(trial: TrialStore) -> Iterator[tuple[str, FinalPolicy]]:
     yield "average", final_policy(agent)
 
 
-def value(policy: FinalPolicy, spec: TrialSpec) -> dict[str, float]:
+def value(policy: FinalPolicy, spec: TrialSpec, episodes: int | None) -> dict[str, float]:
     """Return and first cost of the stochastic policy, with their standard errors; exact ones have none."""
     environments = make_vector(spec.task.name, 1, options=spec.task.options)
-    if table := policy_table(policy, environments):
+    if probabilities := policy_table(policy, environments):
         assert isinstance(environments, FiniteVectorEnv)
-        exact = evaluate_policy(environments.finite_cmdp(), pd.DataFrame(table).to_numpy())
+        exact = evaluate_policy(environments.finite_cmdp(), pd.DataFrame(probabilities).to_numpy())
         return {"return": exact.episode_return, "cost": float(exact.costs[0])}
     rows = evaluation_rows(
         policy,
         spec,
         [FrozenPolicy.STOCHASTIC],
-        num_episodes=spec.evaluation_episodes,
+        num_episodes=episodes or spec.evaluation_episodes,
         seed=TrialSeeds.of(spec).evaluation,
     )
-    episodes = pd.DataFrame(rows)[["episode_return", "cost_0"]]
-    means, errors = episodes.mean(), episodes.sem()
+    table = pd.DataFrame(rows)[["episode_return", "cost_0"]]
+    means, errors = table.mean(), table.sem()
     return {
         "return": means["episode_return"],
         "return_se": errors["episode_return"],
@@ -66,7 +66,7 @@ def value(policy: FinalPolicy, spec: TrialSpec) -> dict[str, float]:
     }
 
 
-def compared(sweep: Path) -> pd.DataFrame:
+def compared(sweep: Path, episodes: int | None = None) -> pd.DataFrame:
     """A row a trial and policy."""
     rows: list[dict[str, Any]] = []
     for trial in SweepStore(sweep.parent, sweep.name).trials():
@@ -78,7 +78,7 @@ def compared(sweep: Path) -> pd.DataFrame:
             "seed": spec.seed,
             "limit": spec.deploy_limits.array[0],
         }
-        rows += [{**keys, "policy": name, **value(each, spec)} for name, each in policies(trial)]
+        rows += [{**keys, "policy": name, **value(each, spec, episodes)} for name, each in policies(trial)]
     return pd.DataFrame(rows).round(4)
 
 
@@ -87,9 +87,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sweep", type=Path)
     parser.add_argument("--to", type=Path, required=True)
+    parser.add_argument(
+        "--episodes", type=int, help="episodes a policy; as many as the sweep's trials without it"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    table = compared(arguments.sweep)
+    table = compared(arguments.sweep, arguments.episodes)
     table.to_csv(arguments.to, index=False, lineterminator="\n")
     table["relative_error"] = np.abs(table["cost"] / table["limit"] - 1.0)
     keys = ["task", "agent", "method", "policy"]

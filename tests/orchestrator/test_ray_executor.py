@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 import ray
+import torch
 from ray.exceptions import RayActorError
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
@@ -27,10 +28,10 @@ from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.stop_file import StopFile
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.ray import hang_watchdog
+from recrl.orchestrator.ray import hang_watchdog, nodes
 from recrl.orchestrator.ray.clusters import existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
-from recrl.orchestrator.ray.nodes import check_nodes, trials_that_fit
+from recrl.orchestrator.ray.nodes import check_gpus, check_nodes, trials_that_fit
 from recrl.orchestrator.ray.ray_executor import (
     RayExecutor,
 )
@@ -300,6 +301,20 @@ def test_nodes_are_asked_before_any_trial(tmp_path: Path) -> None:
         ClusterError, match=r": \S+ does not see memory://bucket, but another file in its place; give "
     ):
         check_nodes("probe", "memory://bucket")
+
+
+@pytest.mark.usefixtures("cluster")
+@pytest.mark.skipif(bool(torch.version.cuda or torch.version.hip), reason="PyTorch for GPUs")
+def test_nodes_whose_pytorch_cannot_use_their_gpus_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_gpus()
+    found = [{**node, "Resources": {"CPU": 2.0, "GPU": 1.0}} for node in ray.nodes()]  # type: ignore[no-untyped-call]
+    monkeypatch.setattr(nodes, "_nodes", lambda: found)
+    with pytest.raises(
+        ClusterError,
+        match=r"^resources.gpus_per_trial is above 0, but \S+ has torch \S+, which cannot use its GPUs; "
+        r"install torch with CUDA there, or set gpus_per_trial to 0$",
+    ):
+        check_gpus()
 
 
 @pytest.mark.usefixtures("cluster")

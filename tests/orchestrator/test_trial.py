@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
@@ -55,12 +56,15 @@ def stop_after(updates: int) -> Callable[[], bool]:
     return lambda: next(answers)
 
 
-def run(folder: Path, spec: TrialSpec = SPEC, stops: tuple[int, ...] = ()) -> TrialStore:
+def run(
+    folder: Path, spec: TrialSpec = SPEC, stops: tuple[int, ...] = (), *, on_gpu: bool = False
+) -> TrialStore:
     """The trial, stopped and resumed after the given numbers of further updates, then run to its end."""
     store = SweepStore(folder, "sweep").trial(spec)
     for updates in stops:
-        assert run_recorded(spec, store, should_stop=stop_after(updates)) is TrialState.WAITING
-    assert run_recorded(spec, store, should_stop=never) is TrialState.COMPLETE
+        state = run_recorded(spec, store, should_stop=stop_after(updates), on_gpu=on_gpu)
+        assert state is TrialState.WAITING
+    assert run_recorded(spec, store, should_stop=never, on_gpu=on_gpu) is TrialState.COMPLETE
     return store
 
 
@@ -94,6 +98,30 @@ def assert_pieces_make_the_whole(folder: Path, spec: TrialSpec, stops: tuple[int
     assert pieces.events() == whole.events()
     assert pieces.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
     np.testing.assert_equal(final_tree(pieces), final_tree(whole))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device")
+def test_a_trial_without_the_gpu_that_it_is_to_learn_on_fails(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "sweep").trial(SPEC)
+    assert run_recorded(SPEC, store, should_stop=never, on_gpu=True) is TrialState.FAILED
+    assert "cannot use a GPU here; install torch with CUDA and a driver" in str(store.record().error)
+    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert json.loads((store.folder / "provenance.json").read_text())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("task", ["two-state", "continuous-bandit", "PointGoal2"])
+@pytest.mark.parametrize("agent", sorted(AGENTS))
+def test_a_trial_on_a_gpu_is_resumed_there_and_on_a_cpu(agent: str, task: str, tmp_path: Path) -> None:
+    spec = replace(SPEC, agent=Choice(agent, QUICK), task=Choice(task))
+    whole = run(tmp_path / "whole", spec, on_gpu=True)
+    pieces = run(tmp_path / "pieces", spec, stops=(7, 5), on_gpu=True)
+    moved = SweepStore(tmp_path / "moved", "sweep").trial(spec)
+    assert run_recorded(spec, moved, should_stop=stop_after(7), on_gpu=True) is TrialState.WAITING
+    assert run_recorded(spec, moved, should_stop=never) is TrialState.COMPLETE
+    np.testing.assert_equal(final_tree(pieces), final_tree(whole))
+    assert pieces.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
+    assert len(pd.read_csv(moved.updates_path)) == spec.num_updates
 
 
 @pytest.mark.parametrize("agent", ["ppo-lag", "cpo"])
