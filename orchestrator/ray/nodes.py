@@ -80,7 +80,7 @@ def check_gpus() -> None:
     Raises:
         ClusterError: one sentence with every node whose PyTorch was not.
     """
-    task = ray.remote(_torch_without_gpu())
+    task = ray.remote(_torch_without_gpu)
     asked = {}
     for node in _nodes():
         if node["Resources"].get("GPU", 0.0) > 0.0:
@@ -125,15 +125,10 @@ def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "")
 
 
-def _torch_without_gpu() -> Callable[[], str]:
-    """Return the function that runs on the nodes: the version of a PyTorch without GPUs, else empty."""
+def _torch_without_gpu() -> str:
+    from recrl.orchestrator.trial.device import torch_without_gpu  # noqa: PLC0415  (imports torch)
 
-    def look() -> str:
-        import torch  # noqa: PLC0415  (the driver does without)
-
-        return "" if torch.version.cuda or torch.version.hip else torch.__version__
-
-    return look
+    return torch_without_gpu()
 
 
 def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:

@@ -26,6 +26,11 @@ def device_name(*, on_gpu: bool) -> str:
     return f"cuda: {torch.cuda.get_device_name()}"
 
 
+def torch_without_gpu() -> str:
+    """Return the version of a PyTorch that was built for CPUs only, else an empty text."""
+    return "" if torch.version.cuda or torch.version.hip else torch.__version__
+
+
 def learning_on(*, gpu: bool) -> AbstractContextManager[Any]:
     """Make agents on the GPU inside the block, if one is asked for."""
     return torch.device("cuda") if gpu else nullcontext()
