@@ -65,7 +65,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if not factories:
             raise ValueError(f"{name}: num_envs must be at least 1, got 0")
         self.num_envs = len(factories)
-        self._environments = [_made(name, factory) for factory in factories]
+        self._environments = [made_environment(name, factory) for factory in factories]
         first = self._environments[0]
         self._raw_observation_space = first.observation_space
         # Found once: the dispatch on the space's type would take a tenth of a simple environment's step.
@@ -182,15 +182,16 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 determined by its seed and its actions, and cannot be resumed.
         """
         saved = SavedState(f"{self.cmdp.name}: saved state", state)
-        entries = ("episode_seeds", "episode_actions", *(["checksums"] if "checksums" in state else []))
-        for name in entries:
-            saved.check_number(name, self.num_envs)
-        like = np.zeros((self.num_envs, *(self.single_observation_space.shape or ())), np.float32)
-        self._observations = saved.array("observations", like)
-        generator = saved.generator("generator")
-        self._episode_seeds = [int(seed) for seed in state["episode_seeds"]]
-        self._episode_actions = [list(actions) for actions in state["episode_actions"]]
+        space = self.single_action_space
+        seeds = saved.whole_numbers("episode_seeds", self.num_envs, most=SEED_BOUND - 1)
+        actions = saved.arrays("episode_actions", self.num_envs, shape=space.shape or (), dtype=space.dtype)
+        if "checksums" in state:
+            saved.check_number("checksums", self.num_envs)
         expected = state.get("checksums")
+        like = np.zeros((self.num_envs, *(self.single_observation_space.shape or ())), np.float32)
+        observations, generator = saved.array("observations", like), saved.generator("generator")
+        self._observations, self._episode_seeds = observations, seeds
+        self._episode_actions = list(map(list, actions))
         for index in range(self.num_envs):
             if not np.array_equal(self._replayed(index), self._observations[index]):
                 difference = "another observation"
@@ -349,7 +350,9 @@ def _declared_horizon(environment: Environment) -> int | None:
     if environment.spec is not None and environment.spec.max_episode_steps is not None:
         return environment.spec.max_episode_steps
     horizon = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
-    return horizon if isinstance(horizon, int) and not isinstance(horizon, bool) and horizon >= 1 else None
+    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+        return None
+    return int(horizon)
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
@@ -366,7 +369,7 @@ def _declared_components(environment: Environment) -> tuple[ObservationComponent
     return components
 
 
-def _made(name: str, factory: Callable[[], Environment]) -> Environment:
+def made_environment(name: str, factory: Callable[[], Environment]) -> Environment:
     """Return a new environment; raise an error if the factory returns something else."""
     environment = factory()
     if not isinstance(environment, gymnasium.Env):

@@ -124,3 +124,5 @@ def _check(task: str, options: dict[str, Any]) -> None:
             for place, sentence in sentences(error, model)
         ]
         raise RecrlError("; ".join(f"{task}: {problem}" for problem in problems)) from error
+    except USERS_ERRORS as error:
+        raise RecrlError(f"the task {task} cannot be used: {described(error)}") from error
