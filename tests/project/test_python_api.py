@@ -300,6 +300,43 @@ def test_tasks_say_what_is_wrong() -> None:
         recrl.make_env("two-state")
 
 
+@pytest.mark.parametrize("make", [recrl.make, recrl.make_env])
+def test_a_module_that_cannot_be_used_is_named(
+    make: Callable[[str], Any], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "half_written.py").write_text("Walk = undefined\n")
+    monkeypatch.syspath_prepend(str(folder))
+    with pytest.raises(recrl.RecrlError, match=r"^the task half_written:Walk cannot be used: NameError: "):
+        make("half_written:Walk")
+    with pytest.raises(recrl.RecrlError, match=r"^the task math:pi cannot be used: .* got float$"):
+        make("math:pi")
+    with pytest.raises(recrl.RecrlError, match=r"^the task os:getpid cannot be made: .* got int "):
+        make("os:getpid")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"executor": "local"}, "executor: must be 'ray' or 'inline', got 'local'"),
+        (
+            {"executor": "inline", "address": "auto"},
+            "address: the executor inline uses no cluster; use ray, or leave out 'auto'",
+        ),
+        ({"max_concurrent": 0}, "max_concurrent: must be at least 1, got 0"),
+    ],
+)
+def test_a_launch_refuses_what_it_would_ignore(folder: Path, options: Any, sentence: str) -> None:
+    with pytest.raises(recrl.RecrlError) as error:
+        recrl.launch(GRID, **options)
+    assert str(error.value) == sentence
+    assert list(folder.iterdir()) == []
+
+
+def test_only_an_address_takes_the_name_of_a_sweep(finished_sweep: SweepStore) -> None:
+    with pytest.raises(recrl.RecrlError, match=r"^name: only an MLflow address takes one; .* got 'other'$"):
+        recrl.load_sweep(finished_sweep.folder, "other")
+
+
 def test_validate_takes_a_file_or_a_dictionary(folder: Path) -> None:
     (folder / "grid.json.yaml").write_text(json.dumps(GRID))
     assert recrl.validate("grid.json.yaml").trials() == recrl.validate(GRID).trials()
