@@ -37,6 +37,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.gymnasium_spaces import float32_vectors, supported_actions
 from recrl.environments.saved_state import SavedState
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
@@ -72,8 +73,8 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         self._flatten = functools.partial(
             spaces.flatten.dispatch(type(first.observation_space)), first.observation_space
         )
-        self.single_observation_space = _float32_vectors(name, first.observation_space)
-        self.single_action_space = _supported_actions(name, first.action_space)
+        self.single_observation_space = float32_vectors(name, first.observation_space)
+        self.single_action_space = supported_actions(name, first.action_space)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.render_mode = first.render_mode
@@ -385,20 +386,3 @@ def _brief(value: Any) -> str:
     shape = f" of shape {value.shape}" if isinstance(value, np.ndarray) else ""
     text = " ".join(repr(value).split())
     return f"{kind}{shape} {text[:77]}..." if len(text) > 80 else f"{kind}{shape} {text}"
-
-
-def _float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:
-    flat = spaces.flatten_space(space)
-    if not isinstance(flat, spaces.Box):
-        raise ValueError(f"{name}: observations of {space} cannot be flattened to vectors")
-    return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
-
-
-def _supported_actions(name: str, space: spaces.Space[Any]) -> spaces.Box | spaces.Discrete:
-    if isinstance(space, spaces.Discrete) and space.start == 0:
-        return space
-    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and len(space.shape) == 1:
-        return space
-    raise ValueError(
-        f"{name}: actions must be Discrete from 0 or a Box of one dimension of floats, got {space}"
-    )

@@ -105,7 +105,7 @@ def _with_cost_arrays(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any
 
         def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
             observation, reward, terminated, truncated, info = super().step(action)
-            costs = {"cost": np.atleast_1d(np.asarray(info["cost"], np.float64))} if "cost" in info else {}
+            costs = {"cost": np.asarray(info["cost"], np.float64).reshape(-1)} if "cost" in info else {}
             return observation, reward, terminated, truncated, {**info, **costs}
 
     return CostArrays(environment)

@@ -276,7 +276,13 @@ def test_environments_of_a_batch_do_not_repeat_each_other_nor_the_next_seeds() -
 
 
 @pytest.mark.parametrize(
-    "space", [spaces.MultiDiscrete([2, 2]), spaces.Discrete(2, start=1), spaces.Box(0.0, 1.0, (2, 2))]
+    "space",
+    [
+        spaces.MultiDiscrete([2, 2]),
+        spaces.Discrete(2, start=1),
+        spaces.Box(0.0, 1.0, (2, 2)),
+        spaces.Box(0.0, 1.0, (0,)),
+    ],
 )
 def test_action_spaces_that_no_agent_handles_are_refused(space: spaces.Space[Any]) -> None:
     def build() -> Countdown:

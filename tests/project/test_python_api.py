@@ -44,7 +44,7 @@ class Room(gymnasium.Env):
     def step(self, action):
         assert self.action_space.contains(action)
         self.steps += 1
-        return {"at": np.ones(2, np.float32)}, 1.0, False, self.steps == 5, {"cost": 1.0}
+        return {"at": np.ones(2, np.float32)}, 1.0, False, self.steps == 5, {"cost": np.ones((1, 1))}
 
 def make(render_mode=None):
     return Room()
@@ -288,7 +288,7 @@ def test_files_run_no_code_unless_they_are_trusted(folder: Path, monkeypatch: py
     env = recrl.make_env("own_room:make")
     observation, _ = env.reset(seed=0)
     _, _, _, _, info = env.step(training.policy.act(observation))
-    assert info["cost"] == 1.0
+    assert info["cost"].tolist() == [1.0]
 
 
 def test_tasks_say_what_is_wrong() -> None:
