@@ -194,9 +194,12 @@ def train(
             "run": {"total_steps": total_steps, **run},
         }
         with modules_in(Path.cwd()), one_thread(), shown_progress(progress):
-            sweep = launch(
-                grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False
-            )
+            try:
+                sweep = launch(
+                    grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False
+                )
+            except GridError as error:  # the grid's name is that of the folder
+                raise GridError([re.sub("^name: ", "folder: ", it) for it in error.problems]) from error
         store = SweepStore(place.parent, place.name)
         (spec,) = store.specs()
         trial = store.trial(spec)

@@ -142,6 +142,7 @@ def test_progress_is_one_line_with_return_and_cost(
         ({"train_limits": 1}, "train_limits: must be at least the deploy_limits of two-state"),
         ({"rolout_steps": 3}, "run.rolout_steps: unknown key; did you mean 'rollout_steps'?"),
         ({"seed": -1}, "seeds: must be whole numbers from 0"),
+        ({"folder": "my run"}, "folder: must be a name for a folder: letters, digits and . _ - only"),
         ({"deploy_limits": {1, 2}}, "must hold plain values only"),
     ],
 )
