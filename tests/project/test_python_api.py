@@ -44,7 +44,7 @@ class Room(gymnasium.Env):
     def step(self, action):
         assert self.action_space.contains(action)
         self.steps += 1
-        return {"at": np.ones(2, np.float32)}, 1.0, False, self.steps == 5, {"cost": np.ones((1, 1))}
+        return {"at": np.ones(2, np.float32)}, 1.0, False, self.steps == 5, {"cost": 1.0}
 
 def make(render_mode=None):
     return Room()
@@ -299,6 +299,14 @@ def test_tasks_say_what_is_wrong() -> None:
         recrl.make("rivergrid-1a", horizon=0)
     with pytest.raises(recrl.RecrlError, match=r"no single environment; use recrl.make\('two-state'\)"):
         recrl.make_env("two-state")
+
+
+def test_costs_of_a_single_environment_are_a_vector(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "column_room.py").write_text(OWN_TASK.replace('"cost": 1.0', '"cost": np.ones((1, 1))'))
+    monkeypatch.syspath_prepend(str(folder))
+    env = recrl.make_env("column_room:make")
+    env.reset(seed=0)
+    assert env.step(env.action_space.sample())[4]["cost"].tolist() == [1.0]
 
 
 @pytest.mark.parametrize("make", [recrl.make, recrl.make_env])
