@@ -37,6 +37,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
+from recrl.environments.gymnasium_spaces import float32_vectors, supported_actions
 from recrl.environments.saved_state import SavedState
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
@@ -65,15 +66,15 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if not factories:
             raise ValueError(f"{name}: num_envs must be at least 1, got 0")
         self.num_envs = len(factories)
-        self._environments = [_made(name, factory) for factory in factories]
+        self._environments = [made_environment(name, factory) for factory in factories]
         first = self._environments[0]
         self._raw_observation_space = first.observation_space
         # Found once: the dispatch on the space's type would take a tenth of a simple environment's step.
         self._flatten = functools.partial(
             spaces.flatten.dispatch(type(first.observation_space)), first.observation_space
         )
-        self.single_observation_space = _float32_vectors(name, first.observation_space)
-        self.single_action_space = _supported_actions(name, first.action_space)
+        self.single_observation_space = float32_vectors(name, first.observation_space)
+        self.single_action_space = supported_actions(name, first.action_space)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.render_mode = first.render_mode
@@ -182,15 +183,16 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 determined by its seed and its actions, and cannot be resumed.
         """
         saved = SavedState(f"{self.cmdp.name}: saved state", state)
-        entries = ("episode_seeds", "episode_actions", *(["checksums"] if "checksums" in state else []))
-        for name in entries:
-            saved.check_number(name, self.num_envs)
-        like = np.zeros((self.num_envs, *(self.single_observation_space.shape or ())), np.float32)
-        self._observations = saved.array("observations", like)
-        generator = saved.generator("generator")
-        self._episode_seeds = [int(seed) for seed in state["episode_seeds"]]
-        self._episode_actions = [list(actions) for actions in state["episode_actions"]]
+        space = self.single_action_space
+        seeds = saved.whole_numbers("episode_seeds", self.num_envs, most=SEED_BOUND - 1)
+        actions = saved.arrays("episode_actions", self.num_envs, shape=space.shape or (), dtype=space.dtype)
+        if "checksums" in state:
+            saved.check_number("checksums", self.num_envs)
         expected = state.get("checksums")
+        like = np.zeros((self.num_envs, *(self.single_observation_space.shape or ())), np.float32)
+        observations, generator = saved.array("observations", like), saved.generator("generator")
+        self._observations, self._episode_seeds = observations, seeds
+        self._episode_actions = list(map(list, actions))
         for index in range(self.num_envs):
             if not np.array_equal(self._replayed(index), self._observations[index]):
                 difference = "another observation"
@@ -349,7 +351,9 @@ def _declared_horizon(environment: Environment) -> int | None:
     if environment.spec is not None and environment.spec.max_episode_steps is not None:
         return environment.spec.max_episode_steps
     horizon = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
-    return horizon if isinstance(horizon, int) and not isinstance(horizon, bool) and horizon >= 1 else None
+    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+        return None
+    return int(horizon)
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
@@ -366,7 +370,7 @@ def _declared_components(environment: Environment) -> tuple[ObservationComponent
     return components
 
 
-def _made(name: str, factory: Callable[[], Environment]) -> Environment:
+def made_environment(name: str, factory: Callable[[], Environment]) -> Environment:
     """Return a new environment; raise an error if the factory returns something else."""
     environment = factory()
     if not isinstance(environment, gymnasium.Env):
@@ -382,20 +386,3 @@ def _brief(value: Any) -> str:
     shape = f" of shape {value.shape}" if isinstance(value, np.ndarray) else ""
     text = " ".join(repr(value).split())
     return f"{kind}{shape} {text[:77]}..." if len(text) > 80 else f"{kind}{shape} {text}"
-
-
-def _float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:
-    flat = spaces.flatten_space(space)
-    if not isinstance(flat, spaces.Box):
-        raise ValueError(f"{name}: observations of {space} cannot be flattened to vectors")
-    return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
-
-
-def _supported_actions(name: str, space: spaces.Space[Any]) -> spaces.Box | spaces.Discrete:
-    if isinstance(space, spaces.Discrete) and space.start == 0:
-        return space
-    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and len(space.shape) == 1:
-        return space
-    raise ValueError(
-        f"{name}: actions must be Discrete from 0 or a Box of one dimension of floats, got {space}"
-    )

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 from pydantic import BaseModel, Field, JsonValue, field_validator
 
-from recrl.environments.gymnasium_adapter import Environment, SyncCMDPVectorEnv
+from recrl.environments.gymnasium_adapter import Environment, SyncCMDPVectorEnv, made_environment
 from recrl.environments.options import Options
 from recrl.environments.plugins import check_keywords, import_module, require_trust
 
@@ -33,7 +33,8 @@ class GymnasiumOptions(Options):
         description="Names of the costs in info['cost']; by default the environment's cost_names, else cost.",
     )
     costless: bool = Field(
-        default=False, description="Whether to report a cost of 0 for an environment that reports none."
+        default=False,
+        description="Whether to report costs of 0. Costs that the environment reports are ignored.",
     )
 
     @field_validator("id")
@@ -85,9 +86,15 @@ def make_from_callable(
 
 
 def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
-    """Return a rendering environment of a registered id."""
-    keywords: dict[str, Any] = {**options.keywords, "render_mode": "rgb_array"}
-    environment: Environment = gymnasium.make(options.id, disable_env_checker=True, **keywords)
+    """Return an environment of a registered id; it renders if it takes ``render_mode``."""
+    make = functools.partial(gymnasium.make, options.id, disable_env_checker=True)
+    keywords: dict[str, Any] = dict(options.keywords)
+    try:
+        environment: Environment = make(**{**keywords, "render_mode": "rgb_array"})
+    except TypeError as error:
+        if "unexpected keyword argument 'render_mode'" not in str(error):
+            raise
+        environment = make(**keywords)
     return _Costless(environment, len(options.cost_names or ("cost",))) if options.costless else environment
 
 
@@ -95,16 +102,24 @@ def draw_from_callable(factory: Callable[..., Environment], name: str, options: 
     """Return an environment of a user's callable; it renders if the callable takes ``render_mode``.
 
     A callable with ``**keywords`` may check them and refuse ``render_mode``. Then it is called without.
+
+    Raises:
+        ValueError: the callable does not take an option, or returns something else.
     """
     keywords = options.model_dump()
-    parameters = inspect.signature(factory).parameters
-    rendering = {**keywords, "render_mode": "rgb_array"}
+    check_keywords(factory, name, keywords)
+    plain = functools.partial(factory, **keywords)
+    rendering = functools.partial(plain, render_mode="rgb_array")
+    try:
+        parameters = inspect.signature(factory).parameters
+    except (TypeError, ValueError):  # builtins have none
+        return made_environment(name, plain)
     if "render_mode" in parameters:
-        return factory(**rendering)
+        return made_environment(name, rendering)
     if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
         with suppress(TypeError, ValueError):
-            return factory(**rendering)
-    return factory(**keywords)
+            return made_environment(name, rendering)
+    return made_environment(name, plain)
 
 
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):

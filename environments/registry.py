@@ -222,7 +222,17 @@ def make_drawn(name: str, *, options: Mapping[str, Any] | None = None) -> gymnas
 def optimal_return(name: str, options: Mapping[str, Any], limits: CostLimits) -> float | None:
     """Return J*(d), the largest expected undiscounted return under limits d.
 
-    The result is None if it is not known, and -inf if no policy keeps the limits.
+    Args:
+        name: of the task, as for ``make_vector``.
+        options: the task's settings.
+        limits: d, undiscounted cost per episode, [k].
+
+    Returns:
+        The constrained optimum; None if it is not known, and -inf if no policy keeps the limits.
+
+    Raises:
+        UnknownNameError: the task is not known.
+        ValueError: an option is wrong, or there is another number of limits than of costs.
     """
     task = find_task(name)
     if task.optimum is None:

@@ -43,7 +43,7 @@ class SavedState:
     tree: Any
     path: str = ""
 
-    def entry(self, name: str) -> Any:
+    def entry(self, name: str | int) -> Any:
         """Return an entry without a check of its value."""
         if not isinstance(self.tree, Mapping):
             raise ValueError(
@@ -59,7 +59,7 @@ class SavedState:
 
     def array(
         self,
-        name: str,
+        name: str | int,
         like: npt.NDArray[Any],
         *,
         least: float = -math.inf,
@@ -85,6 +85,26 @@ class SavedState:
             bounds = "finite" if math.isinf(least) else f"from {least} to {most}"
             raise self.error(name, f"must have numbers that are {bounds}, got {bad.flat[0]}")
         return np.array(found, like.dtype)
+
+    def arrays(
+        self, name: str, number: int, *, shape: tuple[int, ...], dtype: npt.DTypeLike | None
+    ) -> list[npt.NDArray[Any]]:
+        """Return a copy of the array of each of ``number`` environments, [T, *shape] with any T."""
+        self.check_number(name, number)
+        parts = SavedState(self.source, dict(enumerate(self.entry(name))), f"{self.path}{name}.")
+        return [
+            parts.array(index, np.empty((*np.shape(part)[:1], *shape), dtype))
+            for index, part in parts.tree.items()
+        ]
+
+    def whole_numbers(self, name: str, number: int, *, most: int) -> list[int]:
+        """Return the number of each of ``number`` environments, from 0 to ``most``."""
+        self.check_number(name, number)
+        found = list(self.entry(name))
+        for index, each in enumerate(found):
+            if not isinstance(each, int | np.integer) or isinstance(each, bool) or not 0 <= each <= most:
+                raise self.error(f"{name}.{index}", f"must be a whole number from 0 to {most}, got {each!r}")
+        return list(map(int, found))
 
     def generators(self, name: str, number: int) -> list[np.random.Generator]:
         """Return the generators of ``number`` environments, from the states of their bit generators."""
@@ -121,7 +141,7 @@ class SavedState:
             if saved.entry(name) != expected:
                 raise saved.error(name, f"must be {expected!r}, got {saved.entry(name)!r}")
 
-    def error(self, name: str, problem: str) -> ValueError:
+    def error(self, name: str | int, problem: str) -> ValueError:
         """Return an error about an entry."""
         return ValueError(f"{self.source}: {self.path}{name} {problem}")
 

@@ -184,19 +184,21 @@ def largest_train_limit(
     Args:
         curriculum: a key of ``MEAN_WEIGHTS``.
         budget: allowed cumulative cost, discounted or not like the excesses.
-        deploy_limit: d_d.
+        deploy_limit: d_d, finite and at least 0.
         excesses: of each policy, [n], n >= 1.
         clock: time of a policy's progress.
 
     Raises:
-        ValueError: the curriculum has no bound, or not even d_t = d_d is within the budget.
+        ValueError: the curriculum has no bound, not even d_t = d_d is within the budget, or an argument is
+            out of its range.
 
     >>> largest_train_limit("linear", 281.0, 20.0, excesses=[0.25] * 4, clock="start")
     100.0
     """
+    _require_limits(deploy_limit, deploy_limit)
     weights = weight_sum(curriculum, policies=len(excesses), clock=clock)
     least = len(excesses) * deploy_limit + math.fsum(excesses)
-    if budget < least:
+    if not budget >= least:  # also catches NaN
         raise ValueError(
             f"budget must be at least {least:g}, the bound for d_t = d_d = {deploy_limit:g} over "
             f"{len(excesses)} policies, got {budget:g}"

@@ -85,6 +85,9 @@ def evaluate_policy(model: FiniteCMDP, policy: Floats) -> PolicyValue:
     Args:
         model: the CMDP.
         policy: pi(a | s), [S, A] (stationary) or [H, S, A].
+
+    Raises:
+        ValueError: the policy has another shape.
     """
     table = (model.num_states, model.num_actions)
     if policy.shape not in {table, (model.horizon, *table)}:
@@ -110,6 +113,7 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
 
     Raises:
         InfeasibleLimitsError: no policy keeps the limits.
+        ValueError: there is another number of limits than of costs.
     """
     constrained = np.array(limits.finite)
     bounds = _checked_limits(model, limits)[constrained]

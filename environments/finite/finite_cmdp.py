@@ -172,7 +172,9 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self._deterministic = bool((probabilities.max(axis=1) == 1.0).all())
         self._likeliest = self._successors[np.arange(len(probabilities)), probabilities.argmax(axis=1)]
         self._cumulative = np.cumsum(probabilities, axis=1)
-        self._cumulative[:, -1] = np.inf  # rounding must not leave a draw without a successor
+        # Rounding must not leave a draw without a successor, or with one of probability 0 (padding).
+        last = probabilities.shape[1] - 1 - np.argmax(probabilities[:, ::-1] > 0.0, axis=1)
+        self._cumulative[np.arange(probabilities.shape[1]) >= last[:, None]] = np.inf
         self._rewards = model.rewards.reshape(-1).copy()
         self._costs = model.costs.reshape(-1, model.num_costs).copy()
         self._start_states = np.flatnonzero(model.start)

@@ -74,6 +74,8 @@ def _options(text: str) -> dict[str, Any]:
         raise argparse.ArgumentTypeError(f"must be a JSON object ({error}), got {text!r}") from error
     if not isinstance(options, dict):
         raise argparse.ArgumentTypeError(f"must be a JSON object, got {text!r}")
+    if "map_seed" in options:
+        raise argparse.ArgumentTypeError(f"must not have map_seed, give the seeds before it, got {text!r}")
     return options
 
 

@@ -14,7 +14,7 @@ class Corridor(gymnasium.Env):
         self.length = length
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,), np.float32)
         self.action_space = gymnasium.spaces.Discrete(2)  # walk, run
-        self.spec = gymnasium.envs.registration.EnvSpec("Corridor-v0", max_episode_steps=20)
+        self.spec = gymnasium.envs.registration.EnvSpec("Corridor-v0", max_episode_steps=length)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

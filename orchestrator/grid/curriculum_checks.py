@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from recrl.orchestrator.spec import TrialSpec
 
 # Methods that measure nothing, whatever d_t is.
-MEASURING_NOTHING = ("none", "unconstrained")
+MEASURING_NOTHING = ("none", "step", "unconstrained", "cooling")
 
 
 def unsuitable(trial: TrialSpec) -> Iterator[tuple[str, str]]:

@@ -34,7 +34,7 @@ def load_sweep(
     Args:
         source: the sweep's folder (``runs/demo``), its name below ``root``, its grid file, an export
             (``demo.zip``), or an MLflow address (``http://host:port``, ``sqlite:///file.db``).
-        name: of the sweep; required for an MLflow address with several.
+        name: of the sweep, only for an MLflow address; required there if it has several.
         root: the folder of all sweeps, for a name.
         trust: whether to follow the sweep's import paths, to compute the optimum of a task. This runs their
             code: do so only with files whose author you trust.
@@ -45,7 +45,7 @@ def load_sweep(
         undiscounted sums over an episode; ``recrl.analysis.data.sweep_data`` lists all columns.
 
     Raises:
-        RecrlError: there is no such sweep, or it cannot be read.
+        RecrlError: there is no such sweep, it cannot be read, or ``name`` is given without an address.
 
     Example:
         >>> import recrl
@@ -59,6 +59,8 @@ def load_sweep(
     with following(trust):
         if "://" in str(source):
             return from_mlflow.load(checked_uri(str(source)), name)
+        if name is not None:
+            raise RecrlError(f"name: only an MLflow address takes one; give root and source, got {name!r}")
         if str(source).endswith(export.SUFFIX):
             return export.load(Path(source))
         return sweep_data.load(find_sweep(Path(root), str(source)))

@@ -105,7 +105,7 @@ def _with_cost_arrays(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any
 
         def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
             observation, reward, terminated, truncated, info = super().step(action)
-            costs = {"cost": np.atleast_1d(np.asarray(info["cost"], np.float64))} if "cost" in info else {}
+            costs = {"cost": np.asarray(info["cost"], np.float64).reshape(-1)} if "cost" in info else {}
             return observation, reward, terminated, truncated, {**info, **costs}
 
     return CostArrays(environment)
@@ -124,3 +124,5 @@ def _check(task: str, options: dict[str, Any]) -> None:
             for place, sentence in sentences(error, model)
         ]
         raise RecrlError("; ".join(f"{task}: {problem}" for problem in problems)) from error
+    except USERS_ERRORS as error:
+        raise RecrlError(f"the task {task} cannot be used: {described(error)}") from error

@@ -81,8 +81,8 @@ def launch(
         root: the folder of all sweeps.
         executor: ``ray``, in parallel on all cores or a cluster; or ``inline``, one after the other in this
             process.
-        address: of an existing Ray cluster; by default one is started here.
-        max_concurrent: largest number of parallel trials.
+        address: of an existing Ray cluster; by default one is started here. Not with ``inline``.
+        max_concurrent: largest number of parallel trials, at least 1; by default as many as fit.
         mlflow: whether to log the sweep to MLflow.
         figures: whether to draw figures and the report at the end.
         progress: whether to print progress and results.
@@ -92,7 +92,8 @@ def launch(
 
     Raises:
         GridError: the grid is wrong; nothing was started.
-        RecrlError: another process runs the sweep, or Ray, MLflow or the disk cannot be used.
+        RecrlError: another argument is wrong, another process runs the sweep, or Ray, MLflow or the disk
+            cannot be used.
         KeyboardInterrupt: Ctrl-C, SIGTERM or ``recrl-sweep stop`` stopped it before its end; the same call
             continues.
     """
@@ -103,6 +104,10 @@ def launch(
 
     if executor not in ("ray", "inline"):
         raise RecrlError(f"executor: must be 'ray' or 'inline', got {executor!r}")
+    if executor == "inline" and address is not None:
+        raise RecrlError(f"address: the executor inline uses no cluster; use ray, or leave out {address!r}")
+    if max_concurrent is not None and max_concurrent < 1:
+        raise RecrlError(f"max_concurrent: must be at least 1, got {max_concurrent}")
     options = LaunchOptions(
         root=Path(root),
         max_concurrent=max_concurrent,
@@ -189,9 +194,12 @@ def train(
             "run": {"total_steps": total_steps, **run},
         }
         with modules_in(Path.cwd()), one_thread(), shown_progress(progress):
-            sweep = launch(
-                grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False
-            )
+            try:
+                sweep = launch(
+                    grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False
+                )
+            except GridError as error:  # the grid's name is that of the folder
+                raise GridError([re.sub("^name: ", "folder: ", it) for it in error.problems]) from error
         store = SweepStore(place.parent, place.name)
         (spec,) = store.specs()
         trial = store.trial(spec)

@@ -247,6 +247,25 @@ def test_the_exact_value_is_the_mean_over_simulated_episodes() -> None:
         assert costs[:, index].mean() == pytest.approx(value.costs[index], abs=tolerance)
 
 
+def test_rounding_leads_to_no_state_of_probability_0() -> None:
+    rounded = np.array([[[0.5, 0.499995, 0.0]], [[0.0, 0.99999, 0.0]], [[1.0, 0.0, 0.0]]])
+    model = FiniteCMDP(
+        successors=np.tile(np.arange(3), (3, 1, 1)),
+        probabilities=rounded,
+        rewards=np.zeros((3, 1)),
+        costs=np.zeros((3, 1, 1)),
+        terminal=np.zeros(3, np.bool_),
+        start=np.array([1.0, 0.0, 0.0]),
+        horizon=100,
+        cost_names=("cost",),
+    )
+    envs = FiniteVectorEnv("rounded", model, np.eye(3, dtype=np.float32), num_envs=20_000)
+    envs.reset(seed=0)
+    for _ in range(50):
+        envs.step(np.zeros(20_000, np.int64))
+        assert envs.states.max() == 1
+
+
 def test_a_policy_of_the_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"the policy must have shape \(4, 3\) or \(5, 4, 3\), got \(3, 4\)"):
         evaluate_policy(random_cmdp(0), np.ones((3, 4)))

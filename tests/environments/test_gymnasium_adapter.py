@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from typing import Any, ClassVar
 
@@ -12,7 +13,12 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.gymnasium_tasks import draw_from_callable, make_from_callable
+from recrl.environments.gymnasium_tasks import (
+    GymnasiumOptions,
+    draw_from_callable,
+    draw_gymnasium,
+    make_from_callable,
+)
 from recrl.environments.registry import KeywordOptions, make_vector, task_options
 
 
@@ -144,7 +150,14 @@ def test_an_environment_that_reports_no_cost_is_refused_unless_told() -> None:
 
 @pytest.mark.parametrize(
     ("attribute", "spec_horizon", "horizon"),
-    [(None, None, None), (30, None, 30), (30, 20, 20), ("far", None, None), (0, None, None)],
+    [
+        (None, None, None),
+        (30, None, 30),
+        (np.int64(30), None, 30),
+        (30, 20, 20),
+        ("far", None, None),
+        (0, None, None),
+    ],
 )
 def test_the_horizon_is_the_specs_or_else_the_environments(
     attribute: Any, spec_horizon: int | None, horizon: int | None
@@ -263,7 +276,13 @@ def test_environments_of_a_batch_do_not_repeat_each_other_nor_the_next_seeds() -
 
 
 @pytest.mark.parametrize(
-    "space", [spaces.MultiDiscrete([2, 2]), spaces.Discrete(2, start=1), spaces.Box(0.0, 1.0, (2, 2))]
+    "space",
+    [
+        spaces.MultiDiscrete([2, 2]),
+        spaces.Discrete(2, start=1),
+        spaces.Box(0.0, 1.0, (2, 2)),
+        spaces.Box(0.0, 1.0, (0,)),
+    ],
 )
 def test_action_spaces_that_no_agent_handles_are_refused(space: spaces.Space[Any]) -> None:
     def build() -> Countdown:
@@ -423,6 +442,16 @@ def test_a_factory_that_makes_no_environment_is_named() -> None:
     [
         ({"episode_seeds": [1]}, "episode_seeds must be of 2 environments, got 1"),
         ({"episode_actions": 7}, "episode_actions must be a list or an array, got int"),
+        (
+            {"episode_seeds": [1, None]},
+            "episode_seeds.1 must be a whole number from 0 to 2147483647, got None",
+        ),
+        ({"episode_seeds": [-1, 1]}, "episode_seeds.0 must be a whole number from 0 to 2147483647, got -1"),
+        ({"episode_actions": [None, None]}, "episode_actions.0 must be int64 of shape (), got NoneType"),
+        (
+            {"episode_actions": [np.zeros(0, np.int64), np.zeros((1, 3), np.int64)]},
+            "episode_actions.1 must be int64 of shape (1,), got int64 of shape (1, 3)",
+        ),
         ({"checksums": [0]}, "checksums must be of 2 environments, got 1"),
         (
             {"observations": np.zeros(2, np.float32)},
@@ -439,3 +468,31 @@ def test_a_damaged_state_is_refused(changes: dict[str, Any], sentence: str) -> N
         environments.load_state_dict({**state, **changes})
     assert str(error.value) == f"countdown: saved state: {sentence}"
     environments.load_state_dict(state)
+
+
+def test_a_saved_state_is_a_dict() -> None:
+    with pytest.raises(ValueError, match=r"^countdown: saved state: it must be a dict, got NoneType$"):
+        SyncCMDPVectorEnv("countdown", [Countdown]).load_state_dict(None)  # type: ignore[arg-type]
+
+
+def _countdown(**keywords: Any) -> Countdown:
+    return Countdown(**keywords)
+
+
+def test_a_registered_environment_without_rendering_is_a_single_one_too() -> None:
+    gymnasium.register("recrl-tests/Countdown-v0", entry_point=_countdown)
+    try:
+        environment = draw_gymnasium("gymnasium", GymnasiumOptions(id="recrl-tests/Countdown-v0"))
+        assert isinstance(environment.unwrapped, Countdown)
+        unknown = GymnasiumOptions(id="recrl-tests/Countdown-v0", keywords={"width": 2})
+        with pytest.raises(TypeError, match="width"):
+            draw_gymnasium("gymnasium", unknown)
+    finally:
+        del gymnasium.registry["recrl-tests/Countdown-v0"]
+
+
+def test_a_users_callable_is_checked_for_a_single_environment_as_for_a_batch() -> None:
+    with pytest.raises(ValueError, match=r"^breezy takes no option 'winds'; did you mean 'wind'\?"):
+        draw_from_callable(_breezy, "breezy", KeywordOptions(winds=2))
+    with pytest.raises(ValueError, match=r"^os:getpid must return a Gymnasium environment, got int "):
+        draw_from_callable(os.getpid, "os:getpid", KeywordOptions())  # type: ignore[arg-type]

@@ -205,6 +205,10 @@ def test_the_command_names_a_wrong_option(
     [
         ("[1]", "argument --options: must be a JSON object, got '[1]'"),
         (
+            '{"map_seed": 3}',
+            "argument --options: must not have map_seed, give the seeds before it, got '{\"map_seed\": 3}'",
+        ),
+        (
             '{"costs": ["turns"]}',
             'costs must be ["river"], because the rule for limits counts the river only, got ["turns"]',
         ),

@@ -197,6 +197,8 @@ def test_a_curriculum_of_mean_costs_does_not_go_with_limits_on_a_cvar() -> None:
         "grid.yaml:3: agents.1: constraint: cvar does not suit the train_limits of two-state, which are "
         "measured as mean costs; give them as numbers, or exclude the pair"
     )
+    for measures_nothing in ("step", "cooling"):
+        assert len(_grid(worst.replace("linear", measures_nothing)).trials()) == 8
     given_limits = worst.replace("deploy_limits: 2", "deploy_limits: 2, train_limits: 6")
     assert len(_grid(given_limits).trials()) == 8
     dynamic = given_limits.replace("linear", "dynamic")

@@ -5,8 +5,10 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from recrl.environments.registry import make_vector
 from recrl.orchestrator.errors import GridError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -61,6 +63,15 @@ def test_a_trial_of_ones_own_task_agent_and_teacher_runs(
     assert updates.loc[held, "limit_0"].iloc[1:].nunique() == 1  # the first is infinite
     assert updates["limit_0"].iloc[-1] == 3.0
     assert updates["episode_return"].max() > updates["episode_return"].iloc[0]
+
+
+def test_the_corridor_ends_at_its_declared_horizon(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(installed))
+    corridor = make_vector("corridor", 1, options={"length": 30})
+    corridor.reset(seed=0)
+    ends = [bool(corridor.step(np.zeros(1, np.int64))[2][0]) for _ in range(30)]
+    assert ends == [False] * 29 + [True]
+    assert corridor.cmdp.horizon == 30
 
 
 def test_options_of_ones_own_are_checked_before_anything_starts(

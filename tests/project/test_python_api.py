@@ -142,6 +142,7 @@ def test_progress_is_one_line_with_return_and_cost(
         ({"train_limits": 1}, "train_limits: must be at least the deploy_limits of two-state"),
         ({"rolout_steps": 3}, "run.rolout_steps: unknown key; did you mean 'rollout_steps'?"),
         ({"seed": -1}, "seeds: must be whole numbers from 0"),
+        ({"folder": "my run"}, "folder: must be a name for a folder: letters, digits and . _ - only"),
         ({"deploy_limits": {1, 2}}, "must hold plain values only"),
     ],
 )
@@ -288,7 +289,7 @@ def test_files_run_no_code_unless_they_are_trusted(folder: Path, monkeypatch: py
     env = recrl.make_env("own_room:make")
     observation, _ = env.reset(seed=0)
     _, _, _, _, info = env.step(training.policy.act(observation))
-    assert info["cost"] == 1.0
+    assert info["cost"].tolist() == [1.0]
 
 
 def test_tasks_say_what_is_wrong() -> None:
@@ -298,6 +299,51 @@ def test_tasks_say_what_is_wrong() -> None:
         recrl.make("rivergrid-1a", horizon=0)
     with pytest.raises(recrl.RecrlError, match=r"no single environment; use recrl.make\('two-state'\)"):
         recrl.make_env("two-state")
+
+
+def test_costs_of_a_single_environment_are_a_vector(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "column_room.py").write_text(OWN_TASK.replace('"cost": 1.0', '"cost": np.ones((1, 1))'))
+    monkeypatch.syspath_prepend(str(folder))
+    env = recrl.make_env("column_room:make")
+    env.reset(seed=0)
+    assert env.step(env.action_space.sample())[4]["cost"].tolist() == [1.0]
+
+
+@pytest.mark.parametrize("make", [recrl.make, recrl.make_env])
+def test_a_module_that_cannot_be_used_is_named(
+    make: Callable[[str], Any], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "half_written.py").write_text("Walk = undefined\n")
+    monkeypatch.syspath_prepend(str(folder))
+    with pytest.raises(recrl.RecrlError, match=r"^the task half_written:Walk cannot be used: NameError: "):
+        make("half_written:Walk")
+    with pytest.raises(recrl.RecrlError, match=r"^the task math:pi cannot be used: .* got float$"):
+        make("math:pi")
+    with pytest.raises(recrl.RecrlError, match=r"^the task os:getpid cannot be made: .* got int "):
+        make("os:getpid")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"executor": "local"}, "executor: must be 'ray' or 'inline', got 'local'"),
+        (
+            {"executor": "inline", "address": "auto"},
+            "address: the executor inline uses no cluster; use ray, or leave out 'auto'",
+        ),
+        ({"max_concurrent": 0}, "max_concurrent: must be at least 1, got 0"),
+    ],
+)
+def test_a_launch_refuses_what_it_would_ignore(folder: Path, options: Any, sentence: str) -> None:
+    with pytest.raises(recrl.RecrlError) as error:
+        recrl.launch(GRID, **options)
+    assert str(error.value) == sentence
+    assert list(folder.iterdir()) == []
+
+
+def test_only_an_address_takes_the_name_of_a_sweep(finished_sweep: SweepStore) -> None:
+    with pytest.raises(recrl.RecrlError, match=r"^name: only an MLflow address takes one; .* got 'other'$"):
+        recrl.load_sweep(finished_sweep.folder, "other")
 
 
 def test_validate_takes_a_file_or_a_dictionary(folder: Path) -> None:

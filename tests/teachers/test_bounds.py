@@ -173,6 +173,14 @@ def test_a_budget_below_that_of_d_d_is_refused() -> None:
             "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), got inf and 20",
         ),
         (
+            lambda: largest_train_limit("linear", 100.0, -5.0, excesses=[0.0], clock="start"),
+            "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), got -5 and -5",
+        ),
+        (
+            lambda: largest_train_limit("linear", math.nan, 5.0, excesses=[0.0], clock="start"),
+            "budget must be at least 5, the bound for d_t = d_d = 5 over 1 policies, got nan",
+        ),
+        (
             lambda: cumulative_bound("linear", 100.0, 20.0, excesses=[], clock="start"),
             "there must be at least 1 policy, got 0",
         ),
