@@ -288,6 +288,18 @@ def test_wrong_arguments_are_a_sentence(
     assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
 
 
+def test_a_sweep_above_the_working_directory_has_its_own_name(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = SweepStore(folder / "runs", "small")
+    store.folder.mkdir(parents=True)
+    store.write_info({"name": store.name})
+    (store.folder / "trials").mkdir()
+    monkeypatch.chdir(store.folder / "trials")
+    assert main(["status", "..", "--brief"]) == ExitCode.OK
+    assert capsys.readouterr().out.startswith("small: 0 of 0 complete")
+
+
 def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("large", "small"):
         store = SweepStore(folder / "runs", name)
@@ -498,6 +510,30 @@ def test_a_wrong_option_is_a_sentence(
     with pytest.raises(SystemExit):
         main(["plan", "grid.yaml", option])
     assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep plan: error: {sentence}"
+
+
+@pytest.mark.parametrize("value", ["[" * 100_000, "1" * 5_000], ids=["deep", "long"])
+def test_an_option_that_json_cannot_read_is_text(
+    folder: Path, capsys: pytest.CaptureFixture[str], value: str
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    assert main(["replay", "small", "--teacher", "dynamic", f"--option=window={value}"]) == 2
+    assert capsys.readouterr().err.startswith("recrl-sweep: --option: dynamic: window: ")
+
+
+@pytest.mark.parametrize("label", ["[/b] up", "[bold] x.py:100: y"])
+def test_a_label_is_shown_as_it_is(folder: Path, capsys: pytest.CaptureFixture[str], label: str) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("linear", f"{{name: linear, label: '{label}'}}"))
+    assert main(["plan", "grid.yaml"]) == ExitCode.OK
+    assert f"two-state ppo-lag {label} " in capsys.readouterr().out
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    assert main(["status", "small"]) == ExitCode.OK
+    assert f"two-state ppo-lag {label} " in capsys.readouterr().out
+    [trial] = SweepStore(folder / "runs", "small").trials()
+    with trial.log_path.open("a") as log:
+        log.write(f"warning of {label}\n")
+    assert main(["logs", "small", "two-state"]) == ExitCode.OK
+    assert f"\nwarning of {label}\n" in capsys.readouterr().out
 
 
 def test_a_root_below_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
