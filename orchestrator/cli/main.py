@@ -38,7 +38,17 @@ NO_PATH = (
     errno.ENOENT,
     errno.EINVAL,
 )
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
+# The disk is full, lost or refuses.
+NO_ROOM = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EIO,
+    errno.ESTALE,
+)
 
 
 def main(given: Sequence[str] | None = None) -> int:

@@ -1,5 +1,7 @@
 """The command line: quick to start, honest in its exit codes, and its errors are sentences."""
 
+import errno
+import os
 import re
 import resource
 import shlex
@@ -15,6 +17,7 @@ import pytest
 
 from recrl.analysis.figures import learning_curves
 from recrl.environments.plugins import load_attribute
+from recrl.orchestrator.cli import status
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse
 from recrl.orchestrator.cli.main import main
@@ -510,6 +513,68 @@ def test_a_wrong_option_is_a_sentence(
     with pytest.raises(SystemExit):
         main(["plan", "grid.yaml", option])
     assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep plan: error: {sentence}"
+
+
+EMPTY = "must not be empty; leave it out, or check the shell's variable"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["launch", "grid.yaml", "--storage", ""], f"argument --storage: {EMPTY}"),
+        (["launch", "grid.yaml", "--address="], f"argument --address: {EMPTY}"),
+        (
+            ["launch", "grid.yaml", "--no-mlflow", "--tracking-uri", "sqlite:///x.db"],
+            "argument --tracking-uri: not allowed with argument --no-mlflow",
+        ),
+        (["logs", "--follow", "--folder"], "argument --folder: not allowed with argument --follow"),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_refused(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep {arguments[0]}: error: {sentence}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (
+            ["launch", "grid.yaml", *INLINE, "--address", "auto"],
+            "--address: the inline executor uses this process alone, and no cluster",
+        ),
+        (
+            ["launch", "grid.yaml", *INLINE, "--max-concurrent", "2"],
+            "--max-concurrent: the inline executor runs one trial after the other",
+        ),
+        (
+            ["export", "small", "--tracking-uri", "sqlite:///x.db", "--storage", "memory://x"],
+            "--tracking-uri, --storage: give one of them, the place to read the sweep from",
+        ),
+    ],
+)
+def test_options_that_exclude_each_other_start_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    assert main(arguments) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+    assert not (folder / "runs").exists()
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EPERM])
+def test_a_disk_that_is_lost_is_a_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def lost(*_: object) -> None:
+        raise OSError(number, os.strerror(number), "runs/small")
+
+    monkeypatch.setattr(status, "run_status", lost)
+    assert main(["status", "small"]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err == (
+        f"recrl-sweep: runs/small: {os.strerror(number)}; saved results are kept\n"
+    )
 
 
 @pytest.mark.parametrize("value", ["[" * 100_000, "1" * 5_000], ids=["deep", "long"])
