@@ -369,6 +369,19 @@ sys.exit(main(["list", "tasks"]))
     assert (done.returncode, done.stderr) == (ExitCode.OK, "")
 
 
+def test_a_terminal_without_a_sign_shows_another(folder: Path) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    done = subprocess.run(
+        [sys.executable, "-m", "recrl", "evaluate", "small", "--only", "method=none"],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(r"[0-9] \? [0-9]", done.stdout)
+
+
 def test_the_module_runs_like_the_script(folder: Path) -> None:
     command = [sys.executable, "-m", "recrl", "--version"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
@@ -612,7 +625,7 @@ def test_plan_measures_what_has_not_run_yet(folder: Path, capsys: pytest.Capture
     assert main(["plan", "grid.yaml"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert "\ntime unknown until a first trial has run (two-state ppo-lag); " in out
-    assert out.endswith("To measure about a second of each: recrl-sweep plan --measure\n")
+    assert out.endswith("To measure about a second of each: recrl-sweep plan grid.yaml --measure\n")
     assert main(["plan", "grid.yaml", "--measure", "--cores", "1"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert re.search(r"\ntwo-state ppo-lag: [0-9,]+ steps/s on one core\n", out)
