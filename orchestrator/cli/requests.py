@@ -105,7 +105,7 @@ class LaunchRequest(GridRequest):
         help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
         "is started here",
     )
-    tracking_uri: str | None = by_flag(group="mlflow", **_TRACKING)
+    tracking_uri: str | None = by_flag(**_TRACKING)
     executor: str = by_flag(
         choices=("ray", "inline"),
         default="ray",
@@ -117,10 +117,7 @@ class LaunchRequest(GridRequest):
         help="with --address: send recrl itself, without its dependencies, to the cluster's nodes",
     )
     mlflow: bool = by_flag(
-        "--no-mlflow",
-        group="mlflow",
-        action="store_false",
-        help="do not log to MLflow; 'sync' can do it later",
+        "--no-mlflow", action="store_false", help="do not log to MLflow; 'sync' can do it later"
     )
     figures: bool = by_flag("--no-figures", action="store_false", help="draw no figures at the end")
 

@@ -207,16 +207,16 @@ def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
         raise KeyError("river")
 
     monkeypatch.setattr(learning_curves, "curricula", mistaken)
-    assert main(["launch", "grid.yaml", *INLINE[:-1]]) == ExitCode.OK
+    assert main(["launch", "grid.yaml", *INLINE[:-1], "--root", "elsewhere"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert (
         "Figures    not all are drawn (KeyError: 'river'), because of a bug in recrl\n"
-        "           for its traceback: recrl-sweep figures small\n"
-        "Results    runs/small\n"
+        "           for its traceback: recrl-sweep figures small --root elsewhere\n"
+        "Results    elsewhere/small\n"
     ) in out
     assert out.endswith("small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n")
     with pytest.raises(KeyError, match="river"):
-        main(["figures", "small"])
+        main(["figures", "small", "--root", "elsewhere"])
 
 
 def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,6 +244,19 @@ def test_failed_trials_are_named_with_their_log(
         "Try what failed again with: recrl-sweep launch grid.yaml --executor inline --no-mlflow --no-figures "
         "--only method=none --retry-failed",
     ]
+
+
+def test_an_error_without_a_text_fails_its_trial(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = "class Silent(Exception):\n    def __str__(self): return self.text\n\n"
+    own = UNLUCKY_STUDENT.replace("def make", f"{silent}def make").replace("ArithmeticError", "Silent")
+    (folder / "my_silent_student.py").write_text(own)
+    monkeypatch.syspath_prepend(folder)
+    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_silent_student:ENTRY'"))
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
+    del sys.modules["my_silent_student"]
+    assert "none seed 0: Silent: its text cannot be read\n" in capsys.readouterr().out
 
 
 def test_no_password_is_printed(
@@ -536,10 +549,6 @@ EMPTY = "must not be empty; leave it out, or check the shell's variable"
     [
         (["launch", "grid.yaml", "--storage", ""], f"argument --storage: {EMPTY}"),
         (["launch", "grid.yaml", "--address="], f"argument --address: {EMPTY}"),
-        (
-            ["launch", "grid.yaml", "--no-mlflow", "--tracking-uri", "sqlite:///x.db"],
-            "argument --tracking-uri: not allowed with argument --no-mlflow",
-        ),
         (["logs", "--follow", "--folder"], "argument --folder: not allowed with argument --follow"),
     ],
 )
