@@ -84,7 +84,11 @@ def described(error: BaseException) -> str:
     """Return an error as one line: ``KeyError: 'window'``; for SystemExit, its exit code."""
     if isinstance(error, SystemExit):
         return f"it ended the process (exit code {error.code})"
-    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    try:
+        text = str(error)
+    except Exception:  # a user's own class may fail here
+        text = "its text cannot be read"
+    return " ".join(f"{type(error).__name__}: {text}".split()).removesuffix(":")
 
 
 def missing(path: Path) -> str:

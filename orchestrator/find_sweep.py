@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from recrl.environments.plugins import nearest
@@ -39,7 +40,7 @@ def find_sweep(root: Path, sweep: str | None, storage: str | None = None) -> Swe
             f"{sweep}: an export has tables but no policies, logs or trials; give the sweep's name or folder"
         )
     if sweep not in names:
-        folder = Path(sweep).absolute()
+        folder = Path(os.path.abspath(sweep))  # without "..", which is no sweep's name
         if not storage and (is_sweep(folder) or (folder / "trials").is_dir()):
             return SweepStore(folder.parent, folder.name)
         hint = nearest(Path(sweep).name, names)

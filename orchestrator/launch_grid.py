@@ -214,6 +214,10 @@ def _executor(grid: GridSpec, place: SweepPlace, options: LaunchOptions) -> Exec
     if options.ship_package and not options.address:
         raise RecrlError("--ship-package: needs an --address to ship to")
     if options.executor == "inline":
+        if options.address:
+            raise RecrlError("--address: the inline executor uses this process alone, and no cluster")
+        if (options.max_concurrent or 1) > 1:
+            raise RecrlError("--max-concurrent: the inline executor runs one trial after the other")
         if on_gpu := grid.resources.gpus_per_trial > 0.0:
             from recrl.orchestrator.trial.device import device_name  # noqa: PLC0415  (imports torch)
 

@@ -217,8 +217,9 @@ def estimate(plan: Plan, *, concurrent: int, speeds: Mapping[str, float] | None 
 
 
 def unmeasured(plan: Plan) -> tuple[TrialSpec, ...]:
-    """Return one trial to do of each kind without a finished trial."""
-    known = {kind_of(trial.spec) for trial in plan.trials if trial.record.cpu_seconds > 0.0}
+    """Return one trial to do of each kind of which no trial has taken a step."""
+    timed = (it for it in plan.trials if it.record.cpu_seconds > 0.0 and it.record.env_steps > 0)
+    known = {kind_of(trial.spec) for trial in timed}
     kinds = {kind_of(spec): spec for spec in reversed(plan.to_do)}
     return tuple(spec for kind, spec in reversed(kinds.items()) if kind not in known)
 

@@ -1,4 +1,7 @@
-"""Types of command-line arguments: folders, files and numbers. Other values are an error of one sentence."""
+"""Types of command-line arguments: folders, files, addresses and numbers.
+
+Other values are an error of one sentence.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +32,13 @@ def folder(text: str) -> Path:
     except (OSError, ValueError) as error:
         raise argparse.ArgumentTypeError(_nopath_of(text, error)) from error
     return path
+
+
+def address(text: str) -> str:
+    """An address: any text but an empty one, which an unset variable of a shell leaves."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("must not be empty; leave it out, or check the shell's variable")
+    return text
 
 
 def path_of(text: str) -> Path:

@@ -148,5 +148,5 @@ def _parsed(text: str) -> Any:
     """Parse a JSON value; other text stays text."""
     try:
         return json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):  # no JSON, a number of too many digits, or nested too deeply
         return text

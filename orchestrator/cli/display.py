@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -146,19 +147,21 @@ def lines_of(trial: TrialStore, *, may_grow: Callable[[], bool]) -> Iterator[str
         trial: on disk.
         may_grow: returns whether to wait for new lines.
     """
-    offset, rest = 0, ""
+    offset, rest = 0, b""
     while True:
         waits = may_grow()
         with suppress(FileNotFoundError), trial.log_path.open("rb") as file:
+            if file.seek(0, os.SEEK_END) < offset:  # another log: the trial was begun anew
+                offset, rest = 0, b""
             file.seek(offset)
-            *lines, rest = (rest + file.read().decode(errors="replace")).split("\n")
+            *lines, rest = (rest + file.read()).split(b"\n")
             offset = file.tell()
-            yield from lines
+            yield from (line.decode(errors="replace") for line in lines)
         if not waits:
             break
         time.sleep(LOG_SECONDS)
     if rest:
-        yield rest
+        yield rest.decode(errors="replace")
 
 
 def duration(seconds: float) -> str:

@@ -116,7 +116,8 @@ class _Printer(LaunchListener):
         """Print the error, and how to see its traceback."""
         reason = f"({type(error).__name__}: {error}), because of a bug in recrl"
         say(self._console, f"Figures    not all are drawn {reason}")
-        say(self._console, f"           for its traceback: recrl-sweep figures {self._grid.name}")
+        place = shlex.join([self._grid.name, *_root_of(self._options)])
+        say(self._console, f"           for its traceback: recrl-sweep figures {place}")
 
     def filming(self, trials: Sequence[TrialStore]) -> None:
         """Print the place of the videos."""
@@ -143,12 +144,15 @@ def _say_results(sweep: Sweep, console: Console) -> None:
         say(console, "")
 
 
+def _root_of(options: LaunchOptions) -> list[str]:
+    """Return the arguments that name the folder of all sweeps, unless it is the default."""
+    return [] if options.root == DEFAULT_ROOT else ["--root", str(options.root)]
+
+
 def _say_synced(outcome: LaunchOutcome, uri: str, options: LaunchOptions, console: Console) -> None:
     """Print the address of the sweep in MLflow, the command to open it, and whether it is up to date."""
     store = outcome.place.store
-    place = [store.name]
-    if options.root != DEFAULT_ROOT:
-        place += ["--root", str(options.root)]
+    place = [store.name, *_root_of(options)]
     if options.tracking_uri:
         place += ["--tracking-uri", redacted(options.tracking_uri)]
     where = redacted(uri) if options.tracking_uri else short(store.mlflow_database)

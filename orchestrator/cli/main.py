@@ -6,6 +6,7 @@ Imports almost nothing until the command is known, so that ``--help`` is fast.
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -38,7 +39,17 @@ NO_PATH = (
     errno.ENOENT,
     errno.EINVAL,
 )
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
+# The disk is full, lost or refuses.
+NO_ROOM = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EIO,
+    errno.ESTALE,
+)
 
 
 def main(given: Sequence[str] | None = None) -> int:
@@ -51,6 +62,8 @@ def main(given: Sequence[str] | None = None) -> int:
         An exit code.
     """
     given = list(sys.argv[1:] if given is None else given)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # its encoding may lack a sign such as ±
+        sys.stdout.reconfigure(errors="replace")
     request = parse(given)
     try:
         return _run(request)

@@ -25,7 +25,13 @@ UNLIMITED = 100_000  # characters of a line
 
 
 class TextConsole(Console):
-    """A console that shows labels, errors and logs as text, with control characters escaped."""
+    """A console that shows labels, errors and logs as text, with control characters escaped.
+
+    Rich would read ``[...]`` in a label as its markup, and ``:100:`` in a log as an emoji.
+    """
+
+    def __init__(self, *, width: int | None = None) -> None:
+        super().__init__(width=width, markup=False, emoji=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """Render with escaped control characters of texts; colours are Rich's own."""
@@ -69,8 +75,8 @@ def short(path: Path) -> Path:
 
 
 def say(console: Console, sentence: str) -> None:
-    """Print one line without secrets and control characters: no markup, no colours, no wrapping."""
-    console.print(shown(sentence), markup=False, highlight=False, soft_wrap=True)
+    """Print one line without secrets and control characters: no colours, no wrapping."""
+    console.print(shown(sentence), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def number_of_trials(number: int) -> str:

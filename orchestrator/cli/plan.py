@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 
 from rich.console import Console
@@ -66,7 +67,8 @@ def run_plan(request: PlanRequest, console: Console) -> ExitCode:
     speeds = _measured(plan, console) if request.measure else {}
     say_plan(plan, grid, console, at_once=at_once, where=where, speeds=speeds)
     if not request.measure and unmeasured(plan):
-        say(console, "To measure about a second of each: recrl-sweep plan --measure")
+        again = shlex.join(["recrl-sweep", *request.given, "--measure"])
+        say(console, f"To measure about a second of each: {again}")
     for line in display.damages_of_plan(plan):
         say(console, line)
     say_other_code(plan, console)

@@ -58,7 +58,9 @@ class PlaceRequest(Request):
         metavar="FOLDER",
         help="the folder of all sweeps (default: runs)",
     )
-    storage: str | None = by_flag(metavar="URI", help=f"read the sweep from {_STORE}; {_COPY}")
+    storage: str | None = by_flag(
+        type=types.address, metavar="URI", help=f"read the sweep from {_STORE}; {_COPY}"
+    )
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,11 @@ class LaunchRequest(GridRequest):
 
     example: ClassVar[str] = "recrl-sweep launch demo.yaml --only method=none,dynamic seed=0"
     trusted: ClassVar[bool] = True
-    storage: str | None = by_flag(metavar="URI", help=f"keep the sweep in {_STORE} for all nodes; {_COPY}")
+    storage: str | None = by_flag(
+        type=types.address, metavar="URI", help=f"keep the sweep in {_STORE} for all nodes; {_COPY}"
+    )
     address: str | None = by_flag(
+        type=types.address,
         metavar="HOST:PORT",
         help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
         "is started here",
@@ -124,6 +129,7 @@ class PlanRequest(GridRequest):
     example: ClassVar[str] = "recrl-sweep plan demo.yaml --measure"
     address: str | None = by_flag(
         group="room",
+        type=types.address,
         metavar="HOST:PORT",
         help="estimate for this Ray cluster, which must run, or 'auto' to find it; by default for this "
         "machine",
@@ -189,10 +195,11 @@ class LogsRequest(SweepRequest):
         help="the beginning of its id, title or folder, as status shows them; default: the running trial",
     )
     follow: bool = by_flag(
+        group="what",
         action="store_true",
         help="wait until the trial starts, and show new lines as long as it runs",
     )
-    folder: bool = by_flag(action="store_true", help="print the trial's folder instead")
+    folder: bool = by_flag(group="what", action="store_true", help="print the trial's folder instead")
 
 
 @dataclass(frozen=True)

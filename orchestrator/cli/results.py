@@ -85,6 +85,8 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415  (imports pandas and SciPy)
 
     given: str | None = request.sweep
+    if request.tracking_uri is not None and request.storage is not None:
+        raise RecrlError("--tracking-uri, --storage: give one of them, the place to read the sweep from")
     if request.tracking_uri is not None:
         name = read_name(Path(given)) if given and given.endswith((".yaml", ".yml")) else given
         sweep = from_mlflow.load(checked_uri(request.tracking_uri), name)

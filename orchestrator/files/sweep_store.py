@@ -8,6 +8,7 @@
         stop.request            exists while that process is asked to stop
         storage.json            of a local copy: the address of the object store
         figures/                output of ``recrl-sweep figures``
+        replays/                output of ``recrl-sweep replay``
         mlflow.db, mlartifacts/ the default MLflow store
         mlflow-sync/            how far each MLflow store is up to date
         trials/<task>__<agent>__<method>__s<seed>__<id>/

@@ -158,7 +158,10 @@ class TrialStore(TrialReader):
             return 0
 
     def _clear_the_way(self) -> None:
-        """Move aside files in place of folders, and folders in place of files."""
+        """Move aside files in place of folders, folders in place of files, and links in place of rows.
+
+        Rows are truncated and appended to, also through a link: it may lead to another file of the user.
+        """
         if self.folder.exists() and not self.folder.is_dir():
             move_aside(self.folder, self.folder.parent.parent / "aside")
         if self.aside_folder.exists() and not self.aside_folder.is_dir():
@@ -172,6 +175,9 @@ class TrialStore(TrialReader):
         for path in (self.lock_path, self.reserve_path):
             if path.is_dir():
                 self.move_aside(path)
+        for name in files_of(FileKind.ROWS):
+            if (self.folder / name).is_symlink():
+                self.move_aside(self.folder / name)
 
     def request_rerun(self) -> None:
         """Let the next attempt move all files of earlier ones aside, and start anew.

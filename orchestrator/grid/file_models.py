@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -43,6 +44,8 @@ def _read_limits(value: Any) -> tuple[float, ...]:
     for limit in values:
         if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
             raise ValueError(f"must be numbers of at least 0 (cost per episode), got {as_written(limit)}")
+        if isinstance(limit, int) and limit > sys.float_info.max:
+            raise ValueError(f"must be at most {sys.float_info.max:.1e}, got {as_written(limit)}")
     return tuple(float(limit) for limit in values)
 
 
@@ -132,6 +135,8 @@ DeployLimits = Annotated[tuple[float, ...], PlainValidator(_read_deploy_limits),
 Seeds = Annotated[
     tuple[int, ...], PlainValidator(_read_seeds), _one_or_list({"type": "integer", "minimum": 0})
 ]
+_AT_LEAST_ONE = Field(min_length=1)
+Labels = Annotated[list[str], BeforeValidator(_listed), _AT_LEAST_ONE, _one_or_list(_TEXT)]
 CustomResources = Annotated[
     dict[str, float],
     PlainValidator(_read_custom),
@@ -219,7 +224,7 @@ class Run(_Written):
 class Resources(_Written):
     """Resources of a trial; no result depends on them."""
 
-    cpus_per_trial: Number = Field(default=1.0, gt=0.0, le=1024.0, description="Cores of a running trial.")
+    cpus_per_trial: Number = Field(default=1.0, ge=1e-4, le=1024.0, description="Cores of a running trial.")
     gpus_per_trial: Number = Field(
         default=0.0, ge=0.0, le=64.0, description="GPUs of a running trial. Above 0 it learns on CUDA."
     )
@@ -249,10 +254,10 @@ class Resources(_Written):
 class Exclusion(_Written):
     """Trials to leave out: those that match everything given here; labels, and seeds."""
 
-    task: Annotated[list[str], BeforeValidator(_listed), _one_or_list(_TEXT)] | None = None
-    agent: Annotated[list[str], BeforeValidator(_listed), _one_or_list(_TEXT)] | None = None
-    method: Annotated[list[str], BeforeValidator(_listed), _one_or_list(_TEXT)] | None = None
-    seed: Annotated[list[Whole], BeforeValidator(_listed), _one_or_list(_COUNT)] | None = None
+    task: Labels | None = None
+    agent: Labels | None = None
+    method: Labels | None = None
+    seed: Annotated[list[Whole], BeforeValidator(_listed), _AT_LEAST_ONE, _one_or_list(_COUNT)] | None = None
 
     def matches(self, spec: TrialSpec) -> bool:
         """Whether the trial is left out."""

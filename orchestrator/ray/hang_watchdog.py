@@ -8,6 +8,7 @@ import signal
 import socket
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,8 @@ def _end_process(record: TrialRecord | None, actor: Any) -> None:
         actor: Ray's handle of it, if any.
     """
     if record is not None and record.host == socket.gethostname() and _is_worker(record.pid):
-        os.kill(record.pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):  # it has just ended
+            os.kill(record.pid, signal.SIGKILL)
     elif actor is not None:
         ray.kill(actor)
 

@@ -65,7 +65,8 @@ def start_sync(store: SweepStore, uri: str, *, interval_seconds: float) -> Backg
     folder = sync_folder(store, uri)
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "recrl.orchestrator.tracking.background_sync", str(store.folder)]
-    with open(os.open(folder / "log.txt", os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600), "ab") as log:
+    flags = os.O_CREAT | os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW
+    with open(os.open(folder / "log.txt", flags, 0o600), "ab") as log:
         process = subprocess.Popen(
             [*command, "--interval", str(interval_seconds), "--parent", str(os.getpid())],
             # In the environment and not among the arguments, which other users can see.

@@ -18,6 +18,7 @@ from pathlib import Path
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import Position
 
@@ -69,7 +70,7 @@ class ExportUpload:
         try:
             self._upload()
         except Exception as error:  # a server may accept small files only; the runs are shown nevertheless
-            return parent, next(iter(str(error).splitlines()), type(error).__name__)
+            return parent, redacted(next(iter(str(error).splitlines()), type(error).__name__))
         finally:
             ended = now()
             self._due = ended + max(INTERVAL_SECONDS, REST * (ended - began))

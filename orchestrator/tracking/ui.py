@@ -81,7 +81,8 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 1
         return UI(url, None)
     command = ui_command(store, uri, port=port)
     log_path = sync_folder(store, uri) / "ui.txt"
-    with open(os.open(log_path, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o600), "wb") as log:
+    flags = os.O_CREAT | os.O_WRONLY | os.O_TRUNC | os.O_NOFOLLOW
+    with open(os.open(log_path, flags, 0o600), "wb") as log:
         environment = {**os.environ, "MLFLOW_BACKEND_STORE_URI": uri}
         server = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
     end = time.monotonic() + timeout

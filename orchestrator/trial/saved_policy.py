@@ -11,6 +11,7 @@ equals a complete trial's ``evaluation.csv``.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,8 @@ from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows, open_env
 from recrl.orchestrator.trial.videos import VideoFormat, captioned, stride, write_video
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
+
+logger = logging.getLogger("recrl.sweep")
 
 
 class NoCheckpointError(RecrlError):
@@ -122,24 +125,24 @@ class SavedTrial:
         Raises:
             RecrlError: the task cannot be rendered, or this machine cannot render or encode it.
         """
-        path = self.video_path(policy, video_format, seed=seed)
+        path, task = self.video_path(policy, video_format, seed=seed), self.spec.task
         try:
-            environment = make_drawn(self.spec.task.name, options=self.spec.task.options)
+            environment = make_drawn(task.name, options=task.options)
         except NotDrawnError as error:
             raise RecrlError(f"{self.spec.title}: {error}") from error
         except USERS_ERRORS as error:
             raise RecrlError(f"{self.spec.title}: cannot be drawn: {described(error)}") from error
-        speed = float(environment.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND)
-        every = stride(video_format, frames_per_second=speed, longest=self.cmdp.horizon)
-        shots = film(
-            self.policy,
-            environment,
-            policy,
-            num_costs=self.cmdp.num_costs,
-            seed=self._seed_sequence(seed),
-            every=every,
-        )
         try:
+            speed = float(environment.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND)
+            every = stride(video_format, frames_per_second=speed, longest=self.cmdp.horizon)
+            shots = film(
+                self.policy,
+                environment,
+                policy,
+                num_costs=self.cmdp.num_costs,
+                seed=self._seed_sequence(seed),
+                every=every,
+            )
             frames = (captioned(shot.frame, self._caption(shot)) for shot in shots)
             write_video(path, frames, frames_per_second=speed / every)
         except RecrlError:
@@ -147,7 +150,10 @@ class SavedTrial:
         except USERS_ERRORS as error:  # the user's task, or a missing graphics library
             raise RecrlError(f"{self.spec.title}: cannot be filmed: {described(error)}") from error
         finally:
-            environment.close()
+            try:
+                environment.close()
+            except USERS_ERRORS as error:  # the video, or the error before, is what counts
+                logger.warning("%s raised an error when it was closed: %s", task.name, described(error))
         return path
 
     def video_path(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:

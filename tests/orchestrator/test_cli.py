@@ -1,5 +1,7 @@
 """The command line: quick to start, honest in its exit codes, and its errors are sentences."""
 
+import errno
+import os
 import re
 import resource
 import shlex
@@ -15,6 +17,7 @@ import pytest
 
 from recrl.analysis.figures import learning_curves
 from recrl.environments.plugins import load_attribute
+from recrl.orchestrator.cli import status
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse
 from recrl.orchestrator.cli.main import main
@@ -204,16 +207,16 @@ def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
         raise KeyError("river")
 
     monkeypatch.setattr(learning_curves, "curricula", mistaken)
-    assert main(["launch", "grid.yaml", *INLINE[:-1]]) == ExitCode.OK
+    assert main(["launch", "grid.yaml", *INLINE[:-1], "--root", "elsewhere"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert (
         "Figures    not all are drawn (KeyError: 'river'), because of a bug in recrl\n"
-        "           for its traceback: recrl-sweep figures small\n"
-        "Results    runs/small\n"
+        "           for its traceback: recrl-sweep figures small --root elsewhere\n"
+        "Results    elsewhere/small\n"
     ) in out
     assert out.endswith("small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n")
     with pytest.raises(KeyError, match="river"):
-        main(["figures", "small"])
+        main(["figures", "small", "--root", "elsewhere"])
 
 
 def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -241,6 +244,19 @@ def test_failed_trials_are_named_with_their_log(
         "Try what failed again with: recrl-sweep launch grid.yaml --executor inline --no-mlflow --no-figures "
         "--only method=none --retry-failed",
     ]
+
+
+def test_an_error_without_a_text_fails_its_trial(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = "class Silent(Exception):\n    def __str__(self): return self.text\n\n"
+    own = UNLUCKY_STUDENT.replace("def make", f"{silent}def make").replace("ArithmeticError", "Silent")
+    (folder / "my_silent_student.py").write_text(own)
+    monkeypatch.syspath_prepend(folder)
+    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_silent_student:ENTRY'"))
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
+    del sys.modules["my_silent_student"]
+    assert "none seed 0: Silent: its text cannot be read\n" in capsys.readouterr().out
 
 
 def test_no_password_is_printed(
@@ -286,6 +302,18 @@ def test_wrong_arguments_are_a_sentence(
 ) -> None:
     assert main(arguments) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+
+
+def test_a_sweep_above_the_working_directory_has_its_own_name(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = SweepStore(folder / "runs", "small")
+    store.folder.mkdir(parents=True)
+    store.write_info({"name": store.name})
+    (store.folder / "trials").mkdir()
+    monkeypatch.chdir(store.folder / "trials")
+    assert main(["status", "..", "--brief"]) == ExitCode.OK
+    assert capsys.readouterr().out.startswith("small: 0 of 0 complete")
 
 
 def test_several_sweeps_must_be_told_apart(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -352,6 +380,19 @@ sys.exit(main(["list", "tasks"]))
 """
     done = _python(code, folder)
     assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+
+
+def test_a_terminal_without_a_sign_shows_another(folder: Path) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    done = subprocess.run(
+        [sys.executable, "-m", "recrl", "evaluate", "small", "--only", "method=none"],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(r"[0-9] \? [0-9]", done.stdout)
 
 
 def test_the_module_runs_like_the_script(folder: Path) -> None:
@@ -500,6 +541,88 @@ def test_a_wrong_option_is_a_sentence(
     assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep plan: error: {sentence}"
 
 
+EMPTY = "must not be empty; leave it out, or check the shell's variable"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["launch", "grid.yaml", "--storage", ""], f"argument --storage: {EMPTY}"),
+        (["launch", "grid.yaml", "--address="], f"argument --address: {EMPTY}"),
+        (["logs", "--follow", "--folder"], "argument --folder: not allowed with argument --follow"),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_refused(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep {arguments[0]}: error: {sentence}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (
+            ["launch", "grid.yaml", *INLINE, "--address", "auto"],
+            "--address: the inline executor uses this process alone, and no cluster",
+        ),
+        (
+            ["launch", "grid.yaml", *INLINE, "--max-concurrent", "2"],
+            "--max-concurrent: the inline executor runs one trial after the other",
+        ),
+        (
+            ["export", "small", "--tracking-uri", "sqlite:///x.db", "--storage", "memory://x"],
+            "--tracking-uri, --storage: give one of them, the place to read the sweep from",
+        ),
+    ],
+)
+def test_options_that_exclude_each_other_start_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    assert main(arguments) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+    assert not (folder / "runs").exists()
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EPERM])
+def test_a_disk_that_is_lost_is_a_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def lost(*_: object) -> None:
+        raise OSError(number, os.strerror(number), "runs/small")
+
+    monkeypatch.setattr(status, "run_status", lost)
+    assert main(["status", "small"]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err == (
+        f"recrl-sweep: runs/small: {os.strerror(number)}; saved results are kept\n"
+    )
+
+
+@pytest.mark.parametrize("value", ["[" * 100_000, "1" * 5_000], ids=["deep", "long"])
+def test_an_option_that_json_cannot_read_is_text(
+    folder: Path, capsys: pytest.CaptureFixture[str], value: str
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    assert main(["replay", "small", "--teacher", "dynamic", f"--option=window={value}"]) == 2
+    assert capsys.readouterr().err.startswith("recrl-sweep: --option: dynamic: window: ")
+
+
+@pytest.mark.parametrize("label", ["[/b] up", "[bold] x.py:100: y"])
+def test_a_label_is_shown_as_it_is(folder: Path, capsys: pytest.CaptureFixture[str], label: str) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("linear", f"{{name: linear, label: '{label}'}}"))
+    assert main(["plan", "grid.yaml"]) == ExitCode.OK
+    assert f"two-state ppo-lag {label} " in capsys.readouterr().out
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    assert main(["status", "small"]) == ExitCode.OK
+    assert f"two-state ppo-lag {label} " in capsys.readouterr().out
+    [trial] = SweepStore(folder / "runs", "small").trials()
+    with trial.log_path.open("a") as log:
+        log.write(f"warning of {label}\n")
+    assert main(["logs", "small", "two-state"]) == ExitCode.OK
+    assert f"\nwarning of {label}\n" in capsys.readouterr().out
+
+
 def test_a_root_below_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "grid.yaml").write_text("name: x")
     with pytest.raises(SystemExit):
@@ -511,7 +634,7 @@ def test_plan_measures_what_has_not_run_yet(folder: Path, capsys: pytest.Capture
     assert main(["plan", "grid.yaml"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert "\ntime unknown until a first trial has run (two-state ppo-lag); " in out
-    assert out.endswith("To measure about a second of each: recrl-sweep plan --measure\n")
+    assert out.endswith("To measure about a second of each: recrl-sweep plan grid.yaml --measure\n")
     assert main(["plan", "grid.yaml", "--measure", "--cores", "1"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert re.search(r"\ntwo-state ppo-lag: [0-9,]+ steps/s on one core\n", out)

@@ -306,6 +306,11 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
         ),
         (
             "deploy_limits: 2",
+            f"deploy_limits: 1{'0' * 400}",
+            f"grid.yaml:2: tasks.0.deploy_limits: must be at most 1.8e+308, got 1{'0' * 56}...",
+        ),
+        (
+            "deploy_limits: 2",
             "deploy_limits: 5, train_limits: 3",
             "grid.yaml:2: tasks.0.train_limits: must be at least the deploy_limits of two-state "
             "(d_t >= d_d), got 3 under 5",
@@ -328,8 +333,13 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
         ),
         (
             "run:",
+            "exclude: [{method: []}]\nrun:",
+            "grid.yaml:6: exclude.0.method: must have at least 1 entries, got 0",
+        ),
+        (
+            "run:",
             "resources: {cpus_per_trial: 0}\nrun:",
-            "grid.yaml:6: resources.cpus_per_trial: must be greater than 0.0, got 0",
+            "grid.yaml:6: resources.cpus_per_trial: must be at least 0.0001, got 0",
         ),
         ("seeds: 2", "seeds: 2\nseeds: 3", "grid.yaml:6: seeds: given twice, first on line 5"),
         ("seeds: 2", "seeds: !!python/name:os.system ''", None),

@@ -12,6 +12,7 @@ from recrl.orchestrator.launch_plan import (
     estimate,
     make_plan,
     trials_at_once,
+    unmeasured,
     usable_cores,
 )
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -105,6 +106,14 @@ def test_the_time_follows_from_the_speed_of_the_same_task_and_agent(store: Sweep
     found = estimate(plan, concurrent=2)
     assert found.unknown == ()
     assert found.wall_seconds == pytest.approx((3 * seconds["ppo-lag"] + 3 * seconds["cpo"]) / 2)
+
+
+def test_a_trial_that_has_taken_no_step_tells_no_speed(store: SweepStore) -> None:
+    _begin(store, SPECS[0], env_steps=0, end=TrialState.WAITING)
+    plan = make_plan(SPECS[:2], store)
+    assert plan.trials[0].record.cpu_seconds > 0.0
+    assert estimate(plan, concurrent=1).unknown == ("two-state ppo-lag",)
+    assert unmeasured(plan) == (SPECS[0],)
 
 
 def test_nothing_to_do_takes_nothing(store: SweepStore) -> None:

@@ -466,3 +466,14 @@ def test_a_full_disk_keeps_nobody_from_stopping(tmp_path: Path, monkeypatch: pyt
     with StopFile.open(tmp_path) as stop_file:
         stop_file.set()
         assert StopFile(stop_file.path).is_set()
+
+
+def test_a_hanging_process_that_ends_by_itself_is_let_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = subprocess.Popen(["true"])
+    process.wait()
+    monkeypatch.setattr(hang_watchdog, "_is_worker", lambda _: True)  # as it was a moment ago
+    files = SweepStore(tmp_path, "s").trial(LONG)
+    files.begin(LONG)
+    hang_watchdog._end_process(replace(files.record(), pid=process.pid), None)

@@ -6,13 +6,19 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.cli.output import TextConsole, logging_to_stderr
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.redaction import RedactedStream, printable, redacted
+from recrl.orchestrator.tracking.export_file import ExportUpload
+from recrl.orchestrator.tracking.positions import Position
 from tests.faults.bad_inputs import changed
 
 CANARY = "c4n4ry"
@@ -121,3 +127,13 @@ def test_a_failed_trial_keeps_no_secret_of_an_error(tmp_path: Path) -> None:
     assert done.stderr.splitlines()[0] == (
         r"grid.yaml:15: tasks.0: leaky:make cannot be built: RuntimeError: no http://***@host and \x1b[31m"
     )
+
+
+def test_a_server_that_refuses_the_export_file_tells_no_password(tmp_path: Path) -> None:
+    def refused(*_: object) -> None:
+        raise ConnectionError("PUT to http://me:hunter2@host/artifacts failed")
+
+    runs = cast(Any, SimpleNamespace(parent_id="0", client=SimpleNamespace(log_artifact=refused)))
+    upload = ExportUpload(SweepStore(tmp_path, "s"), runs, lambda _, path: path.touch(), tmp_path)
+    _, remark = upload.bring_up_to_date(Position("0"), {"trial": TrialRecord()}, live=False)
+    assert remark == "PUT to http://***@host/artifacts failed"

@@ -211,6 +211,25 @@ def test_a_task_that_fails_to_render_is_a_sentence(
         SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
+def test_a_task_with_a_wrong_frame_rate_is_a_sentence(
+    crossing: TrialStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RiverGridEnv, "metadata", {**RiverGridEnv.metadata, "render_fps": "fast"})
+    with pytest.raises(RecrlError, match="cannot be filmed: ValueError: could not convert string to float"):
+        SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+
+
+def test_a_task_that_cannot_be_closed_has_its_video(
+    crossing: TrialStore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def close(_: RiverGridEnv) -> None:
+        raise OSError("no display")
+
+    monkeypatch.setattr(RiverGridEnv, "close", close)
+    assert SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None).exists()
+    assert "rivergrid-1a raised an error when it was closed: OSError: no display" in caplog.text
+
+
 @pytest.mark.parametrize("name", ["rivergrid-1b", "rivergrid", "gymnasium"])
 def test_a_drawn_task_is_the_task(name: str) -> None:
     options = TASKS[name].sample_options

@@ -12,6 +12,7 @@ from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import print_table
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.spec import TrialSpec, TrialState
@@ -147,6 +148,26 @@ def test_no_number_of_a_table_is_shortened(terminal: bool) -> None:
     assert all(number in lines[1] for number in row[:-1])
     assert (verdict in lines[1]) is not terminal
     assert console.width == 80
+
+
+def test_a_followed_log_is_read_by_whole_characters_and_from_the_start_of_a_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(display, "LOG_SECONDS", 0.0)
+    trial = TrialStore(tmp_path)
+    old = "one\ntw\N{LATIN SMALL LETTER O WITH DIAERESIS}\n".encode()
+    states = iter([old[:7], old, b"new\n"])
+
+    def changes() -> bool:
+        if (data := next(states, None)) is not None:
+            trial.log_path.write_bytes(data)
+        return data is not None
+
+    assert list(display.lines_of(trial, may_grow=changes)) == [
+        "one",
+        "tw\N{LATIN SMALL LETTER O WITH DIAERESIS}",
+        "new",
+    ]
 
 
 @pytest.mark.parametrize("terminal", [True, False])

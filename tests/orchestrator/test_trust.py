@@ -221,7 +221,7 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
     assert (tmp_path / "diary.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", [".lock", ".reserve", "log.txt"])
+@pytest.mark.parametrize("name", [".lock", ".reserve", "log.txt", "episodes.csv", "events.jsonl"])
 def test_no_file_of_a_trial_is_written_through_a_link(foreign: Path, name: str) -> None:
     (foreign / "diary.txt").write_text("mine")
     (foreign / "grid.yaml").write_text(changed("methods", to=["none"]))
