@@ -44,29 +44,10 @@ def check_nodes(probe: str, uri: str = "") -> None:
         ClusterError: one sentence with every node that differs, and its differences.
     """
     look = _look()
-    task = ray.remote(look)
-    asked = {}
-    for node in _nodes():
-        if node["Resources"].get("CPU", 0.0) > 0.0:
-            only = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-            answer = task.options(num_cpus=0, scheduling_strategy=only).remote(DISTRIBUTIONS, probe, uri)
-            asked[answer] = node["NodeManagerAddress"]
-    if not asked:
-        return
-    ready, _ = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_SECONDS)
-    here = look(DISTRIBUTIONS, probe, uri)
-    place = uri or str(Path(probe).parent)
-    problems = []
-    for answer, address in asked.items():
-        if answer not in ready:
-            problems.append(f"{address} has not answered for {ANSWER_SECONDS:g} seconds")
-            continue
-        try:
-            there = ray.get(answer)
-            problems += differences(address, here, there, place)
-        except RayError as error:
-            cause = error.cause if isinstance(error, RayTaskError) else error
-            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {_first_line(cause)}")
+    here, place = look(DISTRIBUTIONS, probe, uri), uri or str(Path(probe).parent)
+    answers, problems = _asked("CPU", look, DISTRIBUTIONS, probe, uri)
+    for address, there in answers:
+        problems += differences(address, here, there, place)
     if problems:
         raise ClusterError(
             f"not every node of the cluster can run these trials: {'; '.join(sorted(problems))}; "
@@ -78,20 +59,14 @@ def check_gpus() -> None:
     """Check that PyTorch was built for GPUs on every node that has some, before any trial.
 
     Raises:
-        ClusterError: one sentence with every node whose PyTorch was not.
+        ClusterError: one sentence with every node whose PyTorch was not, or that cannot tell.
     """
-    task = ray.remote(_torch_without_gpu)
-    asked = {}
-    for node in _nodes():
-        if node["Resources"].get("GPU", 0.0) > 0.0:
-            only = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-            asked[task.options(num_cpus=0, scheduling_strategy=only).remote()] = node["NodeManagerAddress"]
-    ready, _ = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_SECONDS) if asked else ([], [])
-    found = {asked[answer]: ray.get(answer) for answer in ready}
-    if problems := [f"{address} has torch {there}" for address, there in found.items() if there]:
+    answers, problems = _asked("GPU", _torch_without_gpu)
+    problems += [f"{address} has torch {there} for CPUs only" for address, there in answers if there]
+    if problems:
         raise ClusterError(
-            f"resources.gpus_per_trial is above 0, but {', '.join(sorted(problems))}, "
-            "which cannot use its GPUs; install torch with CUDA there, or set gpus_per_trial to 0"
+            f"resources.gpus_per_trial is above 0, but not every node can use its GPUs: "
+            f"{'; '.join(sorted(problems))}; install torch with CUDA there, or set gpus_per_trial to 0"
         )
 
 
@@ -113,6 +88,35 @@ def differences(address: str, here: Mapping[str, str], there: Mapping[str, str],
     if there.get(SIGHT):
         found.append(f"{address} does not see {place}{there[SIGHT]}")
     return found
+
+
+def _asked(
+    resource: str, function: Callable[..., Any], *arguments: Any
+) -> tuple[list[tuple[str, Any]], list[str]]:
+    """Call a function on every node that has some of a resource.
+
+    Returns:
+        Pairs of a node's address and its answer; a sentence for each node without an answer.
+    """
+    task = ray.remote(function)
+    asked = {}
+    for node in _nodes():
+        if node["Resources"].get(resource, 0.0) > 0.0:
+            only = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            answer = task.options(num_cpus=0, scheduling_strategy=only).remote(*arguments)
+            asked[answer] = node["NodeManagerAddress"]
+    ready = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_SECONDS)[0] if asked else []
+    answers, problems = [], []
+    for answer, address in asked.items():
+        if answer not in ready:
+            problems.append(f"{address} has not answered for {ANSWER_SECONDS:g} seconds")
+            continue
+        try:
+            answers.append((address, ray.get(answer)))
+        except RayError as error:
+            cause = error.cause if isinstance(error, RayTaskError) else error
+            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {_first_line(cause)}")
+    return answers, problems
 
 
 def _nodes() -> list[dict[str, Any]]:

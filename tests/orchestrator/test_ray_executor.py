@@ -311,8 +311,8 @@ def test_nodes_whose_pytorch_cannot_use_their_gpus_are_named(monkeypatch: pytest
     monkeypatch.setattr(nodes, "_nodes", lambda: found)
     with pytest.raises(
         ClusterError,
-        match=r"^resources.gpus_per_trial is above 0, but \S+ has torch \S+, which cannot use its GPUs; "
-        r"install torch with CUDA there, or set gpus_per_trial to 0$",
+        match=r"^resources.gpus_per_trial is above 0, but not every node can use its GPUs: \S+ has torch \S+ "
+        r"for CPUs only; install torch with CUDA there, or set gpus_per_trial to 0$",
     ):
         check_gpus()
 
