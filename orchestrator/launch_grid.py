@@ -214,15 +214,7 @@ def _executor(grid: GridSpec, place: SweepPlace, options: LaunchOptions) -> Exec
     if options.ship_package and not options.address:
         raise RecrlError("--ship-package: needs an --address to ship to")
     if options.executor == "inline":
-        if options.address:
-            raise RecrlError("--address: the inline executor uses this process alone, and no cluster")
-        if (options.max_concurrent or 1) > 1:
-            raise RecrlError("--max-concurrent: the inline executor runs one trial after the other")
-        if on_gpu := grid.resources.gpus_per_trial > 0.0:
-            from recrl.orchestrator.trial.device import device_name  # noqa: PLC0415  (imports torch)
-
-            device_name(on_gpu=True)  # an error before any trial
-        return InlineExecutor(on_gpu=on_gpu)
+        return _inline_executor(grid, options)
     if place.uri.startswith("memory://"):
         raise RecrlError(f"{place.uri}: is memory of a single process; use --executor inline")
     from recrl.orchestrator.ray.ray_executor import RayExecutor  # noqa: PLC0415  (imports ray)
@@ -237,6 +229,20 @@ def _executor(grid: GridSpec, place: SweepPlace, options: LaunchOptions) -> Exec
         teacher=grid.resources.teacher,
         silence_seconds=grid.resources.silence_seconds,
     )
+
+
+def _inline_executor(grid: GridSpec, options: LaunchOptions) -> Executor:
+    if options.address:
+        raise RecrlError(f"the inline executor uses no cluster; leave out the address {options.address}")
+    if (options.max_concurrent or 1) > 1:
+        raise RecrlError(
+            f"the inline executor runs one trial after the other, and not {options.max_concurrent} at once"
+        )
+    if on_gpu := grid.resources.gpus_per_trial > 0.0:
+        from recrl.orchestrator.trial.device import require_gpu  # noqa: PLC0415  (imports torch)
+
+        require_gpu()
+    return InlineExecutor(on_gpu=on_gpu)
 
 
 def _sync_to(uri: str) -> Callable[[SweepStore], RunningSync]:

@@ -65,7 +65,7 @@ def check_gpus() -> None:
     problems += [f"{address} has torch {there} for CPUs only" for address, there in answers if there]
     if problems:
         raise ClusterError(
-            f"resources.gpus_per_trial is above 0, but not every node can use its GPUs: "
+            "resources.gpus_per_trial is above 0, but not every node can use its GPUs: "
             f"{'; '.join(sorted(problems))}; install torch with CUDA there, or set gpus_per_trial to 0"
         )
 

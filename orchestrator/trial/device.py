@@ -10,6 +10,19 @@ import torch
 from recrl.orchestrator.errors import RecrlError
 
 
+def require_gpu() -> None:
+    """Check that PyTorch can use a GPU here.
+
+    Raises:
+        RecrlError: it cannot.
+    """
+    if not torch.cuda.is_available():
+        raise RecrlError(
+            f"resources.gpus_per_trial is above 0, but torch {torch.__version__} cannot use a GPU here; "
+            "install torch with CUDA and a driver for it, or set gpus_per_trial to 0"
+        )
+
+
 def device_name(*, on_gpu: bool) -> str:
     """Return ``cpu``, or the name of the GPU: ``cuda: NVIDIA H100 80GB HBM3``.
 
@@ -18,11 +31,7 @@ def device_name(*, on_gpu: bool) -> str:
     """
     if not on_gpu:
         return "cpu"
-    if not torch.cuda.is_available():
-        raise RecrlError(
-            f"resources.gpus_per_trial is above 0, but torch {torch.__version__} cannot use a GPU here; "
-            "install torch with CUDA and a driver for it, or set gpus_per_trial to 0"
-        )
+    require_gpu()
     return f"cuda: {torch.cuda.get_device_name()}"
 
 

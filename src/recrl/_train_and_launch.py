@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from recrl.analysis.data.sweep_data import Sweep
+    from recrl.orchestrator.files.trial_store import TrialStore
 
 Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
@@ -104,8 +105,6 @@ def launch(
 
     if executor not in ("ray", "inline"):
         raise RecrlError(f"executor: must be 'ray' or 'inline', got {executor!r}")
-    if executor == "inline" and address is not None:
-        raise RecrlError(f"address: the executor inline uses no cluster; use ray, or leave out {address!r}")
     if max_concurrent is not None and max_concurrent < 1:
         raise RecrlError(f"max_concurrent: must be at least 1, got {max_concurrent}")
     options = LaunchOptions(
@@ -203,16 +202,22 @@ def train(
         store = SweepStore(place.parent, place.name)
         (spec,) = store.specs()
         trial = store.trial(spec)
-        record = trial.record()
-        if record.status is not TrialState.COMPLETE:
-            failed = RecrlError(f"{spec.title}: {record.error or 'is not complete'}")
-            if trial.error_path.exists():
-                failed.add_note(trial.error_path.read_text())
-            raise failed
+        _require_complete(trial, spec.title)
         policy = policy_of(trial, seed=seed)
         if folder is None:
             return Training(replace(sweep, folder=None), policy, None)
         return Training(sweep, policy, trial.folder)
+
+
+def _require_complete(trial: TrialStore, title: str) -> None:
+    """Raise the error of a trial that failed, with its traceback as a note."""
+    record = trial.record()
+    if record.status is TrialState.COMPLETE:
+        return
+    failed = RecrlError(f"{title}: {record.error or 'is not complete'}")
+    if trial.error_path.exists():
+        failed.add_note(trial.error_path.read_text())
+    raise failed
 
 
 @dataclass(frozen=True, eq=False, repr=False)

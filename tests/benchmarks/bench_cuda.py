@@ -1,7 +1,7 @@
 """What an update costs on CUDA beside a CPU's one thread, and whether agents learn the same there.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_cuda.py [--updates 8]
-    OMP_NUM_THREADS=1 python tests/benchmarks/bench_cuda.py --device cuda --seeds 106 107 108 --steps 1000000
+    OMP_NUM_THREADS=1 python tests/benchmarks/bench_cuda.py --device cuda --seeds 106 107 108 --steps 500000
 
 The first form prints the wall milliseconds of 4,096 steps and of the learning from them. Both agents advance
 in turns; the ratio is the median over the pairs. The second runs whole trials of ``ppo-lag`` on PointGoal2,

@@ -565,11 +565,11 @@ def test_an_option_that_would_be_ignored_is_refused(
     [
         (
             ["launch", "grid.yaml", *INLINE, "--address", "auto"],
-            "--address: the inline executor uses this process alone, and no cluster",
+            "the inline executor uses no cluster; leave out the address auto",
         ),
         (
             ["launch", "grid.yaml", *INLINE, "--max-concurrent", "2"],
-            "--max-concurrent: the inline executor runs one trial after the other",
+            "the inline executor runs one trial after the other, and not 2 at once",
         ),
         (
             ["export", "small", "--tracking-uri", "sqlite:///x.db", "--storage", "memory://x"],

@@ -106,7 +106,8 @@ def test_a_trial_without_the_gpu_that_it_is_to_learn_on_fails(tmp_path: Path) ->
     assert run_recorded(SPEC, store, should_stop=never, on_gpu=True) is TrialState.FAILED
     assert "cannot use a GPU here; install torch with CUDA and a driver" in str(store.record().error)
     assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
-    assert json.loads((store.folder / "provenance.json").read_text())
+    attempts = json.loads(store.provenance_path.read_text())["attempts"]
+    assert [attempt["device"] for attempt in attempts] == ["cpu"]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

@@ -329,7 +329,7 @@ def test_a_module_that_cannot_be_used_is_named(
         ({"executor": "local"}, "executor: must be 'ray' or 'inline', got 'local'"),
         (
             {"executor": "inline", "address": "auto"},
-            "address: the executor inline uses no cluster; use ray, or leave out 'auto'",
+            "the inline executor uses no cluster; leave out the address auto",
         ),
         ({"max_concurrent": 0}, "max_concurrent: must be at least 1, got 0"),
     ],
