@@ -1,4 +1,4 @@
-"""What an update costs on CUDA beside a CPU's one thread, and whether agents learn the same there.
+"""Wall time of an update on CUDA and on one thread of a CPU, and whether agents learn the same on both.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_cuda.py [--updates 8]
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_cuda.py --device cuda --seeds 106 107 108 --steps 500000

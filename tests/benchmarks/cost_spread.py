@@ -3,8 +3,8 @@
     python tests/benchmarks/cost_spread.py results/safety-gym/agents.csv --limit 25 --without CarPush2
 
 The variance of the true costs is that of the measured ones less the mean of their squared standard errors,
-over all tasks and seeds together. The chances are those of tasks with as many policies as in the table, whose
-true costs are normal about the limit: that the mean cost is at most one standard error above it.
+over all tasks and seeds together. The chance is the probability that the measured mean cost of a task's
+policies is at most one standard error above the limit, if their true costs are normally distributed about it.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
     OMP_NUM_THREADS=1 python tests/benchmarks/fresh_costs.py runs/margin --to fresh-costs.csv
 
 Each complete trial goes on from its last checkpoint, for ``--updates`` updates under its limit. Before every
-``--every``-th of them the policy that acts runs 64 fresh episodes. If agents learnt the layouts on which they
-train, and not the task, the fresh episodes would cost more than those of training. Tasks with a horizon only.
+``--every``-th of them the policy that collects the rollouts runs 64 fresh episodes. If agents learnt the
+layouts on which they train, and not the task, the fresh episodes would cost more than those of training.
+Only for tasks whose episodes all have the same length.
 """
 
 from __future__ import annotations
