@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -200,6 +201,10 @@ def room(
         from recrl.orchestrator.ray.ray_executor import room_on_cluster  # noqa: PLC0415  (imports ray)
 
         return most or max(1, room_on_cluster(address, resources)), "on the cluster at present"
+    if resources.gpus_per_trial and not inline:
+        from recrl.orchestrator.trial.device import trials_on_gpus  # noqa: PLC0415  (imports torch)
+
+        most = min(most or sys.maxsize, trials_on_gpus(resources.gpus_per_trial))
     fitting = trials_at_once(cpus_per_trial=resources.cpus_per_trial, max_concurrent=most, cores=cores)
     return fitting, f"on {cores} cores" if cores else "on this machine"
 

@@ -62,6 +62,11 @@ class Choice:
         """The choice as JSON values."""
         return {"name": self.name, "options": dict(self.options), "label": self.label}
 
+    @property
+    def file_name(self) -> str:
+        """A readable, unique and safe name for files about it: ``dynamic__3fa2b1c09d``."""
+        return f"{_in_file_names(self.label)}__{_digest(self.to_json())}"
+
 
 @dataclass(frozen=True)
 class TrialSpec:
@@ -154,7 +159,7 @@ class TrialSpec:
     def folder_name(self) -> str:
         """A readable, unique and safe name for the trial's folder."""
         labels = (self.task.label, self.agent.label, self.method.label)
-        readable = "__".join(re.sub(r"[^A-Za-z0-9.+-]+", "-", label).strip(".-")[:40] for label in labels)
+        readable = "__".join(_in_file_names(label) for label in labels)
         return f"{readable}__s{self.seed}__{self.trial_id}"
 
     @property
@@ -190,6 +195,11 @@ class TrialSpec:
 
 
 _SPEC_FILE = file_model(TrialSpec, {Choice: ChoiceFile, CostLimits: LimitValues})
+
+
+def _in_file_names(label: str) -> str:
+    """Return a label without what file names cannot have; two labels may give the same."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "-", label).strip(".-")[:40]
 
 
 def _digest(value: Mapping[str, Any]) -> str:

@@ -51,7 +51,7 @@ Later:
 
 Exit codes:
   0    done, or nothing to do
-  1    some trials failed, are damaged or could not be finished
+  1    some trials failed, are damaged or could not be finished; evaluate: some were left out
   2    the grid or the arguments are wrong; nothing was started
   3    another process is running this sweep
   4    Ray, MLflow or the storage could not be reached, or files could not be written

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from typing import Any
 
 from pydantic import ValidationError
@@ -75,7 +74,6 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     store = open_store(request)
     specs = select(store.specs(), parse_only(request.only))
     method = _teacher(store, request)
-    called = re.sub("[^A-Za-z0-9.+-]+", "-", method.label)
     folder, runs, summaries = store.folder / "replays", [], []
     damaged = []
     for trial in (store.trial(spec) for spec in specs):
@@ -94,7 +92,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
                 raise RecrlError(
                     f"{method.label}: cannot be replayed on {trial.title}: {described(error)}"
                 ) from error
-            write_csv(rows, folder / f"{trial.folder.name}__{called}.csv")
+            write_csv(rows, folder / f"{trial.folder.name}__{method.file_name}.csv")
             runs.append(Replayed(trial.spec, rows))
             summaries.append(replay_summary(trial, rows))
     for sentence in damaged:
@@ -111,7 +109,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     )
     for i in range(max(len(run.spec.deploy_limits) for run in runs)):
         figure = replayed_limits(runs, method.label, cost=i)
-        _, picture = styles.save(figure, folder, f"{called}_cost-{i}" if i else called)
+        _, picture = styles.save(figure, folder, f"{method.file_name}_cost-{i}" if i else method.file_name)
         say(console, f"Figure        {short(picture)}")
     say(console, f"Every update  {short(folder)}")
     return ExitCode.OK

@@ -71,11 +71,12 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     for reason in left_out:
         say(console, f"left out   {reason}")
     _warn_of_other_code(evaluated, console)
+    missing_videos = 0
     if request.video:
-        for saved in evaluated:
-            _film(saved, policies, VideoFormat(request.video), request.seed, console)
+        kind = VideoFormat(request.video)
+        missing_videos = sum(_film(saved, policies, kind, request.seed, console) for saved in evaluated)
     _tell_mlflow(store, request, console)
-    return ExitCode.OK
+    return ExitCode.TRIALS_FAILED if left_out or missing_videos else ExitCode.OK
 
 
 def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> None:
@@ -88,15 +89,18 @@ def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> No
 
 def _film(
     saved: SavedTrial, policies: Sequence[FrozenPolicy], kind: VideoFormat, seed: int | None, console: Console
-) -> None:
-    """Film a trial's policies, and print the places; a film that fails stops no other."""
+) -> int:
+    """Film a trial's policies, and print the places; return how many films failed, which stop no other."""
+    failed = 0
     for policy in policies:
         try:
             video = saved.film(policy, kind, seed=seed)
         except RecrlError as error:
             say(console, f"no video   {error}")
+            failed += 1
         else:
             say(console, f"Video      {short(video)}")
+    return failed
 
 
 def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:

@@ -33,20 +33,20 @@ def number_of_pairs(rest: Sequence[str]) -> int:
 
 
 def parse_only(pairs: Sequence[str]) -> dict[str, list[str]]:
-    """Parse the arguments of ``--only`` to acceptable values by key, as ``select`` takes them.
+    """Parse the arguments of ``--only`` to lists of values by key, as ``select`` takes them.
 
     Raises:
         RecrlError: a pair has no key or no value.
 
     >>> parse_only(["method=none,linear", "seed=0"])
-    {'method': ['none', 'linear'], 'seed': ['0']}
+    {'method': ['none,linear'], 'seed': ['0']}
     """
     wanted: dict[str, list[str]] = {}
     for pair in pairs:
         key, equals, values = pair.partition("=")
         if not equals or not values:
             raise RecrlError(f"--only: must look like method=dynamic or seed=0,1, got {pair!r}")
-        wanted.setdefault(key, []).extend(values.split(","))
+        wanted.setdefault(key, []).append(values)
     return wanted
 
 
@@ -55,22 +55,27 @@ def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> t
 
     Args:
         specs: the trials of the grid.
-        wanted: acceptable labels (or seeds, as text) for some of ``SELECTABLE``.
+        wanted: acceptable labels (or seeds, as text) for some of ``SELECTABLE``; several in one text have
+            commas between them, unless a label is that text.
 
     Raises:
         RecrlError: no trial of the grid has a given key or value.
     """
     from recrl.environments.plugins import nearest  # noqa: PLC0415
 
-    for key, values in wanted.items():
+    accepted: dict[str, list[str]] = {}
+    for key, texts in wanted.items():
         if key not in SELECTABLE:
             raise RecrlError(f"--only: trials are chosen by {', '.join(SELECTABLE)}, got {key!r}")
         known = list(dict.fromkeys(_label(spec, key) for spec in specs))
-        for value in values:
+        accepted[key] = [it for text in texts for it in ([text] if text in known else text.split(","))]
+        for value in accepted[key]:
             if value not in known:
                 hint = nearest(value, known)
                 raise RecrlError(f"--only: no trial has {key} {value!r}{hint} (known: {', '.join(known)})")
-    return tuple(spec for spec in specs if all(_label(spec, key) in values for key, values in wanted.items()))
+    return tuple(
+        spec for spec in specs if all(_label(spec, key) in values for key, values in accepted.items())
+    )
 
 
 def _label(spec: TrialSpec, key: str) -> str:

@@ -23,6 +23,17 @@ def require_gpu() -> None:
         )
 
 
+def trials_on_gpus(gpus_per_trial: float) -> int:
+    """Return how many trials fit on the GPUs of this machine; at least 1, even without a GPU.
+
+    Args:
+        gpus_per_trial: above 0. Below 1 several trials share a GPU; no trial is spread over parts of two.
+    """
+    gpus = torch.cuda.device_count()
+    shared = int(1 / gpus_per_trial + 1e-9)
+    return max(1, gpus * shared if shared else int(gpus / gpus_per_trial))
+
+
 def device_name(*, on_gpu: bool) -> str:
     """Return ``cpu``, or the name of the GPU: ``cuda: NVIDIA H100 80GB HBM3``.
 

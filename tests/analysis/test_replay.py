@@ -94,7 +94,12 @@ def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest
     assert main([*command, "dynamic", "--option", "window=4"]) == ExitCode.OK
     assert "two-state ppo-lag dynamic seed 1" in capsys.readouterr().out
     written = {path.name for path in (root / "sweep" / "replays").iterdir()}
-    assert written == {f"{trial.folder.name}__dynamic.csv", "dynamic.pdf", "dynamic.png"}
+    called = Choice("dynamic", {**trial.spec.method.options, "window": 4}).file_name
+    assert called.startswith("dynamic__")
+    assert written == {f"{trial.folder.name}__{called}.csv", f"{called}.pdf", f"{called}.png"}
+    assert main([*command, "dynamic", "--option", "window=5"]) == ExitCode.OK
+    assert len(list((root / "sweep" / "replays").iterdir())) == 6, "other options, other files"
+    capsys.readouterr()
     assert main([*command, "dynamik"]) == ExitCode.WRONG_INPUT
     assert "did you mean 'dynamic'?" in capsys.readouterr().err
     assert main([*command, "dynamic", "--option", "window=0"]) == ExitCode.WRONG_INPUT

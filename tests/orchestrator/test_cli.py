@@ -818,7 +818,7 @@ def test_evaluate_shows_what_it_could_evaluate(
 
     monkeypatch.setattr(SavedTrial, "evaluate", half)
     capsys.readouterr()
-    assert main(["evaluate", "small", "--episodes", "3"]) == ExitCode.OK
+    assert main(["evaluate", "small", "--episodes", "3"]) == ExitCode.TRIALS_FAILED
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("Episodes") for line in lines)
     assert "left out   no luck" in lines

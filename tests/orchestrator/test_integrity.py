@@ -291,7 +291,7 @@ def test_evaluate_leaves_out_a_trial_whose_last_checkpoint_is_gone(
     """The checkpoint before it would give other numbers without a word."""
     trial = store.trials()[0]
     trial.checkpoints()[0].unlink()
-    assert main(["evaluate", "small", "--policy", "stochastic"]) == ExitCode.OK
+    assert main(["evaluate", "small", "--policy", "stochastic"]) == ExitCode.TRIALS_FAILED
     out = capsys.readouterr().out
     assert "two-state ppo-lag none seed 0" in out and "linear seed 0  " not in out
     assert (

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.grid.file_models import Resources
+from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import (
     PlannedAction,
     TrialSelection,
@@ -135,3 +138,16 @@ def test_a_containers_quota_counts(
     assert usable_cores(tmp_path / "cpu.max") == 4
     (tmp_path / "cpu.max").write_text(f"{text}\n")
     assert usable_cores(tmp_path / "cpu.max") == cores
+
+
+@pytest.mark.parametrize(
+    ("gpus", "per_trial", "fitting"),
+    [(0, 1.0, 1), (3, 1.0, 3), (2, 0.4, 4), (1, 0.1, 10), (3, 2.0, 1), (8, 0.0, 64)],
+)
+def test_no_more_trials_run_than_fit_on_the_gpus(
+    monkeypatch: pytest.MonkeyPatch, gpus: int, per_trial: float, fitting: int
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    resources = Resources(cpus_per_trial=1, gpus_per_trial=per_trial)
+    assert room(resources, address=None, max_concurrent=None, cores=64)[0] == fitting
+    assert room(resources, address=None, max_concurrent=1, cores=64)[0] == 1

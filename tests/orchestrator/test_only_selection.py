@@ -44,3 +44,11 @@ def test_a_selection_of_what_is_not_there_is_refused() -> None:
     with pytest.raises(RecrlError) as caught:
         select(SPECS, {"colour": ["red"]})
     assert str(caught.value) == "--only: trials are chosen by task, agent, method, seed, got 'colour'"
+
+
+def test_a_label_with_a_comma_is_selected_whole() -> None:
+    labelled = GRID.replace(b"linear]", b"{name: linear, label: 'linear, slow'}]")
+    specs = parse_grid(labelled, source="grid.yaml").trials()
+    assert {it.method.label for it in select(specs, parse_only(["method=linear, slow"]))} == {"linear, slow"}
+    both = select(specs, parse_only(["method=linear, slow", "method=none", "seed=0,1"]))
+    assert len(both) == len(specs)

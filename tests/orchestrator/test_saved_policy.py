@@ -271,7 +271,7 @@ def test_evaluate_leaves_out_what_has_no_checkpoint(
     store = SweepStore(Path(root), "small")
     begun = replace(SPEC, seed=6)
     store.trial(begun).begin(begun)
-    assert main(["evaluate", "--root", root]) == ExitCode.OK
+    assert main(["evaluate", "--root", root]) == ExitCode.TRIALS_FAILED
     sentence = "two-state ppo-lag none seed 6: has no intact checkpoint yet\n"
     assert capsys.readouterr().out.endswith(f"left out   {sentence}")
     assert main(["evaluate", "--root", root, "--only", "seed=6"]) == ExitCode.WRONG_INPUT
@@ -289,6 +289,15 @@ def test_evaluate_films_on_demand(crossing: TrialStore, capsys: pytest.CaptureFi
     (video,) = crossing.videos_folder.iterdir()
     assert video.name == "update-00000009__seed-own__deterministic.gif"
     assert capsys.readouterr().out.splitlines()[-1] == f"Video      {video}"
+
+
+def test_a_missing_film_is_no_success(complete: TrialStore, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["evaluate", "--root", str(complete.folder.parents[2]), "--video", "--episodes", "1"]
+    assert main(arguments) == ExitCode.TRIALS_FAILED
+    assert (
+        "no video   two-state ppo-lag none seed 5: the task two-state cannot be rendered"
+        in capsys.readouterr().out
+    )
 
 
 def test_a_launch_films_what_the_grid_wants(
