@@ -1,10 +1,11 @@
-"""What the policies of further updates cost while they learn, and on fresh layouts.
+"""What the policies of further updates cost while they learn, on fresh layouts, and when they are averaged.
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/fresh_costs.py runs/margin --to fresh-costs.csv
+    OMP_NUM_THREADS=1 python tests/benchmarks/fresh_costs.py runs/safety-gym-margin --to fresh-costs.csv
 
 Each complete trial goes on from its last checkpoint, for ``--updates`` updates under its limit. Before every
 ``--every``-th of them the policy that collects the rollouts runs 64 fresh episodes. If agents learnt the
 layouts on which they train, and not the task, the fresh episodes would cost more than those of training.
+The final policy at that time, which averages the last ones, runs the same 64 episodes.
 Only for tasks whose episodes all have the same length.
 """
 
@@ -18,7 +19,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from recrl.agents.agent import Agent
+from recrl.agents.agent import Policy, final_policy
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CurriculumStep
@@ -31,13 +32,13 @@ from recrl.orchestrator.trial.trial import TrialSeeds
 FRESH_EPISODES = 64
 
 
-def fresh_means(agent: Agent, spec: TrialSpec, seed: int) -> tuple[float, float]:
+def fresh_means(policy: Policy, spec: TrialSpec, seed: int) -> tuple[float, float]:
     """Mean return and first cost of fresh episodes."""
     environments = make_vector(spec.task.name, FRESH_EPISODES, options=spec.task.options)
     assert environments.cmdp.horizon is not None
     collector = Collector(environments, num_steps=environments.cmdp.horizon)
     collector.reset(seed=seed)
-    rollout, _ = collector.collect(agent, np.random.default_rng(seed))
+    rollout, _ = collector.collect(policy, np.random.default_rng(seed))
     return float(rollout.rewards.sum() / FRESH_EPISODES), float(rollout.costs[..., 0].sum() / FRESH_EPISODES)
 
 
@@ -57,7 +58,10 @@ def continued(trial: TrialStore, updates: int, every: int) -> list[dict[str, Any
     steps = environments.cmdp.horizon
     assert steps is not None
     for update in range(updates):
-        fresh = fresh_means(agent, spec, 1_000_000 + update) if update % every == 0 else (np.nan, np.nan)
+        fresh, averaged = [(np.nan, np.nan)] * 2
+        if update % every == 0:
+            policies = (agent, final_policy(agent))
+            fresh, averaged = [fresh_means(policy, spec, 1_000_000 + update) for policy in policies]
         rollout, finished = collector.collect(agent, generator)
         rows.append(
             {
@@ -69,6 +73,8 @@ def continued(trial: TrialStore, updates: int, every: int) -> list[dict[str, Any
                 "training_cost": steps * rollout.costs[..., 0].mean(),
                 "fresh_return": fresh[0],
                 "fresh_cost": fresh[1],
+                "average_return": averaged[0],
+                "average_cost": averaged[1],
             }
         )
         agent.update(rollout, episode_costs(finished, 1), CurriculumStep(spec.deploy_limits))
@@ -88,7 +94,8 @@ def main() -> None:
     rows = [row for trial in store.trials() for row in continued(trial, arguments.updates, arguments.every)]
     table = pd.DataFrame(rows)
     table.round(3).to_csv(arguments.to, index=False, lineterminator="\n")
-    columns = ["training_return", "fresh_return", "training_cost", "fresh_cost"]
+    kinds = ("training", "fresh", "average")
+    columns = [f"{kind}_{value}" for value in ("return", "cost") for kind in kinds]
     print(table.groupby(["task", "limit", "seed"])[columns].mean().round(2).to_string())
 
 
