@@ -21,6 +21,7 @@ Notation: N observations, n numbers in each, L lidar numbers, S length scales.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -68,12 +69,23 @@ class RunningMoments:
         clipped = np.clip((observations - mean) / spread, -CLIP, CLIP)
         return clipped.astype(np.float32)
 
+    @classmethod
+    def of(cls, mean: Floats, variance: Floats) -> RunningMoments:
+        """Return moments with a given mean and variance of each number, [n]."""
+        moments = cls(len(mean))
+        moments._count, moments._mean, moments._scatter = 1, mean, variance
+        return moments
+
+    @property
+    def mean_and_variance(self) -> Floats:
+        """The mean and the variance of each number, [2, n]; [2, 0] before the first observation."""
+        return np.stack([self._mean, self._scatter / self._count]) if self._count else np.empty((2, 0))
+
     @property
     def mean_and_spread(self) -> tuple[Floats, Floats]:
         """The mean and the standard deviation of each number, [n]; [0] before the first observation."""
-        if self._count == 0:
-            return np.empty(0), np.empty(0)
-        return self._mean, np.sqrt(self._scatter / self._count + SMALLEST_VARIANCE)
+        mean, variance = self.mean_and_variance
+        return mean, np.sqrt(variance + SMALLEST_VARIANCE)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the count, the means and the sums of squared deviations."""
@@ -144,6 +156,19 @@ class Encoder:
             "mean": mean,
             "spread": spread,
         }
+
+    @property
+    def statistics(self) -> Floats:
+        """The running mean and variance of each number, [2, n]; [2, 0] if there are none yet."""
+        return np.empty((2, 0)) if self._moments is None else self._moments.mean_and_variance
+
+    def with_statistics(self, statistics: Floats) -> Encoder:
+        """Return an encoder with other statistics, [2, n]; itself if they are [2, 0]."""
+        if not statistics.size:
+            return self
+        changed = copy.copy(self)
+        changed._moments = RunningMoments.of(*statistics)
+        return changed
 
     def learn(self, observations: Rows) -> None:
         """Include the observations of a rollout, [N, n], in the running statistics, if there are any."""

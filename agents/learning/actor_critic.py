@@ -121,7 +121,8 @@ class ActorCritic:
 
     def final_policy(self) -> NetworkPolicy:
         """Return the average of the policies after the last updates, see ``policy_average``."""
-        return NetworkPolicy(self._encoder, self._average.network())
+        encoder = self._encoder.with_statistics(self._average.statistics)
+        return NetworkPolicy(encoder, self._average.network())
 
     def update(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
         """Improve the policy by the rule, then fit the critics to the rollout.
@@ -136,7 +137,7 @@ class ActorCritic:
         self._policy.publish()
         require_finite("policy parameters", self._policy.parameters.to_numpy())
         require_finite("critic parameters", self._critics.parameters.to_numpy())
-        self._average.add(self._policy.parameters.to_numpy())
+        self._average.add(self._policy.parameters.to_numpy(), self._encoder.statistics)
         return metrics
 
     def _learn(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:

@@ -82,6 +82,53 @@ def test_before_the_first_update_the_final_policy_is_the_first() -> None:
     )
 
 
+HOPPER = "SafetyHopperVelocity"
+HOPPERS = np.random.default_rng(0).normal(size=(5, 11)).astype(np.float32)
+
+
+def statistics(encoder: dict[str, Any]) -> np.ndarray:
+    """Mean and variance of a saved encoder, [2, n]."""
+    return np.stack([encoder["mean"], encoder["scatter"] / encoder["count"]])
+
+
+def test_statistics_of_observations_are_averaged_like_parameters() -> None:
+    seen = [learnt("ppo-lag", HOPPER, {"policy_average": 0.5}, updates)[0] for updates in (1, 2, 3)]
+    first, second, last = (statistics(agent.state_dict()["encoder"]) for agent in seen)
+    mean, variance = expected = (first + 2 * second + 4 * last) / 7
+    state = seen[-1].state_dict()
+    np.testing.assert_allclose(state["average"]["statistics"], expected, rtol=0, atol=1e-6)
+    other, _ = learnt("ppo-lag", HOPPER, {}, 1)
+    encoder = {"count": 1, "mean": mean, "scatter": variance}
+    other.load_state_dict({**state, "policy": state["average"]["mean"], "encoder": encoder})
+    averaged = seen[-1].final_policy()
+    np.testing.assert_allclose(averaged.act_greedily(HOPPERS), other.act_greedily(HOPPERS), rtol=0, atol=1e-5)
+    module = averaged.to_torch_module()
+    np.testing.assert_allclose(
+        module(torch.as_tensor(HOPPERS)).detach().clamp(-1, 1),
+        averaged.act_greedily(HOPPERS),
+        rtol=0,
+        atol=1e-5,
+    )
+    other.load_state_dict({**state, "policy": state["average"]["mean"]})
+    assert np.abs(averaged.act_greedily(HOPPERS) - other.act_greedily(HOPPERS)).max() > 1e-4
+
+
+def test_without_averaging_the_statistics_are_the_last() -> None:
+    agent, _ = learnt("ppo-lag", HOPPER, {"policy_average": 0.0}, UPDATES)
+    assert np.array_equal(agent.final_policy().act_greedily(HOPPERS), agent.act_greedily(HOPPERS))
+
+
+def test_an_older_state_without_averaged_statistics_has_those_of_its_encoder() -> None:
+    agent, _ = learnt("ppo-lag", HOPPER, {}, UPDATES)
+    state = agent.state_dict()
+    del state["average"]["statistics"]
+    older, _ = learnt("ppo-lag", HOPPER, {}, 1)
+    older.load_state_dict(state)
+    same, _ = learnt("ppo-lag", HOPPER, {}, 1)
+    same.load_state_dict({**state, "policy": state["average"]["mean"]})
+    assert np.array_equal(older.final_policy().act_greedily(HOPPERS), same.act_greedily(HOPPERS))
+
+
 class FixedFeatures(torch.nn.Module):
     """A network with random numbers that are neither parameters nor buffers."""
 

@@ -5,13 +5,14 @@
 Each complete trial goes on from its last checkpoint, for ``--updates`` updates under its limit. Before every
 ``--every``-th of them the policy that collects the rollouts runs 64 fresh episodes. If agents learnt the
 layouts on which they train, and not the task, the fresh episodes would cost more than those of training.
-The final policy at that time, which averages the last ones, runs the same 64 episodes.
-Only for tasks whose episodes all have the same length.
+With ``--decays`` moving averages of the policies run the same episodes, once they are 16 updates old.
+All values are sums over as many steps as the longest episode has.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ import numpy as np
 import pandas as pd
 import torch
 
-from recrl.agents.agent import Policy, final_policy
+from recrl.agents.agent import Policy
 from recrl.agents.collection import Collector, episode_costs
+from recrl.agents.learning.actor_critic import ActorCritic
+from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CurriculumStep
 from recrl.environments.registry import make_vector
@@ -30,10 +33,11 @@ from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import TrialSeeds
 
 FRESH_EPISODES = 64
+LEAST_AGE = 16  # updates before an average is evaluated
 
 
 def fresh_means(policy: Policy, spec: TrialSpec, seed: int) -> tuple[float, float]:
-    """Mean return and first cost of fresh episodes."""
+    """Mean return and first cost of fresh episodes, or of more than one where they end early."""
     environments = make_vector(spec.task.name, FRESH_EPISODES, options=spec.task.options)
     assert environments.cmdp.horizon is not None
     collector = Collector(environments, num_steps=environments.cmdp.horizon)
@@ -42,15 +46,21 @@ def fresh_means(policy: Policy, spec: TrialSpec, seed: int) -> tuple[float, floa
     return float(rollout.rewards.sum() / FRESH_EPISODES), float(rollout.costs[..., 0].sum() / FRESH_EPISODES)
 
 
-def continued(trial: TrialStore, updates: int, every: int) -> list[dict[str, Any]]:
+def continued(trial: TrialStore, updates: int, every: int, decays: Sequence[float]) -> list[dict[str, Any]]:
     """A row an update; nothing for a trial that is not complete."""
     spec, checkpoint = trial.spec, trial.latest_checkpoint()
     if checkpoint is None or checkpoint["trial"]["update"] < spec.num_updates:
         return []
     tree = checkpoint["trial"]
     environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
-    agent = make_agent(spec.agent.name, environments.cmdp, spec.agent.options, TrialSeeds.of(spec).agent)
+    agent, spare = (
+        make_agent(spec.agent.name, environments.cmdp, spec.agent.options, TrialSeeds.of(spec).agent)
+        for _ in range(2)
+    )
+    assert isinstance(agent, ActorCritic)
+    assert isinstance(spare, ActorCritic)
     agent.load_state_dict(tree["agent"])
+    averages = {decay: PolicyAverage(spare._policy, decay) for decay in decays}
     collector = Collector(environments, num_steps=spec.rollout_steps, staggered=True)
     collector.load_state_dict(tree["collector"])
     environments.load_state_dict(tree["environments"])
@@ -58,10 +68,15 @@ def continued(trial: TrialStore, updates: int, every: int) -> list[dict[str, Any
     steps = environments.cmdp.horizon
     assert steps is not None
     for update in range(updates):
-        fresh, averaged = [(np.nan, np.nan)] * 2
-        if update % every == 0:
-            policies = (agent, final_policy(agent))
-            fresh, averaged = [fresh_means(policy, spec, 1_000_000 + update) for policy in policies]
+        seed, is_due = 1_000_000 + update, update % every == 0
+        fresh = fresh_means(agent, spec, seed) if is_due else (np.nan, np.nan)
+        averaged = {}
+        for decay, average in averages.items():
+            if is_due and update >= LEAST_AGE:
+                policy = NetworkPolicy(agent._encoder.with_statistics(average.statistics), average.network())
+                averaged[f"average_{decay}_return"], averaged[f"average_{decay}_cost"] = fresh_means(
+                    policy, spec, seed
+                )
         rollout, finished = collector.collect(agent, generator)
         rows.append(
             {
@@ -73,11 +88,12 @@ def continued(trial: TrialStore, updates: int, every: int) -> list[dict[str, Any
                 "training_cost": steps * rollout.costs[..., 0].mean(),
                 "fresh_return": fresh[0],
                 "fresh_cost": fresh[1],
-                "average_return": averaged[0],
-                "average_cost": averaged[1],
+                **averaged,
             }
         )
         agent.update(rollout, episode_costs(finished, 1), CurriculumStep(spec.deploy_limits))
+        for average in averages.values():
+            average.add(agent._policy.parameters.to_numpy(), agent._encoder.statistics)
     return rows
 
 
@@ -88,14 +104,18 @@ def main() -> None:
     parser.add_argument("--to", type=Path, required=True)
     parser.add_argument("--updates", type=int, default=96)
     parser.add_argument("--every", type=int, default=6)
+    parser.add_argument("--decays", type=float, nargs="*", default=[])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     store = SweepStore(arguments.sweep.parent, arguments.sweep.name)
-    rows = [row for trial in store.trials() for row in continued(trial, arguments.updates, arguments.every)]
+    rows = [
+        row
+        for trial in store.trials()
+        for row in continued(trial, arguments.updates, arguments.every, arguments.decays)
+    ]
     table = pd.DataFrame(rows)
     table.round(3).to_csv(arguments.to, index=False, lineterminator="\n")
-    kinds = ("training", "fresh", "average")
-    columns = [f"{kind}_{value}" for value in ("return", "cost") for kind in kinds]
+    columns = [name for end in ("return", "cost") for name in table if str(name).endswith(f"_{end}")]
     print(table.groupby(["task", "limit", "seed"])[columns].mean().round(2).to_string())
 
 
