@@ -201,7 +201,7 @@ def room(
         from recrl.orchestrator.ray.ray_executor import room_on_cluster  # noqa: PLC0415  (imports ray)
 
         return most or max(1, room_on_cluster(address, resources)), "on the cluster at present"
-    if resources.gpus_per_trial and not inline:
+    if resources.gpus_per_trial and not inline and cores is None:
         from recrl.orchestrator.trial.device import trials_on_gpus  # noqa: PLC0415  (imports torch)
 
         most = min(most or sys.maxsize, trials_on_gpus(resources.gpus_per_trial))

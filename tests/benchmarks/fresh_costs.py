@@ -1,11 +1,14 @@
 """What the policies of further updates cost while they learn, on fresh layouts, and when they are averaged.
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/fresh_costs.py runs/safety-gym-margin --to fresh-costs.csv
+    export OMP_NUM_THREADS=1
+    python tests/benchmarks/fresh_costs.py runs/safety-gym-margin-control --to fresh-costs.csv
 
 Each complete trial goes on from its last checkpoint, for ``--updates`` updates under its limit. Before every
 ``--every``-th of them the policy that collects the rollouts runs 64 fresh episodes. If agents learnt the
 layouts on which they train, and not the task, the fresh episodes would cost more than those of training.
-With ``--decays`` moving averages of the policies run the same episodes, once they are 16 updates old.
+With ``--decays`` moving averages of the policies run the same episodes, once they are 16 updates old. With
+``--last-statistics`` their observations are standardised by the statistics of the last update, as they were
+before commit 2c6c6a8.
 All values are sums over as many steps as the longest episode has.
 """
 
@@ -46,7 +49,9 @@ def fresh_means(policy: Policy, spec: TrialSpec, seed: int) -> tuple[float, floa
     return float(rollout.rewards.sum() / FRESH_EPISODES), float(rollout.costs[..., 0].sum() / FRESH_EPISODES)
 
 
-def continued(trial: TrialStore, updates: int, every: int, decays: Sequence[float]) -> list[dict[str, Any]]:
+def continued(
+    trial: TrialStore, updates: int, every: int, decays: Sequence[float], *, last_statistics: bool
+) -> list[dict[str, Any]]:
     """A row an update; nothing for a trial that is not complete."""
     spec, checkpoint = trial.spec, trial.latest_checkpoint()
     if checkpoint is None or checkpoint["trial"]["update"] < spec.num_updates:
@@ -73,7 +78,10 @@ def continued(trial: TrialStore, updates: int, every: int, decays: Sequence[floa
         averaged = {}
         for decay, average in averages.items():
             if is_due and update >= LEAST_AGE:
-                policy = NetworkPolicy(agent._encoder.with_statistics(average.statistics), average.network())
+                encoder = agent._encoder
+                if not last_statistics:
+                    encoder = encoder.with_statistics(average.statistics)
+                policy = NetworkPolicy(encoder, average.network())
                 averaged[f"average_{decay}_return"], averaged[f"average_{decay}_cost"] = fresh_means(
                     policy, spec, seed
                 )
@@ -81,6 +89,7 @@ def continued(trial: TrialStore, updates: int, every: int, decays: Sequence[floa
         rows.append(
             {
                 "task": spec.task.label,
+                "agent": spec.agent.label,
                 "seed": spec.seed,
                 "limit": spec.deploy_limits.array[0],
                 "update": update,
@@ -105,18 +114,25 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=96)
     parser.add_argument("--every", type=int, default=6)
     parser.add_argument("--decays", type=float, nargs="*", default=[])
+    parser.add_argument("--last-statistics", action="store_true")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     store = SweepStore(arguments.sweep.parent, arguments.sweep.name)
     rows = [
         row
         for trial in store.trials()
-        for row in continued(trial, arguments.updates, arguments.every, arguments.decays)
+        for row in continued(
+            trial,
+            arguments.updates,
+            arguments.every,
+            arguments.decays,
+            last_statistics=arguments.last_statistics,
+        )
     ]
     table = pd.DataFrame(rows)
     table.round(3).to_csv(arguments.to, index=False, lineterminator="\n")
     columns = [name for end in ("return", "cost") for name in table if str(name).endswith(f"_{end}")]
-    print(table.groupby(["task", "limit", "seed"])[columns].mean().round(2).to_string())
+    print(table.groupby(["task", "agent", "limit", "seed"])[columns].mean().round(2).to_string())
 
 
 if __name__ == "__main__":

@@ -148,6 +148,9 @@ def test_no_more_trials_run_than_fit_on_the_gpus(
     monkeypatch: pytest.MonkeyPatch, gpus: int, per_trial: float, fitting: int
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    monkeypatch.setattr("recrl.orchestrator.launch_plan.usable_cores", lambda: 64)
     resources = Resources(cpus_per_trial=1, gpus_per_trial=per_trial)
-    assert room(resources, address=None, max_concurrent=None, cores=64)[0] == fitting
-    assert room(resources, address=None, max_concurrent=1, cores=64)[0] == 1
+    assert room(resources, address=None, max_concurrent=None)[0] == fitting
+    assert room(resources, address=None, max_concurrent=64)[0] == fitting
+    assert room(resources, address=None, max_concurrent=1)[0] == 1
+    assert room(resources, address=None, max_concurrent=None, cores=16)[0] == 16, "another machine's cores"
