@@ -14,9 +14,11 @@ the limit by any amount. Without the bound a few such updates would add more tha
 subtract. An agent that has long kept the limit would still avoid all cost. The multipliers' integral is
 bounded likewise (``multiplier_rules.proportional_integral``).
 
-If the last step could not meet its constraint, a larger I would change nothing, and would delay the return to
-the reward. Then I does not grow (anti-wind-up). Under a limit of 0 g is never negative: there I falls only by
-the second rule. A life table's estimate only approaches 0, so g needs not be 0 exactly.
+If a step could not meet its constraint, a larger I would not have changed it. But the next g may be far lower.
+If I stopped growing after every such step, it would count all low gaps and miss many of the high ones. Then
+the cost would stay above the limit. So I stops growing (anti-wind-up) only after a step that could not meet
+its constraint even if an episode cost 0, that is with g = -d. Under a limit of 0 g is never negative: there I
+falls only by the second rule. A life table's estimate only approaches 0, so g needs not be 0 exactly.
 
 g, e and I are in episode cost, so K has no unit. In cost per step the request I would grow with the length of
 the episodes, as robots learn not to fall. K = 0 is the published algorithm.
@@ -71,8 +73,14 @@ class ViolationIntegral:
         corrected[index] = gaps + self._integral[index]
         return replace(constraints, gaps=corrected)
 
+    def without_cost(self, constraints: Constraints) -> Constraints:
+        """Return the constraints with I - d as the gaps of finite limits, as if an episode cost 0."""
+        finite = np.isfinite(constraints.limits)
+        gaps = np.where(finite, self._integral - constraints.limits, constraints.gaps)
+        return replace(constraints, gaps=gaps)
+
     def note_step(self, index: npt.NDArray[np.int64], unmet: npt.NDArray[np.bool_]) -> None:
-        """Remember which of the constraints, [j], the step taken could not meet."""
+        """Remember which of the constraints, [j], the step taken could not meet even ``without_cost``."""
         self._unmet[:] = False
         self._unmet[index] = unmet
 

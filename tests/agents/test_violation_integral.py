@@ -1,6 +1,7 @@
 """The integral of the violations: its arithmetic, its anti-wind-up, and the steady error that it removes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,3 +119,26 @@ def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_rea
         predicted = problem.after(solution) - problem.violations
         cost += 0.3 + 0.5 * float(predicted[0])
     assert cost - limit == pytest.approx(settled, abs=1e-6)
+
+
+@pytest.mark.parametrize("drift", [1.0, 3.0])
+def test_the_cost_settles_on_the_limit_though_the_constraint_is_often_unreachable(drift: float) -> None:
+    # As above, but the cost is measured with noise, and a step can lower it by 10 at most.
+    generator = np.random.default_rng(5)
+    integral = ViolationIntegral(0.03, 1)
+    cost, limit, count = 60.0, 25.0, 5_000
+    costs, recoveries = np.zeros(count), 0
+    for update in range(count):
+        measured = cost + generator.uniform(-15.0, 15.0)
+        constraints = Constraints(np.full(1, limit), np.full(1, measured - limit), np.full(1, 9.0), 1.0)
+        gap = integral.corrected(constraints).gaps
+        problem = StepProblem(1.0, np.array([-1.0]), np.eye(1), gap, 50.0)
+        solution = solve_dual(problem)
+        lowest = replace(problem, violations=integral.without_cost(constraints).gaps)
+        integral.note_step(BOTH[:1], lowest.unmet(solution))
+        predicted = problem.after(solution) - problem.violations
+        cost = max(cost + drift + 0.5 * float(predicted[0]), 0.0)
+        costs[update] = measured
+        recoveries += solution.case is StepCase.RECOVERY
+    assert recoveries / count > 0.2
+    assert costs[1_000:].mean() - limit == pytest.approx(0.0, abs=0.5)
