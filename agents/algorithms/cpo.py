@@ -17,7 +17,6 @@ Notation: N samples, k costs, P parameters, delta the trust region's size, H its
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -200,10 +199,8 @@ class ConstrainedPolicyOptimisation:
         solution = self._solve(problem)
         is_acceptable = acceptance(model, active, solution, config.target_kl)
         metrics = line_search(policy, to_parameter_step(solution, solved), is_acceptable, config)
-        rejected = metrics["policy_steps"] == 0.0
-        lowest = ActiveConstraints.of(integral.without_cost(constraints)).divided_by(spreads[1:]).violations
-        unmet = replace(problem, violations=lowest).unmet(solution) | (rejected & (lowest > 0.0))
-        integral.note_step(active.index, unmet)
+        reach = problem.reach * spreads[1 + active.index] * constraints.episode_length
+        integral.lower_to(active.index, constraints.limits[active.index] + reach)
         multipliers[:] = 0.0
         multipliers[active.index] = solution.multipliers / spreads[1 + active.index]
         return {

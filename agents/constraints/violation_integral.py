@@ -14,11 +14,14 @@ the limit by any amount. Without the bound a few such updates would add more tha
 subtract. An agent that has long kept the limit would still avoid all cost. The multipliers' integral is
 bounded likewise (``multiplier_rules.proportional_integral``).
 
-If a step could not meet its constraint, a larger I would not have changed it. But the next g may be far lower.
-If I stopped growing after every such step, it would count all low gaps and miss many of the high ones. Then
-the cost would stay above the limit. So I stops growing (anti-wind-up) only after a step that could not meet
-its constraint even if an episode cost 0, that is with g = -d. Under a limit of 0 g is never negative: there I
-falls only by the second rule. A life table's estimate only approaches 0, so g needs not be 0 exactly.
+I is at most d + r (anti-wind-up), r being the largest fall of the cost that a step in the trust region
+predicts. With a larger I no step could meet the constraint, even if an episode cost 0. Such an I would only
+delay the return to the reward, above all after the limit has fallen. A smaller bound would bias the cost.
+Whether a step can meet the constraint changes from update to update. If I did not grow where none can at the
+present g, many high costs would not count, and all low ones would.
+
+Under a limit of 0 g is never negative: there I falls only by the second rule and by the bound. A life table's
+estimate only approaches 0, so g needs not be 0 exactly.
 
 g, e and I are in episode cost, so K has no unit. In cost per step the request I would grow with the length of
 the episodes, as robots learn not to fall. K = 0 is the published algorithm.
@@ -52,7 +55,6 @@ class ViolationIntegral:
     def __init__(self, gain: float, num_costs: int) -> None:
         self._gain = gain
         self._integral = np.zeros(num_costs)
-        self._unmet = np.zeros(num_costs, dtype=np.bool_)
 
     @property
     def values(self) -> Floats:
@@ -65,30 +67,21 @@ class ViolationIntegral:
         gaps = constraints.gaps[index]
         sizes = np.hypot(constraints.limits[index], constraints.standard_errors[index])
         change = self._gain * np.minimum(gaps, sizes)
-        grows = np.where(self._unmet[index], np.minimum(change, 0.0), change)
         kept = (constraints.limits[index] == 0.0) & (gaps <= NEGLIGIBLE * self._integral[index])
         forgotten = np.where(kept, self._gain * self._integral[index], 0.0)
-        self._integral[index] = np.maximum(self._integral[index] + grows - forgotten, 0.0)
+        self._integral[index] = np.maximum(self._integral[index] + change - forgotten, 0.0)
         corrected = constraints.gaps.copy()
         corrected[index] = gaps + self._integral[index]
         return replace(constraints, gaps=corrected)
 
-    def without_cost(self, constraints: Constraints) -> Constraints:
-        """Return the constraints with I - d as the gaps of finite limits, as if an episode cost 0."""
-        finite = np.isfinite(constraints.limits)
-        gaps = np.where(finite, self._integral - constraints.limits, constraints.gaps)
-        return replace(constraints, gaps=gaps)
-
-    def note_step(self, index: npt.NDArray[np.int64], unmet: npt.NDArray[np.bool_]) -> None:
-        """Remember which of the constraints, [j], the step taken could not meet even ``without_cost``."""
-        self._unmet[:] = False
-        self._unmet[index] = unmet
+    def lower_to(self, index: npt.NDArray[np.int64], bounds: Floats) -> None:
+        """Lower I of some constraints, [j], to at most their bounds, episode cost, [j]."""
+        self._integral[index] = np.minimum(self._integral[index], bounds)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the integral, and which constraints the last step did not meet, [k] each."""
-        return {"integral": self._integral.copy(), "unmet": self._unmet.copy()}
+        """Return the integral, [k]."""
+        return {"integral": self._integral.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         self._integral = np.array(state["integral"], np.float64)
-        self._unmet = np.array(state["unmet"], np.bool_)

@@ -41,7 +41,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 
@@ -52,8 +51,6 @@ NO_INFLUENCE = 1e-12
 NO_GRADIENT = 1e-10
 # Tolerance of a constraint for rounding, as a fraction of what the trust region can change.
 FEASIBILITY_TOLERANCE = 1e-9
-# Likewise, of a binding constraint: the error of a nearly dependent system of them, see NO_GRADIENT.
-BINDING_TOLERANCE = 1e-6
 
 
 class StepCase(IntEnum):
@@ -93,13 +90,11 @@ class StepProblem:
             self.violations - solution.gradient_weight * self.mixed - self.gram @ solution.constraint_weights
         )
 
-    def unmet(self, solution: DualSolution) -> npt.NDArray[np.bool_]:
-        """Return which violated constraints a step leaves violated, to first order, [k]."""
-        reach = np.sqrt(2.0 * self.radius * np.maximum(np.diag(self.gram), 0.0))
-        left: npt.NDArray[np.bool_] = (self.violations > 0.0) & (
-            self.after(solution) > BINDING_TOLERANCE * reach
-        )
-        return left
+    @property
+    def reach(self) -> Floats:
+        """The largest fall of each cost surrogate in the trust region, to first order, [k]."""
+        reach: Floats = np.sqrt(2.0 * self.radius * np.maximum(np.diag(self.gram), 0.0))
+        return reach
 
 
 @dataclass(frozen=True, eq=False)
