@@ -3,10 +3,11 @@
     cd results/velocity
     python ../../tests/benchmarks/velocity_table.py six-agents.csv --published published.csv
 
-The tables are those of ``final_policies.py``. A cell is mean return / mean cost over seeds, with one standard
-error of the cost: over seeds or over all episodes, whichever is larger. An agent keeps the limit on a task if
-its mean cost is at most the limit. The agent that then earns most is shown beside the published one of the
-same kind, with Student's 95% interval of its mean over seeds.
+The tables are those of ``final_policies.py``. A cell is mean return / mean cost over seeds, with one
+standard error of the cost: over seeds or over all episodes, whichever is larger. An agent keeps the limit
+on a task if its mean cost is at most the limit. Of those agents the one that earns most is shown, with
+Student's 95% interval of its mean over seeds, which does not allow for the choice. Beside it is the best of
+the published agents that keep the limit.
 """
 
 from __future__ import annotations
@@ -91,7 +92,10 @@ def print_tables(rows: pd.DataFrame, published: pd.DataFrame) -> None:
     print("| task | " + " | ".join(f"`{agent}`" for agent in AGENTS) + " |")
     print("|---" * (len(AGENTS) + 1) + "|")
     for task, agents in table.items():
-        texts = [f"{number(agents[a].episode_return)} / {agents[a].costs}" for a in AGENTS if a in agents]
+        texts = [
+            f"{number(agents[a].episode_return)} / {agents[a].costs}" if a in agents else "not run"
+            for a in AGENTS
+        ]
         print(f"| {task} | " + " | ".join(texts) + " |")
     print("\n| task | best within the limit | return | cost | published best within the limit |")
     print("|---|---|---|---|---|")
@@ -123,7 +127,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     published = pd.read_csv(given.published, comment="#")
     for policy in ("stochastic", "deterministic"):
         chosen = rows[rows["policy"] == policy]
-        print(f"\n{policy}, {chosen['seed'].nunique()} seeds\n")
+        seeds = chosen.groupby(["task", "agent"])["seed"]
+        if (seeds.count() > seeds.nunique()).any():
+            raise SystemExit("a task, agent and seed is in the tables twice")
+        print(f"\n{policy}, {seeds.count().min()} to {seeds.count().max()} seeds\n")
         print_tables(chosen, published)
 
 

@@ -26,6 +26,7 @@ DEFINITIONS = {
     "What was found": {
         "2e6": "steps of a trial",
         "1e7": "steps of a published run",
+        "1e6": "steps of a trial on a velocity task",
         "117": "a count, see test_the_table_of_rivergrid_is_counted",
         "120": "a count, likewise",
         "0.33": "a p-value, see test_the_table_of_rivergrid_is_counted",
