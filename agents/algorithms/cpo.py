@@ -200,7 +200,7 @@ class ConstrainedPolicyOptimisation:
         is_acceptable = acceptance(model, active, solution, config.target_kl)
         metrics = line_search(policy, to_parameter_step(solution, solved), is_acceptable, config)
         reach = problem.reach * spreads[1 + active.index] * constraints.episode_length
-        integral.lower_to(active.index, constraints.limits[active.index] + reach)
+        integral.bound(active.index, constraints.limits[active.index], reach)
         multipliers[:] = 0.0
         multipliers[active.index] = solution.multipliers / spreads[1 + active.index]
         return {

@@ -14,11 +14,12 @@ the limit by any amount. Without the bound a few such updates would add more tha
 subtract. An agent that has long kept the limit would still avoid all cost. The multipliers' integral is
 bounded likewise (``multiplier_rules.proportional_integral``).
 
-I is at most d + r (anti-wind-up), r being the largest fall of the cost that a step in the trust region
-predicts. With a larger I no step could meet the constraint, even if an episode cost 0. Such an I would only
-delay the return to the reward, above all after the limit has fallen. A smaller bound would bias the cost.
-Whether a step can meet the constraint changes from update to update. If I did not grow where none can at the
-present g, many high costs would not count, and all low ones would.
+I is at most d + r (anti-wind-up), r being the running mean of the largest fall of the cost that a step in
+the trust region predicts. With a larger I a step can hardly meet the constraint, even if an episode cost 0.
+Such an I would only delay the return to the reward, above all after the limit has fallen. Smaller bounds
+would bias the cost: whether a step can meet the constraint changes from update to update. If I did not grow
+where none can at the present g, many high costs would not count, and all low ones would. The largest fall
+of a single update is no good bound, either, because it is small where the rollout happened to cost little.
 
 Under a limit of 0 g is never negative: there I falls only by the second rule and by the bound. A life table's
 estimate only approaches 0, so g needs not be 0 exactly.
@@ -42,6 +43,7 @@ from recrl.agents.experience import Constraints
 from recrl.environments.cmdp import Floats
 
 NEGLIGIBLE = 1e-6
+REACH_DECAY = 0.9  # per update
 
 
 class ViolationIntegral:
@@ -55,6 +57,7 @@ class ViolationIntegral:
     def __init__(self, gain: float, num_costs: int) -> None:
         self._gain = gain
         self._integral = np.zeros(num_costs)
+        self._reach = np.full(num_costs, np.nan)
 
     @property
     def values(self) -> Floats:
@@ -74,14 +77,24 @@ class ViolationIntegral:
         corrected[index] = gaps + self._integral[index]
         return replace(constraints, gaps=corrected)
 
-    def lower_to(self, index: npt.NDArray[np.int64], bounds: Floats) -> None:
-        """Lower I of some constraints, [j], to at most their bounds, episode cost, [j]."""
-        self._integral[index] = np.minimum(self._integral[index], bounds)
+    def bound(self, index: npt.NDArray[np.int64], limits: Floats, reach: Floats) -> None:
+        """Note the reach of a step, and lower I of the constraints to at most d + r.
+
+        Args:
+            index: the constraints, [j].
+            limits: d, [j].
+            reach: the largest fall of each cost that this update's step could predict, episode cost, [j].
+        """
+        old = self._reach[index]
+        mean = np.where(np.isnan(old), reach, REACH_DECAY * old + (1.0 - REACH_DECAY) * reach)
+        self._reach[index] = mean
+        self._integral[index] = np.minimum(self._integral[index], limits + mean)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the integral, [k]."""
-        return {"integral": self._integral.copy()}
+        """Return the integral and the mean reach, [k] each."""
+        return {"integral": self._integral.copy(), "reach": self._reach.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         self._integral = np.array(state["integral"], np.float64)
+        self._reach = np.array(state.get("reach", np.full(len(self._integral), np.nan)), np.float64)

@@ -42,18 +42,34 @@ def test_a_cost_without_a_limit_keeps_its_integral() -> None:
     assert integral.values.tolist() == [0.5, 1.0]
 
 
-def test_it_is_lowered_to_its_bounds_and_not_raised() -> None:
+def test_it_is_lowered_to_the_limit_and_the_mean_reach() -> None:
     integral = ViolationIntegral(0.5, 3)
-    after(integral, 1.0, 4.0, 8.0)
-    integral.lower_to(np.array([0, 2]), np.array([1.0, 3.5]))
-    assert integral.values.tolist() == [0.5, 2.0, 3.5]
+    after(integral, 20.0, 8.0, 40.0)
+    assert integral.values.tolist() == [10.0, 4.0, 20.0]
+    integral.bound(np.array([0, 2]), np.array([1.0, 6.0]), np.array([10.0, 10.0]))
+    assert integral.values.tolist() == [10.0, 4.0, 16.0]
+    integral.bound(np.array([0, 2]), np.array([1.0, 6.0]), np.array([0.0, 5.0]))  # mean reach: 9 and 9.5
+    assert integral.values.tolist() == [10.0, 4.0, 15.5]
+    integral.bound(np.array([0]), np.array([0.0]), np.array([9.0]))
+    assert integral.values.tolist() == [9.0, 4.0, 15.5]
 
 
 def test_a_restored_integral_goes_on_exactly() -> None:
     first, second = ViolationIntegral(0.3, 2), ViolationIntegral(0.3, 2)
     after(first, 1.0, 0.1)
+    first.bound(BOTH, np.zeros(2), np.array([0.2, 0.01]))
     second.load_state_dict(first.state_dict())
     assert after(first, 0.7, 0.3) == after(second, 0.7, 0.3)
+    for each in (first, second):
+        each.bound(BOTH, np.zeros(2), np.array([0.1, 0.02]))
+    assert first.values.tolist() == second.values.tolist() == pytest.approx([0.19, 0.011])
+
+
+def test_a_state_of_before_the_bound_loads() -> None:
+    integral = ViolationIntegral(0.3, 2)
+    integral.load_state_dict({"integral": np.array([3.0, 4.0]), "unmet": np.array([True, False])})
+    integral.bound(BOTH, np.ones(2), np.ones(2))
+    assert integral.values.tolist() == [2.0, 2.0]
 
 
 def test_a_limit_of_0_that_is_kept_forgets_old_violations() -> None:
@@ -117,7 +133,7 @@ def test_the_cost_settles_on_the_limit_though_many_steps_cannot_reach_their_aim(
         aims = integral.corrected(constraints).gaps
         problem = StepProblem(1.0, np.array([-1.0]), np.eye(1), aims, 50.0)
         solution = solve_dual(problem)
-        integral.lower_to(BOTH[:1], np.full(1, bound))
+        integral.bound(BOTH[:1], np.full(1, bound - 10.0), np.full(1, 10.0))
         predicted = problem.after(solution) - problem.violations
         cost += drift + 0.5 * float(predicted[0])
         recoveries += solution.case is StepCase.RECOVERY
@@ -130,8 +146,8 @@ def test_after_the_limit_has_fallen_the_integral_is_soon_within_its_new_bound() 
     integral = ViolationIntegral(0.1, 1)
     for _ in range(200):
         after(integral, 50.0, limit=200.0)
-        integral.lower_to(BOTH[:1], np.full(1, 200.0 + 10.0))
+        integral.bound(BOTH[:1], np.full(1, 200.0), np.full(1, 10.0))
     assert integral.values.tolist() == [210.0]
     after(integral, 5.0, limit=25.0)
-    integral.lower_to(BOTH[:1], np.full(1, 25.0 + 10.0))
+    integral.bound(BOTH[:1], np.full(1, 25.0), np.full(1, 10.0))
     assert integral.values.tolist() == [35.0]
