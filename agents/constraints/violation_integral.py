@@ -16,10 +16,10 @@ bounded likewise (``multiplier_rules.proportional_integral``).
 
 I is at most d + r (anti-wind-up), r being the running mean of the largest fall of the cost that a step in
 the trust region predicts. With a larger I a step can hardly meet the constraint, even if an episode cost 0.
-Such an I would only delay the return to the reward, above all after the limit has fallen. Smaller bounds
-would bias the cost: whether a step can meet the constraint changes from update to update. If I did not grow
-where none can at the present g, many high costs would not count, and all low ones would. The largest fall
-of a single update is no good bound, either, because it is small where the rollout happened to cost little.
+Such an I would only delay the return to the reward, above all after the limit has fallen. A bound that is
+reached often biases the cost, because it removes high gaps and no low ones. So I still grows where no step
+can meet the constraint at the present g + I. And r is a mean: that of a single update is small where its
+rollout happened to cost little.
 
 Under a limit of 0 g is never negative: there I falls only by the second rule and by the bound. A life table's
 estimate only approaches 0, so g needs not be 0 exactly.

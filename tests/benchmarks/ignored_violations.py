@@ -16,21 +16,21 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 import recrl
 
 KEYS = ["task", "agent", "method", "seed"]
 RECOVERY = 2.0
-GAIN = 0.03
+GAIN = 0.03  # the default of violation_integral_gain
+ROUNDING = 1e-6
 
 
 def row(updates: pd.DataFrame) -> dict[str, float]:
     """The columns of one trial."""
     violations, integral = updates["cost_gap_0"], updates["violation_integral_0"]
-    counted = np.maximum(integral.diff() / GAIN, -integral.shift() / GAIN)
-    missed = (violations - counted).where((violations > 0.0) & (counted < violations - 1e-6), 0.0)
+    counted = integral.diff() / GAIN
+    missed = (violations - counted).where(counted < violations - ROUNDING, 0.0)
     share = updates["end_step"] / updates["end_step"].max()
     late = share > 0.5
     return {
