@@ -29,7 +29,7 @@ DEFINITIONS = {
         "1e6": "steps of a trial on a velocity task",
         "117": "a count, see test_the_table_of_rivergrid_is_counted",
         "120": "a count, likewise",
-        "0.24": "a p-value, see test_the_table_of_rivergrid_is_counted",
+        "0.21": "a p-value, see test_the_table_of_rivergrid_is_counted",
     },
 }
 NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
