@@ -6,23 +6,24 @@ predicted. It converges above the limit, where the realised fall balances the ri
 causes. An integral of the gap g, the mean episode cost minus the limit, removes this steady error, as in
 every controller:
 
-    I <- max(I + K min(g, e), 0),    if d = 0 and g is negligible beside I: I <- (1 - K) I;
+    I <- max(I + K min(g, e), 0)    before the step; c is computed from g + I in place of g,
+    I <- min(I, d + r)              after the step.
 
-c is computed from g + I in place of g. e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost,
-bounds what a gap adds. An episode costs at least 0, so g is at least -d, but an untrained policy may exceed
-the limit by any amount. Without the bound a few such updates would add more than hundreds of later ones could
-subtract. An agent that has long kept the limit would still avoid all cost. The multipliers' integral is
-bounded likewise (``multiplier_rules.proportional_integral``).
+**What a gap adds.** e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost. An episode costs
+at least 0, so g is at least -d, but an untrained policy may exceed the limit by any amount. Without e a few
+such updates would add more than hundreds of later ones could subtract. An agent that has long kept the limit
+would still avoid all cost. The multipliers' integral has the same e
+(``multiplier_rules.proportional_integral``).
 
-I is at most d + r (anti-wind-up), r being the running mean of the largest fall of the cost that a step in
-the trust region predicts. With a larger I a step can hardly meet the constraint, even if an episode cost 0.
-Such an I would only delay the return to the reward, above all after the limit has fallen. A bound that is
-reached often biases the cost, because it removes high gaps and no low ones. So I still grows where no step
-can meet the constraint at the present g + I. And r is a mean: that of a single update is small where its
-rollout happened to cost little.
+**The bound (anti-wind-up).** r is the running mean of the largest fall of the cost that a step in the trust
+region predicts. With an I above d + r a step can hardly meet the constraint, even if an episode cost 0. Such
+an I would only delay the return to the reward, above all after the limit has fallen. A bound that is reached
+often biases the cost, because it removes high gaps and no low ones. So I still grows where no step can meet
+the constraint at the present g + I. And r is a mean: that of a single update is small where its rollout
+happened to cost little.
 
-Under a limit of 0 g is never negative: there I falls only by the second rule and by the bound. A life table's
-estimate only approaches 0, so g needs not be 0 exactly.
+**Limits of 0.** Under a limit of 0 g is never negative. There, if g is negligible beside I, I falls by K I.
+A life table's estimate only approaches 0, so g needs not be 0 exactly.
 
 g, e and I are in episode cost, so K has no unit. In cost per step the request I would grow with the length of
 the episodes, as robots learn not to fall. K = 0 is the published algorithm.
@@ -43,7 +44,7 @@ from recrl.agents.experience import Constraints
 from recrl.environments.cmdp import Floats
 
 NEGLIGIBLE = 1e-6
-REACH_DECAY = 0.9  # per update
+REACH_DECAY = 0.9  # of r, per update
 
 
 class ViolationIntegral:
@@ -78,7 +79,7 @@ class ViolationIntegral:
         return replace(constraints, gaps=corrected)
 
     def bound(self, index: npt.NDArray[np.int64], limits: Floats, reach: Floats) -> None:
-        """Note the reach of a step, and lower I of the constraints to at most d + r.
+        """Include the reach of a step in r, and set I to min(I, d + r).
 
         Args:
             index: the constraints, [j].
@@ -86,9 +87,8 @@ class ViolationIntegral:
             reach: the largest fall of each cost that this update's step could predict, episode cost, [j].
         """
         old = self._reach[index]
-        mean = np.where(np.isnan(old), reach, REACH_DECAY * old + (1.0 - REACH_DECAY) * reach)
-        self._reach[index] = mean
-        self._integral[index] = np.minimum(self._integral[index], limits + mean)
+        self._reach[index] = np.where(np.isnan(old), reach, REACH_DECAY * old + (1.0 - REACH_DECAY) * reach)
+        self._integral[index] = np.minimum(self._integral[index], limits + self._reach[index])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the integral and the mean reach, [k] each."""

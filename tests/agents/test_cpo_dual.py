@@ -70,6 +70,13 @@ def test_recovery_leaves_constraints_that_hold_as_they_are() -> None:
     assert step(solution, -EAST, costs) == pytest.approx(-EAST)
 
 
+def test_constraints_that_hinder_one_another_stay_violated_though_each_alone_could_be_met() -> None:
+    gram = np.array([[1.0, -0.9], [-0.9, 1.0]])
+    problem = StepProblem(1.0, np.zeros(2), gram, np.full(2, 0.1), 0.01)
+    assert problem.reach == pytest.approx([0.1414, 0.1414], abs=1e-4)  # sqrt(0.02)
+    assert problem.after(solve_dual(problem)) == pytest.approx([0.0684, 0.0684], abs=1e-3)
+
+
 def test_where_constraints_contradict_one_another_recovery_lowers_the_furthest_from_its_limit() -> None:
     costs = np.stack([EAST, -100.0 * EAST])
     solution = solve_dual(reduced(NORTH, costs, np.array([10.0, 500.0]), 0.5))

@@ -59,6 +59,12 @@ def test_the_projection_leaves_what_no_constraint_concerns() -> None:
     assert found == pytest.approx([0.0, math.sqrt(0.5)])
 
 
+def test_a_step_that_was_scaled_back_leaves_its_constraint_violated_though_it_is_within_reach() -> None:
+    problem = StepProblem(1.0, np.array([-0.9]), np.eye(1), np.array([0.13]), 0.01)
+    assert problem.reach == pytest.approx([0.1414], abs=1e-4)
+    assert problem.after(projected_step(problem)) == pytest.approx([0.00222], abs=1e-5)
+
+
 def test_the_published_weight_of_one_constraint() -> None:
     assert projection_weights(np.array([[4.0]]), np.array([2.0])) == pytest.approx([0.5])
     assert projection_weights(np.array([[4.0]]), np.array([-2.0])) == pytest.approx([0.0])

@@ -22,13 +22,15 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from recrl.environments.cmdp import Floats
+
 LIMIT = 25.0
 AGENTS = ("ppo-lag", "trpo-lag", "cpo", "pcpo", "focops", "p3o")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One agent on one task, over seeds."""
+    """One agent on one task: means over seeds, half of the return's interval, the error of the cost."""
 
     task: str
     agent: str
@@ -40,14 +42,11 @@ class Cell:
     @classmethod
     def of(cls, task: str, agent: str, rows: pd.DataFrame) -> Cell:
         """Average the policies of one agent on one task, a row a seed."""
-        returns, costs = rows["return"].to_numpy(), rows["cost"].to_numpy()
-        n = len(rows)
-        over_episodes = math.sqrt(float((rows["cost_se"].to_numpy() ** 2).sum())) / n
-        over_seeds = float(np.std(costs, ddof=1)) / math.sqrt(n) if n > 1 else 0.0
-        spread = float(np.std(returns, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
-        half_width = float(stats.t.ppf(0.975, n - 1)) * spread if n > 1 else math.nan
-        error = max(over_episodes, over_seeds)
-        return cls(task, agent, float(returns.mean()), half_width, float(costs.mean()), error)
+        returns, costs, errors = rows[["return", "cost", "cost_se"]].to_numpy(np.float64).T
+        over_episodes = float(np.linalg.norm(errors)) / len(rows)
+        cost_error = float(np.fmax(over_episodes, standard_error(costs)))
+        half_width = float(stats.t.ppf(0.975, len(rows) - 1)) * standard_error(returns)
+        return cls(task, agent, float(returns.mean()), half_width, float(costs.mean()), cost_error)
 
     @property
     def interval(self) -> str:
@@ -61,6 +60,11 @@ class Cell:
     def costs(self) -> str:
         """The mean cost with its error."""
         return f"{self.cost:.1f} +- {self.cost_error:.1f}"
+
+
+def standard_error(values: Floats) -> float:
+    """One standard error of a mean; NaN for a single value."""
+    return float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
 
 
 def number(value: float) -> str:
