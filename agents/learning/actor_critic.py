@@ -120,7 +120,7 @@ class ActorCritic:
         return self._behaviour.action_probabilities(observations)
 
     def final_policy(self) -> NetworkPolicy:
-        """Return the average of the policies after the last updates, see ``policy_average``."""
+        """Return the policy with the parameters averaged over the last updates, see ``policy_average``."""
         encoder = self._encoder.with_statistics(self._average.statistics)
         return NetworkPolicy(encoder, self._average.network())
 
