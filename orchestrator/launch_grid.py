@@ -22,7 +22,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.file_models import Resources
-from recrl.orchestrator.launch_plan import Plan, TrialSelection, trials_at_once
+from recrl.orchestrator.launch_plan import Plan, TrialSelection, trials_at_once, trials_on_gpus
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.run_sweep import (
@@ -202,9 +202,9 @@ def room(
 
         return most or max(1, room_on_cluster(address, resources)), "on the cluster at present"
     if resources.gpus_per_trial and not inline and cores is None:
-        from recrl.orchestrator.trial.device import trials_on_gpus  # noqa: PLC0415  (imports torch)
+        from recrl.orchestrator.trial.device import usable_gpus  # noqa: PLC0415  (imports torch)
 
-        most = min(most or sys.maxsize, trials_on_gpus(resources.gpus_per_trial))
+        most = min(most or sys.maxsize, max(1, trials_on_gpus(usable_gpus(), resources.gpus_per_trial)))
     fitting = trials_at_once(cpus_per_trial=resources.cpus_per_trial, max_concurrent=most, cores=cores)
     return fitting, f"on {cores} cores" if cores else "on this machine"
 

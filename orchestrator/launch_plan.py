@@ -230,6 +230,17 @@ def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: 
     return min(fitting, max_concurrent or fitting)
 
 
+def trials_on_gpus(gpus: float, gpus_per_trial: float) -> int:
+    """Return how many trials fit on the GPUs of one machine, at least 0.
+
+    Args:
+        gpus: of the machine, at least 0.
+        gpus_per_trial: above 0, and whole above 1. Below 1 several trials share a GPU; none uses two.
+    """
+    on_each = int(1.0 / gpus_per_trial + 1e-9)
+    return int(gpus) * on_each if on_each else int(gpus / gpus_per_trial)
+
+
 def usable_cores(quota_file: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
     """Return the number of cores that this process may use, at least 1; in a container maybe not all.
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -93,6 +94,15 @@ def _read_custom(value: Any) -> dict[str, float]:
         if isinstance(amount, bool) or not isinstance(amount, int | float) or not 0.0 < amount <= 1e6:
             raise ValueError(f"must be amounts above 0 and at most 1e6, got {as_written(amount)} of {name}")
     return {name: float(amount) for name, amount in value.items()}
+
+
+def _share_or_whole(gpus: float) -> float:
+    """Check GPUs of a trial as Ray does: parts of one, or a whole number."""
+    if gpus > 1.0 and not gpus.is_integer():
+        raise ValueError(f"must be a whole number above 1, or less than 1 to share a GPU, got {gpus:g}")
+    if 0.0 < gpus < 1e-4:
+        raise ValueError(f"must be 0 or at least 0.0001, got {gpus:g}")
+    return gpus
 
 
 def _listed(value: Any) -> Any:
@@ -225,8 +235,11 @@ class Resources(_Written):
     """Resources of a trial; no result depends on them."""
 
     cpus_per_trial: Number = Field(default=1.0, ge=1e-4, le=1024.0, description="Cores of a running trial.")
-    gpus_per_trial: Number = Field(
-        default=0.0, ge=0.0, le=64.0, description="GPUs of a running trial. Above 0 it learns on CUDA."
+    gpus_per_trial: Annotated[Number, AfterValidator(_share_or_whole)] = Field(
+        default=0.0,
+        ge=0.0,
+        le=64.0,
+        description="GPUs of a running trial. Above 0 it learns on CUDA; below 1 trials share a GPU.",
     )
     custom_per_trial: CustomResources = Field(
         default_factory=dict,

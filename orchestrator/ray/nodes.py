@@ -15,6 +15,7 @@ from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from recrl.orchestrator.errors import ClusterError
+from recrl.orchestrator.launch_plan import trials_on_gpus
 
 DISTRIBUTIONS = ("recrl", "ray", "torch", "numpy")
 ANSWER_SECONDS = 180.0  # a node may have to start its first process
@@ -29,8 +30,14 @@ def trials_that_fit(wanted: Mapping[str, float]) -> int:
     """
     asked = {name: amount for name, amount in wanted.items() if amount > 0.0}
     return sum(
-        int(min(node["Resources"].get(name, 0.0) / asked[name] for name in asked) + 1e-9) for node in _nodes()
+        min(_fitting(name, node["Resources"].get(name, 0.0), asked[name]) for name in asked)
+        for node in _nodes()
     )
+
+
+def _fitting(name: str, there: float, asked: float) -> int:
+    """Return how many trials a node's amount of one resource is enough for."""
+    return trials_on_gpus(there, asked) if name == "GPU" else int(there / asked + 1e-9)
 
 
 def check_nodes(probe: str, uri: str = "") -> None:

@@ -23,15 +23,9 @@ def require_gpu() -> None:
         )
 
 
-def trials_on_gpus(gpus_per_trial: float) -> int:
-    """Return how many trials fit on the GPUs of this machine; at least 1, even without a GPU.
-
-    Args:
-        gpus_per_trial: above 0. Below 1 several trials share a GPU; no trial is spread over parts of two.
-    """
-    gpus = torch.cuda.device_count()
-    shared = int(1 / gpus_per_trial + 1e-9)
-    return max(1, gpus * shared if shared else int(gpus / gpus_per_trial))
+def usable_gpus() -> int:
+    """Return the number of GPUs that PyTorch can use here."""
+    return torch.cuda.device_count()
 
 
 def device_name(*, on_gpu: bool) -> str:

@@ -341,6 +341,17 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
             "resources: {cpus_per_trial: 0}\nrun:",
             "grid.yaml:6: resources.cpus_per_trial: must be at least 0.0001, got 0",
         ),
+        (
+            "run:",
+            "resources: {gpus_per_trial: 1.5}\nrun:",
+            "grid.yaml:6: resources.gpus_per_trial: must be a whole number above 1, or less than 1 to share "
+            "a GPU, got 1.5",
+        ),
+        (
+            "run:",
+            "resources: {gpus_per_trial: 0.00001}\nrun:",
+            "grid.yaml:6: resources.gpus_per_trial: must be 0 or at least 0.0001, got 1e-05",
+        ),
         ("seeds: 2", "seeds: 2\nseeds: 3", "grid.yaml:6: seeds: given twice, first on line 5"),
         ("seeds: 2", "seeds: !!python/name:os.system ''", None),
         ("seeds: 2", "<<: {seeds: 2}", None),

@@ -15,6 +15,7 @@ from recrl.orchestrator.launch_plan import (
     estimate,
     make_plan,
     trials_at_once,
+    trials_on_gpus,
     unmeasured,
     usable_cores,
 )
@@ -128,6 +129,23 @@ def test_nothing_to_do_takes_nothing(store: SweepStore) -> None:
 def test_at_least_one_trial_fits_and_no_more_than_allowed() -> None:
     assert trials_at_once(cpus_per_trial=1e6, max_concurrent=None) == 1
     assert trials_at_once(cpus_per_trial=1e-3, max_concurrent=3) == 3
+
+
+@pytest.mark.parametrize(
+    ("gpus", "of_a_trial", "trials"),
+    [
+        (0, 1.0, 0),
+        (3, 1.0, 3),
+        (3, 2.0, 1),
+        (2, 0.5, 4),
+        (2, 0.6, 2),
+        (2, 0.4, 4),
+        (10, 0.1, 100),
+        (1, 0.3, 3),
+    ],
+)
+def test_trials_share_a_gpu_but_use_no_parts_of_two(gpus: int, of_a_trial: float, trials: int) -> None:
+    assert trials_on_gpus(gpus, of_a_trial) == trials
 
 
 @pytest.mark.parametrize(("text", "cores"), [("max 100000", 4), ("150000 100000", 1), ("300000 100000", 3)])

@@ -286,6 +286,15 @@ def test_nodes_hold_as_many_trials_as_fit_on_each() -> None:
     assert trials_that_fit({"CPU": 1.0, "big_memory": 1.0}) == 0
 
 
+def test_no_trial_uses_parts_of_two_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        nodes, "_nodes", lambda: [{"Resources": {"CPU": 16.0, "GPU": 2.0}}, {"Resources": {"CPU": 1.0}}]
+    )
+    assert trials_that_fit({"CPU": 1.0, "GPU": 0.6}) == 2
+    assert trials_that_fit({"CPU": 1.0, "GPU": 0.4}) == 4
+    assert trials_that_fit({"CPU": 9.0, "GPU": 0.4}) == 1
+
+
 @pytest.mark.usefixtures("cluster")
 def test_nodes_are_asked_before_any_trial(tmp_path: Path) -> None:
     (tmp_path / "probe").touch()
