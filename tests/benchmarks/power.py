@@ -1,6 +1,6 @@
 """How large a difference between two curricula a number of seeds can show.
 
-    python tests/benchmarks/power.py results/safety-gym/agents-0.99.csv results/safety-gym/curricula.csv
+    python tests/benchmarks/power.py results/safety-gym/agents.csv results/safety-gym/curricula-today.csv
 
 The spread is the standard deviation s of the returns of final policies of one agent and curriculum on a task,
 over seeds and repetitions, pooled over the groups of the task. For n seeds of each of two curricula the table
