@@ -54,5 +54,8 @@ def _elsewhere(storage: str | None) -> str:
 
 
 def is_sweep(folder: Path) -> bool:
-    """Whether a sweep was launched into this folder."""
-    return (folder / "sweep.json").exists() or (folder / "trials.jsonl").exists()
+    """Whether a sweep was launched into this folder; not if the folder may not be read."""
+    try:
+        return (folder / "sweep.json").exists() or (folder / "trials.jsonl").exists()
+    except OSError:
+        return False

@@ -97,6 +97,8 @@ def _root(data: bytes) -> yaml.Node:
         raise _UnreadableError(line, f"not valid YAML: {error.problem or error.context}") from error
     except RecursionError as error:
         raise _UnreadableError(1, f"nested deeper than {MAX_DEPTH} levels") from error
+    except (ValueError, OverflowError) as error:
+        raise _UnreadableError(1, "not valid YAML: a character is out of range") from error
     if root is None:
         raise _UnreadableError(1, "the file is empty")
     return root

@@ -8,6 +8,7 @@ applies to a ``with`` block.
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -20,6 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from recrl.analysis.data.labels import METHOD_ORDER, ordered
+from recrl.orchestrator.files.atomic_files import write_atomically
 
 # Formulas in figures: ours, and matplotlib's for numbers on an axis.
 OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$")
@@ -128,7 +130,7 @@ def save(figure: Figure, folder: Path, stem: str) -> list[Path]:
     blank = {"Creator": "recrl", "Producer": None, "CreationDate": None}
     with context():  # ticks exist only now
         figure.set_layout_engine("none")  # keep the places just found: the layout takes a second
-        figure.savefig(pdf, metadata=blank)
+        _write(figure, pdf, metadata=blank)
     return [pdf, png]
 
 
@@ -142,8 +144,15 @@ def save_png(figure: Figure, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     _show_dollars(figure)
     with context():
-        figure.savefig(path, dpi=PNG_DPI, metadata={"Software": None})
+        _write(figure, path, dpi=PNG_DPI, metadata={"Software": None})
     return path
+
+
+def _write(figure: Figure, path: Path, **options: Any) -> None:
+    """Write a figure in the format of the path's suffix; in place of a link, and not through it."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format=path.suffix.removeprefix("."), **options)
+    write_atomically(path, picture.getvalue())
 
 
 def _show_dollars(figure: Figure) -> None:

@@ -17,6 +17,7 @@ from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.number_texts import DASH, number, with_error
 from recrl.analysis.statistics.intervals import share_text
 from recrl.analysis.statistics.metrics import Measure
+from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.redaction import printable
 
 TOO_FEW = "†"
@@ -188,22 +189,23 @@ def latex(table: pd.DataFrame) -> str:
 
 def write_csv(frame: pd.DataFrame, path: Path) -> Path:
     """Write a data frame as CSV; floats as the shortest exact text."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    frame.to_csv(path, index=False, lineterminator="\n")
-    return path
+    return _written(frame.to_csv(index=False, lineterminator="\n").encode(), path)
 
 
 def write_parquet(frame: pd.DataFrame, path: Path) -> Path:
     """Write a data frame as Parquet, with its types."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    frame.to_parquet(path, index=False)
-    return path
+    return _written(frame.to_parquet(index=False), path)
 
 
 def write_text(text: str, path: Path) -> Path:
     """Write a text file that ends with a line feed."""
+    return _written((text.rstrip("\n") + "\n").encode(), path)
+
+
+def _written(data: bytes, path: Path) -> Path:
+    """Write a file; in place of a link, and not through it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+    write_atomically(path, data)
     return path
 
 

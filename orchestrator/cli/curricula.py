@@ -18,7 +18,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
 from recrl.orchestrator.spec import Choice, TrialState
-from recrl.orchestrator.validation_sentences import sentences
+from recrl.orchestrator.validation_sentences import NotJsonError, require_json, sentences
 from recrl.teachers.registry import find_teacher, teacher_config
 
 
@@ -126,6 +126,7 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
             raise RecrlError(f"--option: must look like window=8, got {pair!r}")
         options[key] = _parsed(value)
     try:
+        require_json(options)
         teacher_config(method.name, options)
     except ValidationError as error:
         mistakes = (
@@ -133,6 +134,8 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
             for place, sentence in sentences(error, find_teacher(method.name).config)
         )
         raise RecrlError(f"--option: {method.name}: {'; '.join(mistakes)}") from error
+    except NotJsonError as error:
+        raise RecrlError(f"--option: {error}") from error
     except UntrustedNameError as error:
         raise RecrlError(f"{error}; if you trust it, add --trust") from error
     except UnknownNameError as error:

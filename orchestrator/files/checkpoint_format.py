@@ -16,7 +16,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from recrl.orchestrator.errors import CheckpointError
+from recrl.orchestrator.errors import CheckpointError, DamagedError
+from recrl.orchestrator.files.atomic_files import read_whole
 
 MAGIC = b"recrl checkpoint 2\n"
 _ANY_MAGIC = b"recrl checkpoint "
@@ -73,11 +74,14 @@ def load(path: Path) -> dict[str, Any]:
 
     Raises:
         CheckpointError: the file is missing, truncated, damaged or of another version.
+        StorageError: it cannot be read at present, so whether it is intact is not known.
     """
     try:
-        data = path.read_bytes()
-    except OSError as error:
+        data = read_whole(path)
+    except FileNotFoundError as error:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror}") from error
+    except DamagedError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
     return decode(data, source=str(path))
 
 

@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from recrl.orchestrator.errors import DamagedError, RowError
+from recrl.orchestrator.errors import DamagedError, RowError, StorageError
 from recrl.orchestrator.files.atomic_files import write_atomically
 
 PIECE_BYTES = 2**20
+NO_FILE = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 EMPTY_DIGEST = hashlib.sha256().hexdigest()
 
 
@@ -137,7 +138,11 @@ class RowFile:
 
 
 def digest_of(path: Path, length: int) -> Any | None:
-    """Return the running SHA-256 of a file's first bytes; None if it has fewer, or is no file."""
+    """Return the running SHA-256 of a file's first bytes; None if it has fewer, or is no file.
+
+    Raises:
+        StorageError: the file cannot be read at present, so whether it is intact is not known.
+    """
     digest, left = hashlib.sha256(), length
     if length == 0:
         return digest
@@ -149,8 +154,10 @@ def digest_of(path: Path, length: int) -> Any | None:
                     return None
                 digest.update(piece)
                 left -= len(piece)
-    except OSError:
+    except NO_FILE:
         return None
+    except OSError as error:
+        raise StorageError(f"{path.name} cannot be read ({error.strerror})") from error
     return digest
 
 

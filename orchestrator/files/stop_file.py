@@ -84,3 +84,5 @@ class StopFile(StopSign):
             return bool(self.path.read_bytes())
         except FileNotFoundError:
             return True
+        except OSError:  # the disk may come back; the next commit will say so if it does not
+            return False

@@ -211,7 +211,10 @@ class SweepStore:
         both_known = created is not None and told["created"] is not None
         if told["created"] != created if both_known else told["name"] != self.name:
             raise DamagedError(f"{name} is not of this sweep, or {self.info_path.name} is not")
-        return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
+        try:
+            return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
+        except (ValueError, KeyError, TypeError) as error:
+            raise DamagedError(f"{name} describes no trials ({error})") from error
 
     def _header(self) -> dict[str, Any]:
         """Return the first line of ``trials.jsonl``; empty if it is missing or damaged."""

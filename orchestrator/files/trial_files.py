@@ -114,13 +114,18 @@ class TrialFiles:
 
     def checkpoints(self) -> list[Path]:
         """The checkpoints on disk, newest first."""
-        return sorted(self.checkpoints_folder.glob("checkpoint-*.recrl"), reverse=True)
+        return sorted(self.checkpoints_folder.glob("checkpoint-*.recrl"), key=_update_of, reverse=True)
 
     @property
     def saved_update(self) -> int:
         """The update of the newest checkpoint, intact or not; 0 if there is none."""
-        names = [path.stem.removeprefix("checkpoint-") for path in self.checkpoints()[:1]]
-        return int(names[0]) if names and names[0].isdecimal() else 0
+        return max(map(_update_of, self.checkpoints()), default=0)
+
+
+def _update_of(checkpoint: Path) -> int:
+    """Return the update in the name of a checkpoint; 0 if there is none."""
+    number = checkpoint.stem.removeprefix("checkpoint-")
+    return int(number) if re.fullmatch(r"[0-9]{1,18}", number) else 0
 
 
 def files_of(*kinds: FileKind) -> tuple[str, ...]:

@@ -160,11 +160,14 @@ class TrialReader(TrialFiles):
 
     def _wrong_files(self, record: TrialRecord) -> Iterator[str]:
         for name, extent in record.extents.items():
-            short = self._short(replace(record, committed={name: extent.length}))
-            digest = None if short else digest_of(self.folder / name, extent.length)
-            if short:
-                yield str(short)
-            elif digest is None or digest.hexdigest() != extent.sha256:
+            try:
+                if short := self._short(replace(record, committed={name: extent.length})):
+                    raise short
+                digest = digest_of(self.folder / name, extent.length)
+            except StorageError as error:
+                yield str(error)
+                continue
+            if digest is None or digest.hexdigest() != extent.sha256:
                 yield f"{name} is not what was committed: its checksum differs"
         if self.spec_path.name in record.committed:
             try:
@@ -177,7 +180,7 @@ class TrialReader(TrialFiles):
         for path in paths.values():
             try:
                 self.load_checkpoint(path)
-            except CheckpointError as error:
+            except (CheckpointError, StorageError) as error:
                 yield str(error).removeprefix(f"{self.folder}/")
 
     def verified_record(self) -> TrialRecord:
@@ -258,6 +261,7 @@ class TrialReader(TrialFiles):
 
         Raises:
             CheckpointError: it is missing, damaged, of another version, or of another trial.
+            StorageError: it cannot be read at present.
         """
         tree = checkpoint_format.load(path)
         owner = tree.get("trial_id")
@@ -266,7 +270,11 @@ class TrialReader(TrialFiles):
         return tree
 
     def latest_checkpoint(self) -> dict[str, Any] | None:
-        """Return the newest intact checkpoint, or None; damaged ones are skipped."""
+        """Return the newest intact checkpoint, or None; damaged ones are skipped.
+
+        Raises:
+            StorageError: a checkpoint cannot be read at present.
+        """
         for path in self.checkpoints():
             try:
                 return self.load_checkpoint(path)

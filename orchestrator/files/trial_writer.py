@@ -74,6 +74,9 @@ class TrialWriter:
 
         A checkpoint is usable if it is intact, of this trial, and its rows exist. Otherwise it is renamed to
         ``*.damaged``, and the one before it is tried.
+
+        Raises:
+            StorageError: a file cannot be read at present, so whether it is intact is not known.
         """
         with self._lease():
             tree = self._newest_usable()
@@ -81,7 +84,7 @@ class TrialWriter:
                 for file in self._rows:
                     file.resume_after(Extent())
             for file in self._rows:
-                if self.record.committed.get(file.path.name, 0) > file.length:
+                if self._rows_before(file.path) > file.length:
                     self.store.move_aside(file.path, copy=True)
             self._cpu_before = float(tree["cpu_seconds"]) if tree else 0.0
             self._cpu_origin = time.process_time()
@@ -92,6 +95,12 @@ class TrialWriter:
                 if file.path.exists():
                     os.truncate(file.path, file.length)
         return tree["trial"] if tree else None
+
+    def _rows_before(self, path: Path) -> int:
+        """Return the bytes of rows that must not be lost: the committed ones, or all if that is not known."""
+        if path.name in self.record.committed:
+            return self.record.committed[path.name]
+        return path.stat().st_size if path.exists() else 0
 
     def _newest_usable(self) -> dict[str, Any] | None:
         """Return the newest usable checkpoint; unusable ones are renamed."""

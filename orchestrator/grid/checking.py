@@ -42,7 +42,7 @@ from recrl.orchestrator.grid.curriculum_checks import unsuitable
 from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, SweepName, TaskEntry
 from recrl.orchestrator.grid.problem_list import TASK_MARK, ProblemList
 from recrl.orchestrator.located_yaml import Place, Problem, parse
-from recrl.orchestrator.spec import Choice
+from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.validation_sentences import (
     NotJsonError,
     as_written,
@@ -198,7 +198,18 @@ class _Check:
                     self.problems.add(("exclude", index, key), sentence)
         if not self.problems and not grid.trials():
             self.problems.add(("exclude",), "leaves no trial")
+        self._check_specs(grid)
         self._check_curricula(grid)
+
+    def _check_specs(self, grid: GridSpec) -> None:
+        """Check that the file of a trial's specification can be read again; one trial of each task."""
+        first = {trial.task.label: trial for trial in reversed(grid.trials())}
+        for index, cell in enumerate(grid.tasks):
+            if trial := first.get(cell.task.label):
+                try:
+                    TrialSpec.from_json(trial.to_json())
+                except ValueError as error:
+                    self.problems.add(("tasks", index), str(error))
 
     def _check_curricula(self, grid: GridSpec) -> None:
         """Check that the curriculum of each trial suits its agent and limits; one sentence per entry."""

@@ -92,6 +92,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
             ["git", "--no-optional-locks", "-C", str(folder), *arguments],
             capture_output=True,
             text=True,
+            errors="replace",  # names of files
             timeout=_GIT_SECONDS,
             check=True,
         )

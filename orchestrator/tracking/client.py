@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote, unquote
 
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -45,7 +46,7 @@ def tracking_uri(store: SweepStore, given: str | None) -> str:
     Raises:
         TrackingError: MLflow has no such kind of store.
     """
-    return f"{SQLITE}{store.mlflow_database}" if given is None else checked_uri(given)
+    return _sqlite_uri(store.mlflow_database) if given is None else checked_uri(given)
 
 
 def checked_uri(given: str) -> str:
@@ -65,7 +66,7 @@ def checked_uri(given: str) -> str:
             "%3F for ?, %23 for # and %40 for @"
         )
     if scheme == "sqlite" and rest.startswith("/") and len(rest) > 1:
-        return f"{SQLITE}{Path(rest.removeprefix('/')).absolute()}"
+        return _sqlite_uri(Path(unquote(rest.removeprefix("/"))).absolute())
     if separator and rest and scheme.partition("+")[0] in ("http", "https", "postgresql", "mysql", "mssql"):
         return given
     raise TrackingError(
@@ -81,7 +82,12 @@ def is_server(uri: str) -> bool:
 
 def sqlite_path(uri: str) -> Path | None:
     """Return the file of an sqlite database, None for other addresses."""
-    return Path(uri.removeprefix(SQLITE)) if uri.startswith(SQLITE) else None
+    return Path(unquote(uri.removeprefix(SQLITE))) if uri.startswith(SQLITE) else None
+
+
+def _sqlite_uri(path: Path) -> str:
+    """Return a database's address; ``?`` and ``%`` have a meaning there."""
+    return f"{SQLITE}{quote(str(path))}"
 
 
 def connect(uri: str, *, settings: Mapping[str, str] = MLFLOW_SETTINGS) -> MlflowClient:
@@ -118,7 +124,7 @@ def _make_database(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.unlink(missing_ok=True)
-    MlflowClient(f"{SQLITE}{temporary}").search_experiments(max_results=1)
+    MlflowClient(_sqlite_uri(temporary)).search_experiments(max_results=1)
     temporary.replace(path)
 
 

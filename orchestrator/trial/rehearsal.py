@@ -17,6 +17,7 @@ from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.files.checkpoint_format import encode
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.trial.agent_answers import checked_noise
 from recrl.orchestrator.trial.one_thread import one_thread
 from recrl.orchestrator.trial.trial import Trial, TrialSeeds, open_environments
 from recrl.teachers.registry import make_teacher
@@ -119,7 +120,7 @@ def _act(store: TrialStore) -> None:
         generator = np.random.default_rng(seeds.exploration)
         for actions in (policy.act(observations, generator), policy.act_greedily(observations)):
             environments.step(environment_actions(environments.single_action_space, actions))
-        agent.add_noise(NOISE, observations)
+        checked_noise(spec.agent.label, agent.add_noise(NOISE, observations))
 
 
 def _run(spec: TrialSpec, curriculum: TeacherSpec, folder: Path, *, restart: bool) -> TrialStore:

@@ -31,10 +31,11 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Fl
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
-from recrl.orchestrator.errors import USERS_ERRORS, RowError, described
+from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.files.curriculum_warnings import HARD_LANDING
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.trial.agent_answers import checked_metrics, checked_noise
 from recrl.orchestrator.trial.rollout_check import check_rollout
 from recrl.teachers.teacher import (
     ProgressReport,
@@ -145,7 +146,7 @@ class Trial:
             **{f"limit_{i}": limit for i, limit in enumerate(step.limits)},
             **_entropy_coefficient(step),
         }
-        self._writer.append_update({**row, **self._own_metrics(metrics, row)})
+        self._writer.append_update({**row, **checked_metrics(self.spec.agent.label, metrics, row)})
         if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
             logger.info("%s", self._log_line(row))
         self._next_step(episodes, rollout.observations)
@@ -224,7 +225,7 @@ class Trial:
                 self._event("the curriculum is none", limits=limits)
         if self._step.policy_noise > 0.0:
             flat = observations.reshape(-1, observations.shape[-1])
-            done = self._agent.add_noise(self._step.policy_noise, flat)
+            done = checked_noise(self.spec.agent.label, self._agent.add_noise(self._step.policy_noise, flat))
             self._event("policy noise", policy_noise=self._step.policy_noise, **done)
         if self._step.rewards_entropy and not isinstance(self._agent, EntropyRewarded):
             raise TypeError(
@@ -267,26 +268,6 @@ class Trial:
             for i, name in enumerate(self._cmdp.cost_names)
         ]
         return f"{head} return {row['episode_return']:.2f}, {', '.join(costs)}"
-
-    def _own_metrics(self, metrics: Mapping[str, float], row: Mapping[str, Any]) -> Mapping[str, float]:
-        """Check and return the agent's metrics; their names must differ from the columns of all trials."""
-        agent = f"agent {self.spec.agent.label}"
-        if not isinstance(metrics, Mapping):
-            raise RowError(f"{agent}: update must return a mapping of metrics, got {metrics!r}")
-        for name, value in metrics.items():
-            if not (isinstance(name, str) and name.isidentifier()):
-                raise RowError(
-                    f"{agent}: the name of a metric must consist of letters, digits and _, and not begin "
-                    f"with a digit, got {name!r}"
-                )
-            if not isinstance(value, int | float | np.number) or math.isinf(value):
-                raise RowError(f"{agent}: metric {name} must be a finite number or NaN, got {value!r}")
-        if taken := sorted(metrics.keys() & row.keys()):
-            raise RowError(
-                f"{agent}: its metrics must have other names than the columns that "
-                f"every trial has, got {', '.join(taken)}"
-            )
-        return metrics
 
     def _event(self, name: str, **details: Any) -> None:
         event = {"update": self.update, "end_step": self.env_steps, "event": name, **details}

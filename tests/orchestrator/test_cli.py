@@ -24,6 +24,7 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.find_sweep import find_sweep
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
@@ -606,6 +607,29 @@ def test_an_option_that_json_cannot_read_is_text(
     assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
     assert main(["replay", "small", "--teacher", "dynamic", f"--option=window={value}"]) == 2
     assert capsys.readouterr().err.startswith("recrl-sweep: --option: dynamic: window: ")
+
+
+def test_an_option_that_is_no_json_number_is_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    assert main(["replay", "small", "--teacher", "dynamic", "--option=return_floor=Infinity"]) == 2
+    assert capsys.readouterr().err.startswith("recrl-sweep: --option: ")
+
+
+def test_a_folder_that_may_not_be_read_is_no_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "sweep.json").write_text("{}")
+    (tmp_path / "private").mkdir()
+    whole = Path.exists
+
+    def refused(path: Path) -> bool:
+        if path.parent.name == "private":
+            raise PermissionError(13, "Permission denied", str(path))
+        return whole(path)
+
+    monkeypatch.setattr(Path, "exists", refused)
+    assert find_sweep(tmp_path, None).name == "mine"
 
 
 @pytest.mark.parametrize("label", ["[/b] up", "[bold] x.py:100: y"])

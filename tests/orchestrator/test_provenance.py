@@ -41,6 +41,19 @@ def test_a_changed_tracked_file_makes_it_dirty(tmp_path: Path) -> None:
     assert git_state(tmp_path) == {"commit": commit, "dirty": True}
 
 
+def test_a_name_that_is_not_utf_8_is_no_obstacle(tmp_path: Path) -> None:
+    _repository(tmp_path)
+    odd = os.fsencode(tmp_path) + b"/caf\xe9.txt"
+    Path(os.fsdecode(odd)).write_text("one\n")
+    _git(tmp_path, "add", ".")
+    _git(tmp_path, "commit", "-q", "-m", "two")
+    _git(tmp_path, "config", "core.quotePath", "false")
+    Path(os.fsdecode(odd)).write_text("two\n")
+    state = git_state(tmp_path)
+    assert state is not None
+    assert state["dirty"]
+
+
 def test_outside_a_repository_there_is_no_commit(tmp_path: Path) -> None:
     assert git_state(tmp_path) is None
     assert collect(tmp_path)["project"] is None

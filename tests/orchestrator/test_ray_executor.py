@@ -467,6 +467,11 @@ def test_a_stop_file_tells_its_own_run_and_all_earlier_ones(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_stop_file_that_cannot_be_read_stops_nobody(tmp_path: Path) -> None:
+    (tmp_path / "stop").mkdir()  # reading it fails, as on a disk that is away
+    assert not StopFile(tmp_path / "stop").is_set()
+
+
 def test_a_full_disk_keeps_nobody_from_stopping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, text: str) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -104,6 +104,11 @@ class NoNoise(NoMode):
         raise NotImplementedError
 
 
+class OddNoise(NoNoise):
+    def add_noise(self, noise, observations):
+        return {"update": 1.0}
+
+
 class Listed(NoNoise):
     def state_dict(self):
         return [self.agent.state_dict()]
@@ -137,7 +142,7 @@ def entry(kind):
 
 COUNTER, INFINITE, ODD_NAME, NO_RESTORE = map(entry, (Wrapped, Infinite, OddName, NoRestore))
 SILENT, LIMITED, NO_MODE = map(entry, (Silent, Limited, NoMode))
-NO_NOISE, LISTED, REORDERED = map(entry, (NoNoise, Listed, Reordered))
+NO_NOISE, LISTED, REORDERED, ODD_NOISE = map(entry, (NoNoise, Listed, Reordered, OddNoise))
 
 
 class Staircase:
@@ -241,6 +246,7 @@ def test_a_task_that_fails_after_its_first_step() -> None:
             "without limits fails in its first updates: OverflowError: cannot convert float infinity ",
         ),
         ("NO_NOISE", "can learn, but its final policy fails: NotImplementedError"),
+        ("ODD_NOISE", ": add_noise must not name update; the event has these keys"),
         ("LISTED", "an agent's state_dict must return a dict, got list"),
         (
             "NO_MODE",

@@ -1,6 +1,9 @@
 """Nothing committed is ever lost, nothing is there twice, and one attempt at a time may write."""
 
+import errno
 import json
+import os
+import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +14,7 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.orchestrator.errors import DamagedError, LostLeaseError, SweepBusyError
+from recrl.orchestrator.errors import DamagedError, LostLeaseError, StorageError, SweepBusyError
 from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -107,6 +110,41 @@ def test_damaged_checkpoint_falls_back_to_the_one_before(store: TrialStore) -> N
     assert newest.with_suffix(".damaged").exists()
 
 
+@pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE, errno.ESTALE, errno.EACCES])
+@pytest.mark.parametrize("pattern", ["*.recrl", "*.csv"])
+def test_what_cannot_be_read_for_a_moment_is_not_taken_for_damaged(
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch, code: int, pattern: str
+) -> None:
+    for update in (1, 2):
+        work(store.begin(SPEC), update)
+    before = {path: path.read_bytes() for path in (*store.checkpoints(), store.episodes_path)}
+    whole = Path.open
+
+    def away(path: Path, mode: str = "r", *further: Any, **options: Any) -> Any:
+        if path.match(pattern) and mode == "rb":
+            raise OSError(code, os.strerror(code))
+        return whole(path, mode, *further, **options)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "open", away)
+        with pytest.raises(StorageError, match=re.escape(f"cannot be read ({os.strerror(code)})")):
+            store.begin(SPEC).restore()
+        assert any(f"cannot be read ({os.strerror(code)})" in found for found in store.damages())
+    assert {path: path.read_bytes() for path in before} == before
+    np.testing.assert_equal(store.begin(SPEC).restore(), tree(2))
+
+
+def test_without_record_and_checkpoints_the_rows_are_kept_aside(store: TrialStore) -> None:
+    work(store.begin(SPEC), 1)
+    rows = store.episodes_path.read_bytes()
+    store.state_path.unlink()
+    for path in store.checkpoints():
+        path.write_bytes(b"")
+    assert store.begin(SPEC).restore() is None
+    (kept,) = store.aside_folder.glob("*-episodes.csv")
+    assert kept.read_bytes() == rows
+
+
 def test_without_an_intact_checkpoint_the_trial_starts_afresh(store: TrialStore) -> None:
     work(store.begin(SPEC), 1)
     for path in store.checkpoints():
@@ -124,6 +162,18 @@ def test_two_checkpoints_are_kept(store: TrialStore) -> None:
         "checkpoint-00000005.recrl",
         "checkpoint-00000004.recrl",
     ]
+
+
+def test_the_newest_checkpoint_is_that_of_the_largest_number(store: TrialStore) -> None:
+    writer = store.begin(SPEC)
+    for update in (99_999_998, 99_999_999, 100_000_000, 100_000_001):
+        work(writer, update)
+    assert [path.name for path in store.checkpoints()] == [
+        "checkpoint-100000001.recrl",
+        "checkpoint-100000000.recrl",
+    ]
+    assert store.saved_update == 100_000_001
+    np.testing.assert_equal(store.begin(SPEC).restore(), tree(100_000_001))
 
 
 def test_only_the_newest_attempt_may_write(store: TrialStore) -> None:

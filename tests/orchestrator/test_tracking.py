@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import pytest
+from sqlalchemy import make_url
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.report import table_files as sweep_tables
@@ -31,7 +32,7 @@ from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
-from recrl.orchestrator.tracking.client import tracking_uri
+from recrl.orchestrator.tracking.client import sqlite_path, tracking_uri
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, verdict_lines
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.run_content import (
@@ -218,6 +219,15 @@ def test_the_default_store_is_a_database_in_the_sweeps_folder(tmp_path: Path) ->
     assert tracking_uri(store, None) == f"sqlite:///{tmp_path}/demo/mlflow.db"
     assert tracking_uri(store, "sqlite:///some.db") == f"sqlite:///{Path.cwd()}/some.db"
     assert tracking_uri(store, "http://mlflow:5000") == "http://mlflow:5000"
+
+
+@pytest.mark.parametrize("name", ["a?b", "a%41b", "a#b", "a b", "ä"])
+def test_a_database_may_lie_below_any_folder(tmp_path: Path, name: str) -> None:
+    store = SweepStore(tmp_path / name, "demo")
+    uri = tracking_uri(store, None)
+    assert sqlite_path(uri) == store.mlflow_database
+    assert tracking_uri(store, uri) == uri
+    assert make_url(uri).database == str(store.mlflow_database)
 
 
 @pytest.mark.parametrize("given", ["mlruns", "file:///tmp/mlruns", "http://", "sqlite:///", "databricks"])

@@ -234,6 +234,19 @@ def test_no_file_of_a_trial_is_written_through_a_link(foreign: Path, name: str) 
     assert (foreign / "diary.txt").read_text() == "mine"
 
 
+def test_no_figure_or_table_is_written_through_a_link(foreign: Path) -> None:
+    (foreign / "diary.txt").write_text("mine")
+    assert main(["figures", "small", "--to", "drawn"]) == ExitCode.OK
+    drawn = [path for path in (foreign / "drawn").rglob("*") if path.is_file()]
+    assert {path.suffix for path in drawn} >= {".csv", ".md", ".html", ".tex", ".pdf", ".png"}
+    for path in drawn:
+        path.unlink()
+        path.symlink_to(foreign / "diary.txt")
+    assert main(["figures", "small", "--to", "drawn"]) == ExitCode.OK
+    assert (foreign / "diary.txt").read_text() == "mine"
+    assert not any(path.is_symlink() for path in drawn)
+
+
 # What is written for LaTeX, Markdown and matplotlib
 
 
