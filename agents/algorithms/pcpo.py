@@ -38,18 +38,20 @@ def projected_step(problem: StepProblem) -> DualSolution:
     """Return the reward's step, projected and scaled back into the trust region.
 
     If the constraints contradict one another, it projects on one only: the most violated
-    of those that the policy can influence.
+    of those that the policy can influence. Then the others need not improve (``StepCase.RECOVERY``).
     """
     squared = problem.squared_gradient
     reach = float(np.sqrt(2.0 * problem.radius / squared)) if squared > NO_INFLUENCE else 0.0
     excesses = problem.violations - reach * problem.mixed
     weights = projection_weights(problem.gram, excesses)
+    recovered: tuple[int, ...] = ()
     if weights is None:
         squares = np.diag(problem.gram)
         usable = np.flatnonzero(squares > NO_INFLUENCE)
         worst = usable[np.argmax(excesses[usable] / np.sqrt(squares[usable]))]
         weights = np.zeros_like(excesses)
         weights[worst] = excesses[worst] / squares[worst]
+        recovered = (int(worst),)
     length = (
         reach**2 * squared
         + 2.0 * reach * float(weights @ problem.mixed)
@@ -57,8 +59,10 @@ def projected_step(problem: StepProblem) -> DualSolution:
     )
     scale = min(1.0, float(np.sqrt(2.0 * problem.radius / max(length, NO_INFLUENCE))))
     case = StepCase.CONSTRAINED if weights.any() else StepCase.UNCONSTRAINED
+    if recovered:
+        case = StepCase.RECOVERY
     multipliers = weights / reach if reach > 0.0 else np.full_like(weights, np.nan)
-    return DualSolution(case, scale * reach, scale * weights, multipliers, ())
+    return DualSolution(case, scale * reach, scale * weights, multipliers, recovered)
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

@@ -44,11 +44,13 @@ def projected_ascent(
 
     Args:
         state: ``multipliers``.
-        gaps: J - d, [k]; -inf where there is no constraint.
+        gaps: J - d, [k]; -inf where there is no constraint, whose multiplier stays as it is.
         step_size: multiplier units per unit of episode cost, above 0.
         maximum: the largest multiplier, possibly infinite.
     """
-    return {"multipliers": np.clip(state["multipliers"] + step_size * gaps, 0.0, maximum)}
+    active = np.isfinite(gaps)
+    moved = np.clip(state["multipliers"] + step_size * np.where(active, gaps, 0.0), 0.0, maximum)
+    return {"multipliers": np.where(active, moved, state["multipliers"])}
 
 
 def start_softplus_adam(num_costs: int, initial: float) -> dict[str, Floats]:
@@ -128,7 +130,12 @@ def proportional_integral(
     The gap is bounded, too. An episode costs at least 0, so the gap is at least -d, but an untrained policy
     may exceed the limit by any amount. Ten updates with a cost of 50 under a limit of 1 would add more to the
     integral than 400 later ones can subtract. A proportional term without bound would stop all learning of
-    rewards until the limit is nearly kept. So a violation counts no more than the largest possible slack.
+    rewards until the limit is nearly kept. So a violation counts no more than ``largest``: if J is known
+    exactly, the slack of an agent without any cost.
+
+    The bound removes large gaps and no small ones. So with relative gaps the mean cost settles above the
+    limit where the standard error is not small beside the limit. It is 1% with 16 episodes whose cost is 0
+    or 100 under a limit of 25, 10% with costs of 0 or 10 under a limit of 1.
 
     Args:
         state: ``multipliers``, ``integral``.

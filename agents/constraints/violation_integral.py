@@ -9,10 +9,13 @@ every controller:
     I <- max(I + K min(g, e), 0)    before the step; c is computed from g + I in place of g,
     I <- min(I, d + r)              after the step.
 
+**Where nothing costs.** If the mean episode cost is negligible beside I, c is computed from g. There is no
+cost to lower, and b is the noise of the cost's critic. Otherwise an I above d would ask for a cost below 0.
+
 **What a gap adds.** e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost. An episode costs
 at least 0, so g is at least -d, but an untrained policy may exceed the limit by any amount. Without e a few
 such updates would add more than hundreds of later ones could subtract. An agent that has long kept the limit
-would still avoid all cost. The multipliers' integral has the same e
+would still avoid all cost. If d and s are 0, e is g. The multipliers' integral has the same e
 (``multiplier_rules.proportional_integral``).
 
 **The bound (anti-wind-up).** r is the running mean of the largest fall of the cost that a step in the trust
@@ -66,16 +69,16 @@ class ViolationIntegral:
         return self._integral.copy()
 
     def corrected(self, constraints: Constraints) -> Constraints:
-        """Include new gaps, all known; return the constraints with g + I as the gaps of finite limits."""
+        """Include new gaps, all known; return the constraints with the gaps from which c is computed."""
         index = np.flatnonzero(np.isfinite(constraints.limits))
-        gaps = constraints.gaps[index]
-        sizes = np.hypot(constraints.limits[index], constraints.standard_errors[index])
-        change = self._gain * np.minimum(gaps, sizes)
-        kept = (constraints.limits[index] == 0.0) & (gaps <= NEGLIGIBLE * self._integral[index])
-        forgotten = np.where(kept, self._gain * self._integral[index], 0.0)
+        gaps, limits = constraints.gaps[index], constraints.limits[index]
+        sizes = np.hypot(limits, constraints.standard_errors[index])
+        change = self._gain * np.where(sizes > 0.0, np.minimum(gaps, sizes), gaps)
+        costless = gaps + limits <= NEGLIGIBLE * self._integral[index]
+        forgotten = np.where(costless & (limits == 0.0), self._gain * self._integral[index], 0.0)
         self._integral[index] = np.maximum(self._integral[index] + change - forgotten, 0.0)
         corrected = constraints.gaps.copy()
-        corrected[index] = gaps + self._integral[index]
+        corrected[index] = np.where(costless, gaps, gaps + self._integral[index])
         return replace(constraints, gaps=corrected)
 
     def bound(self, index: npt.NDArray[np.int64], limits: Floats, reach: Floats) -> None:

@@ -78,6 +78,13 @@ def test_constraints_that_contradict_one_another_mend_the_worst() -> None:
     assert float(np.linalg.norm(found)) == pytest.approx(1.0)
 
 
+def test_contradicting_constraints_do_not_stop_the_line_search() -> None:
+    """The second cost rises by what the first falls; only the first is asked to fall."""
+    gram = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    solution = projected_step(StepProblem(1.0, np.zeros(2), gram, np.array([0.4, 0.1]), 0.02))
+    assert (solution.case, solution.recovered) == (StepCase.RECOVERY, (0,))
+
+
 def test_of_contradicting_constraints_one_without_influence_is_not_the_worst() -> None:
     gram = np.array([[1e-14, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 1.0]])
     problem = StepProblem(1.0, np.zeros(3), gram, np.array([5.0, 0.1, 0.4]), radius=0.5)

@@ -77,10 +77,28 @@ def test_a_limit_of_0_that_is_kept_forgets_old_violations() -> None:
     after(integral, 2.0)
     assert integral.values.tolist() == [1.0]
     for expected in (0.5, 0.25):
-        assert after(integral, 0.0, limit=0.0) == [expected]
-    assert after(integral, 1e-9, limit=0.0) == pytest.approx(
-        [0.125]
-    )  # a life table's estimate only approaches 0
+        after(integral, 0.0, limit=0.0)
+        assert integral.values.tolist() == [expected]
+    after(integral, 1e-9, limit=0.0)  # a life table's estimate only approaches 0
+    assert integral.values.tolist() == pytest.approx([0.125])
+
+
+def test_where_nothing_costs_the_integral_asks_for_nothing() -> None:
+    integral = ViolationIntegral(0.5, 1)
+    assert after(integral, 2.0, limit=1.0) == [2.5]
+    assert after(integral, -0.9, limit=1.0) == pytest.approx([-0.85])
+    integral = ViolationIntegral(0.5, 1)
+    after(integral, 2.0, limit=1.0)
+    assert after(integral, -1.0, limit=1.0) == [-1.0]
+    after(integral, 4.0, limit=1.0)
+    assert after(integral, 1e-9, limit=0.0) == [1e-9]
+
+
+def test_a_known_cost_under_a_limit_of_0_counts() -> None:
+    """Without a standard error nothing but the gap itself bounds what it adds."""
+    integral = ViolationIntegral(0.5, 1)
+    gaps = Constraints(np.zeros(1), np.full(1, 3.0), np.zeros(1), 10.0)
+    assert integral.corrected(gaps).gaps.tolist() == [4.5]
 
 
 @pytest.mark.parametrize("mixed", [-2.0, -0.2, 0.0])
@@ -116,12 +134,12 @@ def test_the_cost_settles_on_the_limit_where_only_half_the_predicted_fall_is_rea
 
 
 def simulated(drift: float, limit: float, least: float, largest: float) -> tuple[float, ViolationIntegral]:
-    """As above, with noisy costs and a reach that varies: the mean violation, and the integral."""
+    """As above, with a reach that varies and costs like times between failures: violation and integral."""
     generator = np.random.default_rng(5)
     integral = ViolationIntegral(0.03, 1)
     cost, gaps, recoveries = limit + 5.0, np.zeros(5_000), 0
     for update in range(len(gaps)):
-        gaps[update] = cost + generator.uniform(-15.0, 15.0) - limit
+        gaps[update] = cost * generator.exponential() - limit
         constraints = Constraints(np.full(1, limit), gaps[update : update + 1], np.full(1, 30.0), 1.0)
         aims = integral.corrected(constraints).gaps
         reach = generator.uniform(least, largest)
@@ -129,21 +147,21 @@ def simulated(drift: float, limit: float, least: float, largest: float) -> tuple
         solution = solve_dual(problem)
         integral.bound(BOTH[:1], np.full(1, limit), problem.reach)
         predicted = problem.after(solution) - problem.violations
-        cost += drift + 0.5 * float(predicted[0])
+        cost = max(cost + drift + 0.5 * float(predicted[0]), 0.0)
         recoveries += solution.case is StepCase.RECOVERY
-    assert recoveries > 0.4 * len(gaps)
+    assert recoveries > 0.35 * len(gaps)
     return float(gaps[1_000:].mean()), integral
 
 
-def test_the_cost_settles_on_the_limit_though_half_the_steps_cannot_reach_their_aim() -> None:
+def test_the_cost_settles_on_the_limit_though_many_steps_cannot_reach_their_aim() -> None:
     violation, _ = simulated(3.0, 5.0, 2.0, 18.0)
-    assert violation == pytest.approx(0.0, abs=0.5)
+    assert violation == pytest.approx(0.0, abs=0.1)
 
 
 def test_with_the_reach_of_a_single_update_it_would_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("recrl.agents.constraints.violation_integral.REACH_DECAY", 0.0)
     violation, _ = simulated(3.0, 5.0, 2.0, 18.0)
-    assert violation > 2.0
+    assert violation > 0.5
 
 
 def test_where_no_step_is_enough_the_integral_stops_at_its_bound() -> None:
