@@ -323,6 +323,32 @@ def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: p
     assert here.storage.objects.keys_in() == []
 
 
+def test_a_trial_whose_commits_are_damaged_is_left_alone_and_the_others_go_on(
+    tmp_path: Path,
+    local: SweepStore,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    damaged, other = grid().trials()
+    here, fresh = machine(tmp_path, "here"), machine(tmp_path, "fresh")
+    with here.storage.working_copy(damaged, never) as trial:
+        run_recorded(damaged, trial, should_stop=never)
+    commits = [key for key in here.storage.objects.keys_in() if "/commit-" in key]
+    for key in commits:
+        here.storage.objects.write(key, b"damaged")
+    InlineExecutor().run([damaged], fresh.storage, threading.Event())
+    assert "no commit of the trial is intact, so it is left alone" in caplog.text
+    result = fresh.launch()
+    assert result.plan.to_do == (other,)
+    assert fresh.store.trial(damaged).record().status is TrialState.DAMAGED
+    assert_equal_trial(fresh.store.trial(other), local.trial(other))
+    (tmp_path / "grid.yaml").write_text(GRID)
+    arguments = [str(tmp_path / "grid.yaml"), *INLINE, "--root", str(tmp_path / "fresh")]
+    assert main(["launch", *arguments]) == ExitCode.TRIALS_FAILED
+    assert capsys.readouterr().out.endswith("\n1 damaged trial left alone\n")
+    assert {here.storage.objects.read(key) for key in commits} == {b"damaged"}
+
+
 def test_a_local_copy_is_too_old_to_judge_a_silence_by_a_third_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
