@@ -24,13 +24,13 @@ from functools import partial
 from pathlib import Path
 
 from recrl.orchestrator.background_thread import background_thread
-from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
+from recrl.orchestrator.errors import DamagedError, RecrlError, StorageError
 from recrl.orchestrator.files.atomic_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.remote.commit_upload import ALIVE_SECONDS, Upload, working_copy
+from recrl.orchestrator.remote.commit_upload import ALIVE_SECONDS, working_copy
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
@@ -245,7 +245,8 @@ class RemoteSweep(SweepPlace):
     def send_dead_trials(self, specs: Sequence[TrialSpec]) -> None:
         """Send the status of trials whose processes died, which only this machine knows.
 
-        Nothing is sent once another launch has taken over the sweep: its attempts may be running.
+        Everything else is sent as the store has it, because the copy here may be damaged. Nothing is sent
+        once another launch has taken over the sweep: its attempts may be running.
 
         Args:
             specs: the trials; none of them runs, and the folder has their status from
@@ -266,16 +267,16 @@ class RemoteSweep(SweepPlace):
         if record.status is TrialState.WAITING and not record.attempt:
             return  # never begun
         remote = self.trial(spec.folder_name)
-        remote.download(trial, checkpoints=True)
+        remote.download(trial, checkpoints=False)
         if trial.record() != record:
             return  # its own process has recorded its end
-        upload = Upload(remote, trial)
-        writer = trial.begin(spec)
-        writer.close(record.status, error=record.error)
         try:
-            upload.finish()
-        except LostLeaseError as error:
+            with working_copy(remote, spec, lambda: True) as original:
+                original.begin(spec).close(record.status, error=record.error)
+        except DamagedError as error:
             logger.warning("%s", error)
+            return
+        remote.download(trial, checkpoints=False)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

@@ -394,6 +394,34 @@ def test_what_only_the_launch_knows_of_a_trial_is_seen_elsewhere(tmp_path: Path)
     assert there.store.trial(silent).record().status is TrialState.WAITING
 
 
+def test_damage_in_a_local_copy_is_not_sent_with_the_status_of_a_dead_trial(
+    tmp_path: Path, local: SweepStore
+) -> None:
+    here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
+    spec = grid().trials()[0]
+    answers = iter([False] * 3 + [True] * 99)
+    with here.storage.working_copy(spec, never) as trial:
+        run_recorded(spec, trial, should_stop=partial(next, answers))
+        whole = trial.updates_path.read_bytes()
+    with here.storage.working_copy(spec, never) as trial:
+        trial.begin(spec)  # its process dies here
+    here.storage.pull(checkpoints=True)
+    copy = here.store.trial(spec)
+    for path in (copy.updates_path, *copy.checkpoints()):
+        data = path.read_bytes()
+        path.write_bytes(data[:-2] + bytes([data[-2] ^ 1]) + data[-1:])
+    copy.set_status(TrialState.FAILED, error="its process died")
+    here.storage.send_dead_trials([spec])
+    there.storage.mark()
+    there.storage.pull()
+    seen = there.store.trial(spec)
+    assert (seen.record().status, seen.record().error) == (TrialState.FAILED, "its process died")
+    assert seen.damages() == []
+    assert seen.updates_path.read_bytes() == whole
+    there.launch(retry_failed=True)
+    assert_equal(there.store, local)
+
+
 def test_a_launch_that_was_taken_over_leaves_the_trials_of_the_other_alone(tmp_path: Path) -> None:
     here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
     spec = grid().trials()[0]
