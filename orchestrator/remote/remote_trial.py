@@ -20,9 +20,11 @@ commit is in the store.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
+import os
 import re
 import time
 from collections.abc import Sequence
@@ -100,8 +102,10 @@ class RemoteTrial:
             checkpoints: whether to include the checkpoint of a running trial.
 
         Raises:
+            DamagedError: there is a link in place of the folder or of its checkpoints.
             StorageError: the store cannot be read.
         """
+        _require_no_links(trial)
         keys = self.objects.keys_in() if keys is None else keys
         attempts = attempts_in(keys)
         if not attempts:
@@ -304,9 +308,9 @@ def _missing(
         pieces: of the complete file.
         have: the present pieces of the same attempt; None if the file is of another attempt.
     """
-    size = size_of(trial, file)
-    is_there = size >= _length(pieces) and (trial.folder / file).exists()
-    if have is not None and _same(have, pieces) and is_there:
+    is_file = (trial.folder / file).is_file() and not (trial.folder / file).is_symlink()
+    size = size_of(trial, file) if is_file else 0
+    if have is not None and _same(have, pieces) and is_file and size >= _length(pieces):
         return None
     known = _length(have) if have and file in APPENDED else 0
     missing = [piece for piece in pieces if piece.end > (known if size >= known else 0)]
@@ -358,8 +362,26 @@ def _with_life(record: TrialRecord, sign: bytes | None) -> TrialRecord:
     return replace(alive, committed=record.committed, digests=record.digests, checkpoint=record.checkpoint)
 
 
+def _require_no_links(trial: TrialStore) -> None:
+    """Check that a trial's folder, the one around it, and its checkpoints' are no symbolic links.
+
+    A folder that was received might otherwise lead a download to other files of the user.
+
+    Raises:
+        DamagedError: one of them is a link.
+    """
+    for path in (trial.folder.parent, trial.folder, trial.checkpoints_folder):
+        if path.is_symlink():
+            raise DamagedError(f"{path}: is a link, it must be a folder; delete it, and it is fetched again")
+
+
 def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
-    """Append bytes to a file, or replace the whole file."""
+    """Append bytes to a file, or replace the whole file, and a link in its place.
+
+    Raises:
+        DamagedError: there is a link in place of the file to append to.
+        StorageError: the name is not that of a file that trials have.
+    """
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         raise StorageError(f"{trial.folder}: its object names a file outside it: {name!r}")
     if name in files_of(FileKind.LOCAL):
@@ -369,7 +391,15 @@ def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
     if start == 0:
         write_atomically(path, data)
         return
-    with path.open("r+b") as file:
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_NOFOLLOW)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise DamagedError(
+            f"{path}: is a link, it must be a file; delete it, and it is fetched again"
+        ) from error
+    with os.fdopen(descriptor, "wb") as file:
         file.seek(start)
         file.write(data)
 

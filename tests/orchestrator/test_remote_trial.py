@@ -164,6 +164,54 @@ def test_a_local_copy_follows_commit_by_commit(bucket: RemoteTrial, tmp_path: Pa
         assert there.episodes_path.read_bytes() == machine.trial.episodes_path.read_bytes()
 
 
+@pytest.mark.parametrize("name", files_of(FileKind.ROWS, FileKind.LOG, FileKind.WHOLE))
+def test_a_link_in_a_local_copy_is_replaced_and_not_followed(
+    bucket: RemoteTrial, tmp_path: Path, name: str
+) -> None:
+    diary = tmp_path / "diary.txt"
+    machine = Machine(bucket, tmp_path / "machine")
+    for update in (1, 2):
+        machine.work(update)
+        with (machine.trial.folder / name).open("ab") as file:
+            file.write(b"a line\n" if name not in files_of(FileKind.ROWS) else b"")
+        machine.upload.push()
+        there = local_copy(bucket, tmp_path / "copy")
+        if update == 1:
+            data = (there.folder / name).read_bytes() + b"mine, and longer than the trial's file\n" * 100
+            diary.write_bytes(data)
+            (there.folder / name).unlink()
+            (there.folder / name).symlink_to(diary)
+    assert diary.read_bytes() == data
+    assert not (there.folder / name).is_symlink()
+    assert (there.folder / name).read_bytes() == (machine.trial.folder / name).read_bytes()
+
+
+@pytest.mark.parametrize("place", ["trials", "trials/TRIAL", "trials/TRIAL/checkpoints"])
+def test_a_link_in_place_of_a_folder_of_a_local_copy_is_refused(
+    bucket: RemoteTrial, tmp_path: Path, place: str
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    mine = tmp_path / "mine"
+    (mine / "checkpoints").mkdir(parents=True)
+    for name in ("spec.json", "checkpoint-00000009.recrl", "checkpoints/checkpoint-00000009.recrl"):
+        (mine / name).write_text("mine")
+    link = tmp_path / "copy" / place.replace("TRIAL", SPEC.folder_name)
+    link.parent.mkdir(parents=True)
+    link.symlink_to(mine)
+    with pytest.raises(
+        DamagedError, match=rf"^{link}: is a link, it must be a folder; delete it, and it is "
+    ):
+        local_copy(bucket, tmp_path / "copy" / "trials")
+    assert sorted(str(path.relative_to(mine)) for path in mine.rglob("*") if path.is_file()) == [
+        "checkpoint-00000009.recrl",
+        "checkpoints/checkpoint-00000009.recrl",
+        "spec.json",
+    ]
+    assert {path.read_text() for path in mine.rglob("*") if path.is_file()} == {"mine"}
+
+
 def test_a_local_copy_leaves_checkpoints_of_running_trials_where_they_are(
     bucket: RemoteTrial, tmp_path: Path
 ) -> None:
