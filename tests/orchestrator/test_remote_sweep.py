@@ -287,7 +287,10 @@ def test_one_launch_at_a_time_and_a_dead_one_frees_the_sweep(tmp_path: Path) -> 
     elsewhere = {"host": "elsewhere", "pid": 1, "token": "1", "boot": "1"}
     for holder, free in (
         ({**elsewhere, "at": time.time()}, False),
+        ({**elsewhere, "at": time.time() - SILENT_SECONDS + 10.0}, False),
         ({**elsewhere, "at": time.time() - SILENT_SECONDS - 1.0}, True),
+        ({**elsewhere, "at": time.time() + SILENT_SECONDS - 10.0}, False),  # a clock that is a little ahead
+        ({**elsewhere, "at": time.time() + SILENT_SECONDS + 10.0}, True),  # one that was far ahead
         ({}, True),
     ):
         one.storage.objects.write("launch.json", json.dumps(holder).encode())
