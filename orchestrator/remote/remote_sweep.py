@@ -82,10 +82,28 @@ class RemoteSweep(SweepPlace):
         """Test the object store, and make the folder the copy of this sweep.
 
         Raises:
-            RecrlError: the store cannot be used, or the folder is not its copy.
+            RecrlError: the store cannot be used, the folder is not its copy, or has trials that are not in
+                the store.
         """
         self.objects.probe()
         self.mark()
+        self._is_in_store()
+
+    def _is_in_store(self) -> bool:
+        """Return whether the sweep has been launched into the store.
+
+        Raises:
+            StorageError: the store cannot be read, or has nothing of it although the folder is a copy of its
+                trials.
+        """
+        if self.objects.read("sweep.json") is not None:
+            return True
+        if any(trial.is_local_copy for trial in self.store.trials()) and not self.objects.keys_in("trials"):
+            raise StorageError(
+                f"{self.address}: there is no such sweep, although {self.store.folder} is a copy of its "
+                "trials; restore the store, or give the sweep another name or another --root"
+            )
+        return False
 
     def require_reruns(self) -> None:
         """Raise an error: trials in an object store cannot be run again.
@@ -158,7 +176,7 @@ class RemoteSweep(SweepPlace):
         if self.store.is_locked():
             return  # the launch on this machine does it regularly
         try:
-            if self.objects.read("sweep.json") is not None:
+            if self._is_in_store():
                 self.mark()
                 self.pull(checkpoints=checkpoints)
         except StorageError as error:

@@ -465,6 +465,32 @@ def test_the_command_line_takes_the_address_once(
     assert main(["evaluate", "small", "two-state ppo-lag none", "--root", "third", "--storage", uri]) == 0
 
 
+def test_a_launch_says_that_the_store_does_not_have_the_sweep_of_its_local_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grid.yaml").write_text(GRID)
+    uri = f"file://{tmp_path}/bucket"
+    some = ["launch", "grid.yaml", *INLINE, "--only", "method=none"]
+    assert main([*some, "--storage", uri]) == ExitCode.OK
+    (tmp_path / "bucket").rename(tmp_path / "moved")
+    capsys.readouterr()
+    sentence = (
+        f"{uri}/small: there is no such sweep, although {tmp_path}/runs/small is a copy of its trials; "
+        "restore the store, or give the sweep another name or another --root"
+    )
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+    assert ObjectStore(uri).keys_in() == []
+    assert main(["status", "--brief"]) == ExitCode.OK
+    shown = capsys.readouterr()
+    assert sentence in shown.err
+    assert shown.out.startswith("small: 1 of 2 complete")
+    shutil.rmtree(tmp_path / "bucket")
+    (tmp_path / "moved").rename(tmp_path / "bucket")
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+
+
 def test_a_folder_is_the_local_copy_of_one_address_or_none(tmp_path: Path, local: SweepStore) -> None:
     here = machine(tmp_path, "here")
     with pytest.raises(RecrlError, match=r": this sweep is kept in that folder, not at file://"):
@@ -487,6 +513,11 @@ def test_a_folder_is_the_local_copy_of_one_address_or_none(tmp_path: Path, local
             "lacking://b/x",
             ExitCode.WRONG_INPUT,
             "lacking://b/x: lacking:// needs a package that is not installed: ",
+        ),
+        (
+            "file://store",
+            ExitCode.WRONG_INPUT,
+            "file://store: the folder must be an absolute path, as in file:///folder, so that it ",
         ),
         (
             "unreliable:///b",

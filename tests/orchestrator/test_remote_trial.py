@@ -619,6 +619,13 @@ def test_addresses_that_are_none_are_a_sentence() -> None:
         assert str(error.value) == (
             f"the storage must be an address such as s3://bucket/folder, got {wrong!r}"
         )
+    for wrong in ("file://store", "local://./store"):
+        with pytest.raises(RecrlError) as error:
+            ObjectStore(wrong)
+        assert str(error.value) == (
+            f"{wrong}: the folder must be an absolute path, as in {wrong.partition(':')[0]}:///folder, so "
+            "that it is the same from every directory"
+        )
     with pytest.raises(RecrlError, match=r"^s4://bucket: no kind of storage is called 's4'; fsspec knows "):
         ObjectStore("s4://bucket")
 
