@@ -7,13 +7,17 @@ runs the trials one after the other in this process: for tests, debuggers and ma
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep_place import SweepPlace
+
+logger = logging.getLogger("recrl.sweep")
 
 
 class Executor(Protocol):
@@ -22,8 +26,9 @@ class Executor(Protocol):
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """Run the specs, in order of priority, until each is finished or ``stop`` is set.
 
-        A trial that raises is recorded as failed in its own files; the others go on. When ``stop`` is
-        set, running trials checkpoint at their next update and the call returns soon after.
+        A trial that raises is recorded as failed in its own files; the others go on. A trial whose commits
+        in an object store cannot be used is left alone. When ``stop`` is set, running trials checkpoint at
+        their next update and the call returns soon after.
         """
         ...
 
@@ -45,5 +50,8 @@ class InlineExecutor:
         for spec in specs:
             if stop.is_set():
                 return
-            with place.working_copy(spec, stop.is_set) as trial:
-                run_recorded(spec, trial, should_stop=stop.is_set, on_gpu=self.on_gpu)
+            try:
+                with place.working_copy(spec, stop.is_set) as trial:
+                    run_recorded(spec, trial, should_stop=stop.is_set, on_gpu=self.on_gpu)
+            except DamagedError as error:
+                logger.warning("%s: %s", spec.title, error)

@@ -32,7 +32,7 @@ class TrialState(StrEnum):
     RUNNING = "running"
     COMPLETE = "complete"
     FAILED = "failed"
-    DAMAGED = "damaged"  # found by a reader; not stored in a file
+    DAMAGED = "damaged"  # found by a reader; stored only in a local copy, of its original
 
     @property
     def is_finished(self) -> bool:

@@ -25,6 +25,7 @@ from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, Launch
 from recrl.orchestrator.launch_plan import Plan
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.run_sweep import SweepResult
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
 from recrl.orchestrator.tracking.mlflow_sync import last_report
 
@@ -72,7 +73,7 @@ def launch_and_print(
     report = store.figures_folder / "report.html"
     if outcome.sweep and options.figures and report.exists():
         say(console, f"Report     {short(report)}")
-    return _say_result(outcome.result, store, options, given, console)
+    return _say_result(outcome.result, place, options, given, console)
 
 
 class _Printer(LaunchListener):
@@ -166,9 +167,10 @@ def _say_synced(outcome: LaunchOutcome, uri: str, options: LaunchOptions, consol
 
 
 def _say_result(
-    result: SweepResult, store: SweepStore, options: LaunchOptions, given: Sequence[str], console: Console
+    result: SweepResult, place: SweepPlace, options: LaunchOptions, given: Sequence[str], console: Console
 ) -> ExitCode:
     """Print the result of a launch, and how to continue."""
+    store = place.store
     say(console, f"{store.name}: {display.status_sentence(result.progress)}")
     say_failures(result.progress, store, console)
     again = shlex.join(["recrl-sweep", *given])
@@ -180,7 +182,8 @@ def _say_result(
     if damaged := result.progress.with_status(DisplayStatus.DAMAGED):
         them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
         rerun = again if options.selection.rerun_damaged else f"{again} --rerun-damaged"
-        say(console, f"{them} left alone; to move the damaged files aside and run again: {rerun}")
+        how = "" if place.uri else f"; to move the damaged files aside and run again: {rerun}"
+        say(console, f"{them} left alone{how}")
     if result.failed:
         retry = again if options.selection.retry_failed else f"{again} --retry-failed"
         say(console, f"Try what failed again with: {retry}")

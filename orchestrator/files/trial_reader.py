@@ -71,12 +71,15 @@ class TrialReader(TrialFiles):
         """Read the trial's present record; a blank record if it was never started.
 
         The status is DAMAGED if ``state.json`` is damaged or a committed file is too short. Then ``error``
-        describes damage and remedy. Digests are checked when rows are read, and by ``damages``.
+        describes damage and remedy. Digests are checked when rows are read, and by ``damages``. A local copy
+        has the status also if the trial's commits in the object store cannot be used. Then no launch runs it.
         """
         try:
             stated, wrong = self._looked_at(self._short)
         except StorageError as error:
             return self._damaged(TrialRecord(), error)
+        if stated.status is TrialState.DAMAGED:
+            return replace(stated, claims=TrialState.COMPLETE)  # it must not run again
         return self._damaged(stated, wrong) if wrong else stated
 
     def _looked_at(self, look: Callable[[TrialRecord], Found]) -> tuple[TrialRecord, Found]:
@@ -159,6 +162,8 @@ class TrialReader(TrialFiles):
             return [str(error)]
 
     def _wrong_files(self, record: TrialRecord) -> Iterator[str]:
+        if record.status is TrialState.DAMAGED:
+            yield record.error
         for name, extent in record.extents.items():
             try:
                 if short := self._short(replace(record, committed={name: extent.length})):

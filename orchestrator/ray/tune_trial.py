@@ -7,6 +7,7 @@ are reused.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,13 @@ from typing import Any
 import ray
 from ray import tune
 
+from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialSpec
+
+logger = logging.getLogger("recrl.sweep")
 
 
 class TuneTrial(tune.Trainable):
@@ -46,15 +50,18 @@ class TuneTrial(tune.Trainable):
         from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
         if not self._stop_sign.is_set():
-            with self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:
-                run_recorded(
-                    self._spec,
-                    trial,
-                    should_stop=self._stop_sign.is_set,
-                    teacher=self._teacher,
-                    commit_seconds=self._commit_seconds,
-                    on_gpu=bool(ray.get_gpu_ids()),
-                )
+            try:
+                with self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:
+                    run_recorded(
+                        self._spec,
+                        trial,
+                        should_stop=self._stop_sign.is_set,
+                        teacher=self._teacher,
+                        commit_seconds=self._commit_seconds,
+                        on_gpu=bool(ray.get_gpu_ids()),
+                    )
+            except DamagedError as error:  # no reason to try again; the driver's copy has the status damaged
+                logger.warning("%s: %s", self._spec.title, error)
         return {"done": True}
 
     def _take(self, config: Mapping[str, Any]) -> None:

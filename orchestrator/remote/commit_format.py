@@ -31,6 +31,10 @@ CHECKPOINT = re.compile(r"checkpoints/checkpoint-\d{8}\.recrl")
 COMMIT = re.compile(r"commit-\d{8}")
 
 
+class OtherVersionError(ValueError):
+    """A commit of another version of recrl."""
+
+
 @dataclass(frozen=True)
 class Piece:
     """Consecutive bytes of a file, in a commit's object.
@@ -82,12 +86,15 @@ class Commit:
         """Return the commit of ``to_json``.
 
         Raises:
-            ValueError: it is no commit of this version.
+            OtherVersionError: it is a commit of another version.
+            ValueError: it is no commit.
         """
         try:
             if value["format"] != FORMAT:
-                found = f"got {value['format']!r}, of another version of recrl"
-                raise ValueError(f"a commit of format {FORMAT} is expected, {found}")
+                raise OtherVersionError(
+                    f"the commit has format {value['format']!r}, of another version of recrl, "
+                    f"and this one reads format {FORMAT}"
+                )
             files = {name: tuple(Piece(**it) for it in pieces) for name, pieces in value["files"].items()}
             commit = cls(TrialRecord.from_json(value["record"]), files)
         except (KeyError, TypeError, AttributeError) as error:
@@ -140,7 +147,8 @@ def unpack(read: Callable[[int, int], bytes]) -> Commit:
         read: returns the object's bytes from one position to another, fewer if it is shorter.
 
     Raises:
-        ValueError: it is not intact, or of another version.
+        OtherVersionError: it is of another version.
+        ValueError: it is not intact.
     """
     data = read(0, FIRST_READ_BYTES)
     try:

@@ -8,21 +8,29 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from recrl.orchestrator.background_thread import background_thread
-from recrl.orchestrator.errors import CheckpointError, LostLeaseError
+from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.remote import retries
-from recrl.orchestrator.remote.commit_format import APPENDED, WHOLE, Commit, Piece, pack
-from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial, attempt_of, attempts_in, size_of
+from recrl.orchestrator.remote.commit_format import APPENDED, COMMIT, WHOLE, Commit, Piece, pack
+from recrl.orchestrator.remote.remote_trial import (
+    ALIVE,
+    ASIDE,
+    RemoteTrial,
+    attempt_of,
+    attempts_in,
+    pulled_key,
+    size_of,
+)
 from recrl.orchestrator.remote.retries import retry_while_down
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
@@ -46,6 +54,7 @@ class Upload:
         self._remote = remote
         self._trial = trial
         self._before = trial.stated().token
+        self._started_from = pulled_key(trial)
         self._commits: list[tuple[str, Commit]] = []
         self._written: set[str] = set()
         self._number = 0
@@ -95,7 +104,7 @@ class Upload:
         name = f"commit-{self._number:08d}"
         commit, data = pack(name, record, kept, new)
         self._written.add(name)
-        self._remote.objects.write(f"{attempt}/{name}", data)
+        self._write(f"{attempt}/{name}", data)
         self._shown = _commit_of(record)
         self._commits = [*self._commits, (name, commit)][-KEPT_COMMITS:]
         self._clear(attempt, others)
@@ -103,6 +112,16 @@ class Upload:
     def revoke(self) -> None:
         """Revoke the trial's lease, so that its attempt ends."""
         self._trial.set_status(TrialState.WAITING)
+
+    def _write(self, key: str, data: bytes) -> None:
+        """Write a commit's object; if that fails, delete what was written of it, if the store lets us."""
+        try:
+            self._remote.objects.write(key, data)
+        except StorageError:
+            with suppress(StorageError):
+                if self._remote.objects.read(key) != data:
+                    self._remote.objects.delete([key])
+            raise
 
     def _speak(self, record: TrialRecord) -> None:
         """Send a sign of life. Only a commit may record the end."""
@@ -165,10 +184,24 @@ class Upload:
         return [f"{other}/{name}" for other, names in others.items() if other != attempt for name in names]
 
     def _clear(self, attempt: str, others: Sequence[str]) -> None:
-        """Delete objects that the last commits do not need, and earlier attempts."""
+        """Delete objects that the last commits do not need, and earlier attempts.
+
+        Commits of earlier attempts that are newer than the start of this attempt were not read: they are
+        damaged or came later. They are kept aside.
+        """
         spare = self._written.difference(*({name, *commit.objects} for name, commit in self._commits))
-        self._remote.objects.delete([*(f"{attempt}/{name}" for name in sorted(spare, reverse=True)), *others])
+        unread = [key for key in others if _is_commit(key) and key > self._started_from]
+        for key in unread:
+            self._keep_aside(key)
+        old = [f"{attempt}/{name}" for name in sorted(spare, reverse=True)]
+        self._remote.objects.delete([*old, *(key for key in others if key not in unread)])
         self._written -= spare
+
+    def _keep_aside(self, key: str) -> None:
+        data = self._remote.objects.read(key)
+        if data is not None:
+            self._remote.objects.write(f"{ASIDE}/{key}", data)
+            self._remote.objects.delete([key])
 
 
 @contextmanager
@@ -186,6 +219,7 @@ def working_copy(
         should_stop: once true, the wait for a store that is down is at most ``STOPPING_SECONDS``.
 
     Raises:
+        DamagedError: the store has commits of the trial, and none can be used.
         StorageError: the store was down for ``RETRY_SECONDS``; its last commit is intact.
     """
     with scratch_folder(tempfile.gettempdir()) as folder:
@@ -217,6 +251,10 @@ def _follow(upload: Upload, over: threading.Event) -> None:
     except LostLeaseError as error:
         logger.warning("%s", error)
         upload.revoke()
+
+
+def _is_commit(key: str) -> bool:
+    return COMMIT.fullmatch(key.rpartition("/")[2]) is not None
 
 
 def _commit_of(record: TrialRecord) -> tuple[Any, ...]:

@@ -2,8 +2,9 @@
 
 With two launches, the first creates ``launch.json`` and the second is refused, if the store has exclusive
 creation (S3, Google, Azure). The lease of a dead launch is free after ``SILENT_SECONDS``, by the machines'
-clocks. If two launches run nevertheless, one of them sees the other's name within ``BEAT_SECONDS`` and stops.
-Until then they may repeat work, but do no damage: each attempt writes below its own name.
+clocks. So is a lease from a clock that is ahead by more; the clocks must agree to within a minute. If two
+launches run nevertheless, one of them sees the other's name within ``BEAT_SECONDS`` and stops. Until then
+they may repeat work, but do no damage: each attempt writes below its own name.
 """
 
 from __future__ import annotations
@@ -161,7 +162,7 @@ def _beat(own: dict[str, Any]) -> bytes:
 def _is_alive(holder: dict[str, Any]) -> bool:
     """Whether a recorded launch runs: its sign of life is recent, and it is not known to be dead."""
     try:
-        if time.time() - float(holder["at"]) > SILENT_SECONDS:
+        if abs(time.time() - float(holder["at"])) > SILENT_SECONDS:  # also if another clock is ahead
             return False
         if not _boot() or holder["boot"] != _boot():
             return True

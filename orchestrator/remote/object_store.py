@@ -173,10 +173,15 @@ class ObjectStore:
 
 
 def _checked(uri: str) -> str:
-    """Return the address, if it is valid."""
+    """Return the address, if it is valid, and leads to one place from every working directory."""
     protocol, separator, path = uri.partition("://")
     if not protocol or not separator or not path.strip("/") or "::" in uri:
         raise RecrlError(f"the storage must be an address such as {EXAMPLE}, got {uri!r}")
+    if protocol in FOLDERS and not path.startswith("/"):
+        raise RecrlError(
+            f"{uri}: the folder must be an absolute path, as in {protocol}:///folder, so that it is the same "
+            "from every directory"
+        )
     if re.match(r"[^/@]*:[^@]*@", path) or "?" in uri:  # Amazon's secrets may contain slashes
         hidden = re.sub(r"(://)[^@]*@|\?.*", r"\1", uri)
         raise RecrlError(

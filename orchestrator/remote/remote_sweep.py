@@ -24,13 +24,13 @@ from functools import partial
 from pathlib import Path
 
 from recrl.orchestrator.background_thread import background_thread
-from recrl.orchestrator.errors import DamagedError, LostLeaseError, RecrlError, StorageError
+from recrl.orchestrator.errors import DamagedError, RecrlError, StorageError
 from recrl.orchestrator.files.atomic_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.stop_file import StopSign
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.remote.commit_upload import ALIVE_SECONDS, Upload, working_copy
+from recrl.orchestrator.remote.commit_upload import ALIVE_SECONDS, working_copy
 from recrl.orchestrator.remote.launch_lease import LaunchLease
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
@@ -82,10 +82,28 @@ class RemoteSweep(SweepPlace):
         """Test the object store, and make the folder the copy of this sweep.
 
         Raises:
-            RecrlError: the store cannot be used, or the folder is not its copy.
+            RecrlError: the store cannot be used, the folder is not its copy, or has trials that are not in
+                the store.
         """
         self.objects.probe()
         self.mark()
+        self._is_in_store()
+
+    def _is_in_store(self) -> bool:
+        """Return whether the sweep has been launched into the store.
+
+        Raises:
+            StorageError: the store cannot be read, or has nothing of it although the folder is a copy of its
+                trials.
+        """
+        if self.objects.read("sweep.json") is not None:
+            return True
+        if any(trial.is_local_copy for trial in self.store.trials()) and not self.objects.keys_in("trials"):
+            raise StorageError(
+                f"{self.address}: there is no such sweep, although {self.store.folder} is a copy of its "
+                "trials; restore the store, or give the sweep another name or another --root"
+            )
+        return False
 
     def require_reruns(self) -> None:
         """Raise an error: trials in an object store cannot be run again.
@@ -158,7 +176,7 @@ class RemoteSweep(SweepPlace):
         if self.store.is_locked():
             return  # the launch on this machine does it regularly
         try:
-            if self.objects.read("sweep.json") is not None:
+            if self._is_in_store():
                 self.mark()
                 self.pull(checkpoints=checkpoints)
         except StorageError as error:
@@ -245,7 +263,8 @@ class RemoteSweep(SweepPlace):
     def send_dead_trials(self, specs: Sequence[TrialSpec]) -> None:
         """Send the status of trials whose processes died, which only this machine knows.
 
-        Nothing is sent once another launch has taken over the sweep: its attempts may be running.
+        Everything else is sent as the store has it, because the copy here may be damaged. Nothing is sent
+        once another launch has taken over the sweep: its attempts may be running.
 
         Args:
             specs: the trials; none of them runs, and the folder has their status from
@@ -266,16 +285,16 @@ class RemoteSweep(SweepPlace):
         if record.status is TrialState.WAITING and not record.attempt:
             return  # never begun
         remote = self.trial(spec.folder_name)
-        remote.download(trial, checkpoints=True)
+        remote.download(trial, checkpoints=False)
         if trial.record() != record:
             return  # its own process has recorded its end
-        upload = Upload(remote, trial)
-        writer = trial.begin(spec)
-        writer.close(record.status, error=record.error)
         try:
-            upload.finish()
-        except LostLeaseError as error:
+            with working_copy(remote, spec, lambda: True) as original:
+                original.begin(spec).close(record.status, error=record.error)
+        except DamagedError as error:
             logger.warning("%s", error)
+            return
+        remote.download(trial, checkpoints=False)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from recrl.orchestrator.errors import StorageError
+from recrl.orchestrator.errors import DamagedError, StorageError
 
 FIRST_PAUSE_SECONDS = 1.0  # before the first repetition; doubled each time
 LONGEST_PAUSE_SECONDS = 60.0
@@ -25,6 +25,7 @@ def retry_while_down(act: Callable[[], None], should_stop: Callable[[], bool]) -
         should_stop: once true, only for ``STOPPING_SECONDS`` more.
 
     Raises:
+        DamagedError: a file or an object is damaged; waiting does not help.
         StorageError: it was down for ``RETRY_SECONDS``.
     """
     began = time.monotonic()
@@ -32,6 +33,8 @@ def retry_while_down(act: Callable[[], None], should_stop: Callable[[], bool]) -
     while True:
         try:
             return act()
+        except DamagedError:
+            raise
         except StorageError as error:
             now = time.monotonic()
             if should_stop():

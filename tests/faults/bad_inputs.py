@@ -270,6 +270,7 @@ def commands() -> Iterator[Case]:
                 "s3://b?x=1",
                 "memory://",
                 "file://",
+                "file://store",
                 "a::b://c",
             ):
                 arguments = (command, target, *more, *quick, "--storage", uri)

@@ -287,7 +287,10 @@ def test_one_launch_at_a_time_and_a_dead_one_frees_the_sweep(tmp_path: Path) -> 
     elsewhere = {"host": "elsewhere", "pid": 1, "token": "1", "boot": "1"}
     for holder, free in (
         ({**elsewhere, "at": time.time()}, False),
+        ({**elsewhere, "at": time.time() - SILENT_SECONDS + 10.0}, False),
         ({**elsewhere, "at": time.time() - SILENT_SECONDS - 1.0}, True),
+        ({**elsewhere, "at": time.time() + SILENT_SECONDS - 10.0}, False),  # a clock that is a little ahead
+        ({**elsewhere, "at": time.time() + SILENT_SECONDS + 10.0}, True),  # one that was far ahead
         ({}, True),
     ):
         one.storage.objects.write("launch.json", json.dumps(holder).encode())
@@ -321,6 +324,32 @@ def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: p
         assert still_runs()
     assert not still_runs()
     assert here.storage.objects.keys_in() == []
+
+
+def test_a_trial_whose_commits_are_damaged_is_left_alone_and_the_others_go_on(
+    tmp_path: Path,
+    local: SweepStore,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    damaged, other = grid().trials()
+    here, fresh = machine(tmp_path, "here"), machine(tmp_path, "fresh")
+    with here.storage.working_copy(damaged, never) as trial:
+        run_recorded(damaged, trial, should_stop=never)
+    commits = [key for key in here.storage.objects.keys_in() if "/commit-" in key]
+    for key in commits:
+        here.storage.objects.write(key, b"damaged")
+    InlineExecutor().run([damaged], fresh.storage, threading.Event())
+    assert "no commit of the trial is intact, so it is left alone" in caplog.text
+    result = fresh.launch()
+    assert result.plan.to_do == (other,)
+    assert fresh.store.trial(damaged).record().status is TrialState.DAMAGED
+    assert_equal_trial(fresh.store.trial(other), local.trial(other))
+    (tmp_path / "grid.yaml").write_text(GRID)
+    arguments = [str(tmp_path / "grid.yaml"), *INLINE, "--root", str(tmp_path / "fresh")]
+    assert main(["launch", *arguments]) == ExitCode.TRIALS_FAILED
+    assert capsys.readouterr().out.endswith("\n1 damaged trial left alone\n")
+    assert {here.storage.objects.read(key) for key in commits} == {b"damaged"}
 
 
 def test_a_local_copy_is_too_old_to_judge_a_silence_by_a_third_of_it(
@@ -368,6 +397,34 @@ def test_what_only_the_launch_knows_of_a_trial_is_seen_elsewhere(tmp_path: Path)
     assert there.store.trial(silent).record().status is TrialState.WAITING
 
 
+def test_damage_in_a_local_copy_is_not_sent_with_the_status_of_a_dead_trial(
+    tmp_path: Path, local: SweepStore
+) -> None:
+    here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
+    spec = grid().trials()[0]
+    answers = iter([False] * 3 + [True] * 99)
+    with here.storage.working_copy(spec, never) as trial:
+        run_recorded(spec, trial, should_stop=partial(next, answers))
+        whole = trial.updates_path.read_bytes()
+    with here.storage.working_copy(spec, never) as trial:
+        trial.begin(spec)  # its process dies here
+    here.storage.pull(checkpoints=True)
+    copy = here.store.trial(spec)
+    for path in (copy.updates_path, *copy.checkpoints()):
+        data = path.read_bytes()
+        path.write_bytes(data[:-2] + bytes([data[-2] ^ 1]) + data[-1:])
+    copy.set_status(TrialState.FAILED, error="its process died")
+    here.storage.send_dead_trials([spec])
+    there.storage.mark()
+    there.storage.pull()
+    seen = there.store.trial(spec)
+    assert (seen.record().status, seen.record().error) == (TrialState.FAILED, "its process died")
+    assert seen.damages() == []
+    assert seen.updates_path.read_bytes() == whole
+    there.launch(retry_failed=True)
+    assert_equal(there.store, local)
+
+
 def test_a_launch_that_was_taken_over_leaves_the_trials_of_the_other_alone(tmp_path: Path) -> None:
     here, there = machine(tmp_path, "here"), machine(tmp_path, "there")
     spec = grid().trials()[0]
@@ -408,6 +465,32 @@ def test_the_command_line_takes_the_address_once(
     assert main(["evaluate", "small", "two-state ppo-lag none", "--root", "third", "--storage", uri]) == 0
 
 
+def test_a_launch_says_that_the_store_does_not_have_the_sweep_of_its_local_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grid.yaml").write_text(GRID)
+    uri = f"file://{tmp_path}/bucket"
+    some = ["launch", "grid.yaml", *INLINE, "--only", "method=none"]
+    assert main([*some, "--storage", uri]) == ExitCode.OK
+    (tmp_path / "bucket").rename(tmp_path / "moved")
+    capsys.readouterr()
+    sentence = (
+        f"{uri}/small: there is no such sweep, although {tmp_path}/runs/small is a copy of its trials; "
+        "restore the store, or give the sweep another name or another --root"
+    )
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+    assert ObjectStore(uri).keys_in() == []
+    assert main(["status", "--brief"]) == ExitCode.OK
+    shown = capsys.readouterr()
+    assert sentence in shown.err
+    assert shown.out.startswith("small: 1 of 2 complete")
+    shutil.rmtree(tmp_path / "bucket")
+    (tmp_path / "moved").rename(tmp_path / "bucket")
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+
+
 def test_a_folder_is_the_local_copy_of_one_address_or_none(tmp_path: Path, local: SweepStore) -> None:
     here = machine(tmp_path, "here")
     with pytest.raises(RecrlError, match=r": this sweep is kept in that folder, not at file://"):
@@ -430,6 +513,11 @@ def test_a_folder_is_the_local_copy_of_one_address_or_none(tmp_path: Path, local
             "lacking://b/x",
             ExitCode.WRONG_INPUT,
             "lacking://b/x: lacking:// needs a package that is not installed: ",
+        ),
+        (
+            "file://store",
+            ExitCode.WRONG_INPUT,
+            "file://store: the folder must be an absolute path, as in file:///folder, so that it ",
         ),
         (
             "unreliable:///b",

@@ -1,7 +1,9 @@
 """A trial in an object store is there whole or as it was before, whoever writes, fails or comes back."""
 
+import hashlib
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError
+from recrl.orchestrator.errors import (
+    DamagedError,
+    LostLeaseError,
+    OtherFormatError,
+    RecrlError,
+    StorageError,
+)
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
-from recrl.orchestrator.remote.commit_format import Commit, pack, unpack
+from recrl.orchestrator.launch_plan import make_plan
+from recrl.orchestrator.remote.commit_format import PREFIX_BYTES, Commit, pack, unpack
 from recrl.orchestrator.remote.commit_upload import Upload, working_copy
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import RemoteTrial
@@ -152,6 +162,54 @@ def test_a_local_copy_follows_commit_by_commit(bucket: RemoteTrial, tmp_path: Pa
         there = local_copy(bucket, tmp_path / "copy")
         assert updates(there) == list(range(1, update + 1))
         assert there.episodes_path.read_bytes() == machine.trial.episodes_path.read_bytes()
+
+
+@pytest.mark.parametrize("name", files_of(FileKind.ROWS, FileKind.LOG, FileKind.WHOLE))
+def test_a_link_in_a_local_copy_is_replaced_and_not_followed(
+    bucket: RemoteTrial, tmp_path: Path, name: str
+) -> None:
+    diary = tmp_path / "diary.txt"
+    machine = Machine(bucket, tmp_path / "machine")
+    for update in (1, 2):
+        machine.work(update)
+        with (machine.trial.folder / name).open("ab") as file:
+            file.write(b"a line\n" if name not in files_of(FileKind.ROWS) else b"")
+        machine.upload.push()
+        there = local_copy(bucket, tmp_path / "copy")
+        if update == 1:
+            data = (there.folder / name).read_bytes() + b"mine, and longer than the trial's file\n" * 100
+            diary.write_bytes(data)
+            (there.folder / name).unlink()
+            (there.folder / name).symlink_to(diary)
+    assert diary.read_bytes() == data
+    assert not (there.folder / name).is_symlink()
+    assert (there.folder / name).read_bytes() == (machine.trial.folder / name).read_bytes()
+
+
+@pytest.mark.parametrize("place", ["trials", "trials/TRIAL", "trials/TRIAL/checkpoints"])
+def test_a_link_in_place_of_a_folder_of_a_local_copy_is_refused(
+    bucket: RemoteTrial, tmp_path: Path, place: str
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    mine = tmp_path / "mine"
+    (mine / "checkpoints").mkdir(parents=True)
+    for name in ("spec.json", "checkpoint-00000009.recrl", "checkpoints/checkpoint-00000009.recrl"):
+        (mine / name).write_text("mine")
+    link = tmp_path / "copy" / place.replace("TRIAL", SPEC.folder_name)
+    link.parent.mkdir(parents=True)
+    link.symlink_to(mine)
+    with pytest.raises(
+        DamagedError, match=rf"^{link}: is a link, it must be a folder; delete it, and it is "
+    ):
+        local_copy(bucket, tmp_path / "copy" / "trials")
+    assert sorted(str(path.relative_to(mine)) for path in mine.rglob("*") if path.is_file()) == [
+        "checkpoint-00000009.recrl",
+        "checkpoints/checkpoint-00000009.recrl",
+        "spec.json",
+    ]
+    assert {path.read_text() for path in mine.rglob("*") if path.is_file()} == {"mine"}
 
 
 def test_a_local_copy_leaves_checkpoints_of_running_trials_where_they_are(
@@ -300,6 +358,113 @@ def test_a_commit_that_is_not_whole_is_not_there(bucket: RemoteTrial, tmp_path: 
         path.write_bytes(whole[:-3] if harm == "cut" else b"")
     assert updates(local_copy(bucket, tmp_path / "copy")) == [1]
     np.testing.assert_equal(Machine(bucket, tmp_path / "next").restored, tree(1))
+
+
+def flip_headers(bucket: Path) -> None:
+    """Change a bit in the header of every commit."""
+    for path in bucket.rglob("commit-*"):
+        whole = path.read_bytes()
+        path.write_bytes(whole[:200] + bytes([whole[200] ^ 1]) + whole[201:])
+
+
+def as_written_by_another_version(bucket: Path) -> None:
+    """Give every commit another format, and its header the digest of that."""
+    for path in bucket.rglob("commit-*"):
+        whole = path.read_bytes()
+        end = PREFIX_BYTES + int(whole[:PREFIX_BYTES].split()[1])
+        header = whole[PREFIX_BYTES:end].replace(b'"format": 2', b'"format": 1', 1)
+        digest = hashlib.sha256(header).hexdigest()
+        path.write_bytes(f"{digest} {len(header):010d}\n".encode() + header + whole[end:])
+
+
+@pytest.mark.parametrize(
+    ("harm", "kind", "sentence"),
+    [
+        (
+            flip_headers,
+            DamagedError,
+            "its header is not intact; no commit of the trial is intact, so it is left alone: restore its "
+            "objects, or give the sweep another name",
+        ),
+        (
+            as_written_by_another_version,
+            OtherFormatError,
+            "the commit has format 1, of another version of recrl, and this one reads format 2; the trial is "
+            "left alone: use that version, or give the sweep another name",
+        ),
+    ],
+)
+def test_a_trial_without_a_commit_that_can_be_used_is_damaged_and_left_alone(
+    bucket: RemoteTrial,
+    tmp_path: Path,
+    *,
+    harm: Callable[[Path], None],
+    kind: type[DamagedError],
+    sentence: str,
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    for update in (1, 2):
+        machine.work(update)
+        machine.upload.push()
+    whole = {key: bucket.objects.read(key) or b"" for key in bucket.objects.keys_in()}
+    harm(tmp_path / "bucket")
+    newest = max(key for key in whole if "/commit-" in key)
+    harmed = {key: bucket.objects.read(key) for key in bucket.objects.keys_in()}
+    with (
+        pytest.raises(kind, match=f"^{re.escape(f'{bucket.objects.uri}/{newest}: {sentence}')}$"),
+        working_copy(bucket, SPEC, lambda: False),  # at once, and not after 15 minutes
+    ):
+        pass
+    sweep = SweepStore(tmp_path, "copy")
+    there = local_copy(bucket, sweep.trials_folder)
+    assert there.record().status is TrialState.DAMAGED
+    assert there.record().error == f"{bucket.objects.uri}/{newest}: {sentence}"
+    assert there.damages() == [there.record().error]
+    assert make_plan([SPEC], sweep).to_do == ()
+    assert {key: bucket.objects.read(key) for key in bucket.objects.keys_in()} == harmed
+    for key, data in whole.items():
+        bucket.objects.write(key, data)
+    assert updates(local_copy(bucket, sweep.trials_folder)) == [1, 2]
+    assert there.record().status is TrialState.RUNNING
+
+
+def test_a_commit_that_is_listed_but_not_found_is_waited_for(
+    bucket: RemoteTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.remote.retries.FIRST_PAUSE_SECONDS", 0.01)
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    read, reads = ObjectStore.read_range, iter(range(99))
+
+    def unsteady(store: ObjectStore, key: str, start: int | None, end: int | None) -> bytes | None:
+        return None if "commit-" in key and next(reads) < 5 else read(store, key, start, end)
+
+    monkeypatch.setattr(ObjectStore, "read_range", unsteady)
+    with pytest.raises(StorageError, match=r"/commit-00000001: is listed, but not found when it is read$"):
+        local_copy(bucket, tmp_path / "copy")
+    with working_copy(bucket, SPEC, lambda: False) as trial:
+        assert updates(trial) == [1]
+
+
+def test_a_commit_that_was_not_read_is_kept_aside(bucket: RemoteTrial, tmp_path: Path) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    for update in (1, 2):
+        machine.work(update)
+        machine.upload.push()
+    newest = max(bucket.objects.keys_in())
+    path = tmp_path / "bucket" / newest
+    path.write_bytes(path.read_bytes()[:-1])
+    damaged = path.read_bytes()
+    for update in (2, 3):
+        successor = Machine(bucket, tmp_path / f"successor {update}")
+        successor.work(update)
+        successor.upload.push()
+    aside = [key for key in bucket.objects.keys_in() if key.startswith("aside/")]
+    assert aside == [f"aside/{newest}"]
+    assert bucket.objects.read(f"aside/{newest}") == damaged
+    assert {key.partition("-")[0] for key in bucket.objects.keys_in()} == {"000003", "aside/000001"}
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1, 2, 3]
 
 
 def test_a_commit_cannot_name_files_that_no_trial_has(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -453,6 +618,13 @@ def test_addresses_that_are_none_are_a_sentence() -> None:
             ObjectStore(wrong)
         assert str(error.value) == (
             f"the storage must be an address such as s3://bucket/folder, got {wrong!r}"
+        )
+    for wrong in ("file://store", "local://./store"):
+        with pytest.raises(RecrlError) as error:
+            ObjectStore(wrong)
+        assert str(error.value) == (
+            f"{wrong}: the folder must be an absolute path, as in {wrong.partition(':')[0]}:///folder, so "
+            "that it is the same from every directory"
         )
     with pytest.raises(RecrlError, match=r"^s4://bucket: no kind of storage is called 's4'; fsspec knows "):
         ObjectStore("s4://bucket")
