@@ -27,7 +27,7 @@ SMALLEST_HEADER = 2048
 
 APPENDED = files_of(FileKind.ROWS, FileKind.LOG)
 WHOLE = files_of(FileKind.WHOLE)
-CHECKPOINT = re.compile(r"checkpoints/checkpoint-\d{8}\.recrl")
+CHECKPOINT = re.compile(r"checkpoints/checkpoint-\d{8,18}\.recrl")
 COMMIT = re.compile(r"commit-\d{8}")
 
 
