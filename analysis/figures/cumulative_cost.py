@@ -88,9 +88,9 @@ def _panel(axes: Axes, series: list[pd.DataFrame], style: MethodStyle) -> None:
         mean = _sums(series, name).mean(axis=0)
         if np.isfinite(mean).any():
             axes.plot(steps, mean, color=colour, linestyle=dashes, linewidth=0.9, label=label, zorder=3.0)
-    bound = _sums(series, "bound").mean(axis=0)[-1]
-    if np.isfinite(bound):
-        note = f"bound: {bound / measured.mean(axis=0)[-1]:.3g} times\nthe measured cost"
+    bound, total = _sums(series, "bound").mean(axis=0)[-1], measured.mean(axis=0)[-1]
+    if np.isfinite(bound) and total > 0.0:
+        note = f"bound: {bound / total:.3g} times\nthe measured cost"
         axes.text(0.97, 0.04, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.0)
     panels.step_axis(axes, 0.0, float(steps[-1]))
 

@@ -92,13 +92,15 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             panels.step_axis(column[-1], 0.0, total)
             column[-1].set_xlabel("environment steps")
         largest = updates[f"cost_{cost}"].fillna(0.0).max()  # 0 before the first episode has finished
-        panels.cost_axis(grid[0, 0], limit, float(largest))
+        scale = panels.cost_axis(grid[0, 0], limit, float(largest))
         low, high = grid[0, 0].get_ylim()
         for axes in grid[0]:
             panels.shade_above_limit(axes, limit)
         grid[0, 0].set_ylim(low, max(high, 1.2 * limit))
         for axes, quantity in zip(grid[:, 0], rows, strict=True):
-            axes.set_ylabel(_label(quantity, cost_suffix(sweep, cost, task)), fontsize=7.0)
+            label = _label(quantity, cost_suffix(sweep, cost, task))
+            label += f"\n{scale}" if scale and axes is grid[0, 0] else ""
+            axes.set_ylabel(label, fontsize=7.0)
             if quantity.startswith(EXPLAINED):
                 axes.set_ylim(LEAST_EXPLAINED, 1.05)
             if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:

@@ -94,12 +94,12 @@ def concave_frontier(optimum: Callable[[float], float], far: float, *, tolerance
     """Sample a concave function of the limit, finely only where it bends.
 
     Args:
-        optimum: d -> J*(d), concave and non-decreasing.
-        far: the largest d, above 0.
+        optimum: d -> J*(d), concave and non-decreasing; minus infinity where no policy keeps the limit.
+        far: the largest d, above 0; a policy keeps it.
         tolerance: largest distance of the polyline below the function at the middle of a piece.
 
     Returns:
-        Points (d, J*(d)) in ascending d, [p, 2].
+        Points (d, J*(d)) in ascending d, from the least d that a policy keeps, [p, 2].
     """
 
     def refined(left: tuple[float, float], right: tuple[float, float]) -> list[tuple[float, float]]:
@@ -110,8 +110,20 @@ def concave_frontier(optimum: Callable[[float], float], far: float, *, tolerance
             return [left, (middle, value)]
         return refined(left, (middle, value)) + refined((middle, value), right)
 
-    ends = [(0.0, optimum(0.0)), (far, optimum(far))]
+    least = _least_feasible(optimum, far)
+    ends = [(least, optimum(least)), (far, optimum(far))]
     return np.array([*refined(ends[0], ends[1]), ends[1]])
+
+
+def _least_feasible(optimum: Callable[[float], float], far: float) -> float:
+    """Return 0, or nearly the least limit that a policy keeps."""
+    if np.isfinite(optimum(0.0)):
+        return 0.0
+    low, high = 0.0, far
+    while high - low > 1e-3 * far:
+        middle = (low + high) / 2.0
+        low, high = (low, middle) if np.isfinite(optimum(middle)) else (middle, high)
+    return high
 
 
 def _frontier(sweep: Sweep, trials: pd.DataFrame, *, far: float) -> tuple[Floats, Floats]:
@@ -126,9 +138,10 @@ def _frontier(sweep: Sweep, trials: pd.DataFrame, *, far: float) -> tuple[Floats
         assert value is not None  # it was known for d_d
         return value
 
-    scale = abs(optimum(far) - optimum(0.0)) + 1e-9
+    scale = abs(optimum(far) - optimum(_least_feasible(optimum, far))) + 1e-9
     points = concave_frontier(optimum, far, tolerance=1e-3 * scale)
-    known = [(limit, optimum(limit)) for limit in sorted(set(trials["deploy_limit_0"]))]
+    limits = sorted(set(trials["deploy_limit_0"]))
+    known = [(limit, best) for limit in limits if np.isfinite(best := optimum(limit))]
     points = np.unique(np.concatenate([points, np.array(known)]), axis=0)
     return points[:, 0], points[:, 1]
 

@@ -161,7 +161,12 @@ def _task_row(
         panels.phase_boundary(row[2 * position + 1], boundary, total)
         if not len(deployed):
             row[2 * position + 1].text(
-                0.5, 0.65, "not yet", transform=row[2 * position + 1].transAxes, ha="center", color="0.4"
+                0.5,
+                0.65,
+                "not yet" if boundary < total else "none",
+                transform=row[2 * position + 1].transAxes,
+                ha="center",
+                color="0.4",
             )
         if quantity != "episode_return":
             limit = float(trials[f"deploy_limit_{position - 1}"].iloc[0])

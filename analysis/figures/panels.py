@@ -113,18 +113,24 @@ def step_axis(axes: Axes, first: float, last: float) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_steps(value)))
 
 
-def cost_axis(axes: Axes, limit: float, largest: float) -> None:
-    """Make a cost axis linear to the limit and logarithmic above, if the costs exceed ten limits."""
+def cost_axis(axes: Axes, limit: float, largest: float) -> str:
+    """Make a cost axis linear to the limit and logarithmic above, if the costs exceed ten limits.
+
+    Returns:
+        The axis' label, which says so; empty for a linear axis.
+    """
     if largest <= LOG_AXIS_FROM * limit:
         axes.set_ylim(bottom=-0.04 * largest)
-        return
+        return ""
     linear_to = limit if limit > 0.0 else 1.0
     axes.set_yscale("symlog", linthresh=linear_to, linscale=0.8)
     axes.set_ylim(-0.15 * linear_to, 1.25 * largest)
     axes.yaxis.set_major_locator(FixedLocator([0.0, linear_to, *_log_ticks(2.0 * linear_to, largest)]))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylabel("log above $d_d$", fontsize=6.0, labelpad=1.0)
+    label = "log above $d_d$" if limit > 0.0 else "log above 1"
+    axes.set_ylabel(label, fontsize=6.0, labelpad=1.0)
+    return label
 
 
 def _log_ticks(low: float, high: float) -> list[float]:

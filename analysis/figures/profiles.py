@@ -41,7 +41,8 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
         return None
     failed = sweep.trials[sweep.trials["status"] == TrialState.FAILED.value]
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
-    tasks, agents = occurring(rows["task"]), occurring(rows["agent"])
+    ended = pd.concat([rows[["task", "agent"]], failed[["task", "agent"]]])
+    tasks, agents = occurring(ended["task"]), occurring(ended["agent"])
     drawn = set()
     with styles.context():
         figure = Figure(figsize=(TEXT_WIDTH, 1.5 * len(tasks) + 0.9), layout="constrained")
@@ -99,9 +100,10 @@ def _thresholds(rows: pd.DataFrame) -> Floats:
     """Return all returns at which a line may fall, and the ends of the axis.
 
     The ends are around the optimum and the returns of feasible runs, or of all runs if none is feasible.
+    Where all trials have failed, they are around 0.
     """
     shown = rows[rows["feasible"]] if rows["feasible"].any() else rows
     values = np.concatenate([shown["episode_return"], rows["optimal_return"]])
-    values = values[np.isfinite(values)]
+    values = values[np.isfinite(values)] if len(rows) else np.zeros(1)
     room = max(0.05 * float(values.max() - values.min()), SOLVED_GAP)
     return np.unique([values.min() - room, *shown["episode_return"], values.max() + room])

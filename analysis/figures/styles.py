@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import io
 import re
+import string
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -85,8 +86,19 @@ def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
     ['none', 'dynamic', 'mine']
     """
     spare = [method for method in ordered(methods, METHOD_ORDER) if method not in STYLES]
-    taken = {method: SPARE_STYLES[index % len(SPARE_STYLES)] for index, method in enumerate(spare)}
+    taken = {method: _spare_style(index) for index, method in enumerate(spare)}
     return {method: STYLES.get(method) or taken[method] for method in ordered(methods, METHOD_ORDER)}
+
+
+def _spare_style(index: int) -> MethodStyle:
+    """Return the style of the index-th method without one of its own; after the colours the rest varies."""
+    again, position = divmod(index, len(SPARE_STYLES))
+    style = SPARE_STYLES[position]
+    if not again:
+        return style
+    other = SPARE_STYLES[(position + again) % len(SPARE_STYLES)]
+    marker = f"${string.ascii_lowercase[index % 26]}$"
+    return replace(style, dashes=other.dashes, marker=marker, width=style.width + 0.4 * again)
 
 
 def context() -> AbstractContextManager[None]:

@@ -194,6 +194,7 @@ def _outcome_tables(
             exact = bool(outcomes.loc[outcomes["measure"] == measure.value, "exact"].all())
             note = tolerance_sentence(exact=exact) + ("" if exact else f" {SAMPLED}")
             note += f" {FAILED_NOTE}" if rows["failed"].any() else ""
+            note += f" {counted}" if (counted := table_formats.not_corrected(table)) else ""
             tables.append(ShownTable(_heading(measure), table, note, table_formats.row_kinds(rows)))
     return tables
 

@@ -150,9 +150,12 @@ def _allowed(limit: float, *, exact: bool) -> str:
 
     >>> _allowed(1.0, exact=True), _allowed(25.0, exact=False)
     ('allowed 1.01 (1%, exact)', 'allowed 25.25, or 25 + SE if that is more')
+    >>> _allowed(0.0, exact=True)
+    'allowed 0.01 (as the limit is 0, exact)'
     """
     most = limit + COST_TOLERANCE * (limit if limit > 0.0 else 1.0)
-    how = f" ({COST_TOLERANCE:.0%}, exact)" if exact else f", or {limit:g} + SE if that is more"
+    share = f"{COST_TOLERANCE:.0%}" if limit > 0.0 else "as the limit is 0"
+    how = f" ({share}, exact)" if exact else f", or {limit:g} + SE if that is more"
     return f"allowed {most:g}{how}"
 
 
@@ -247,10 +250,13 @@ def verdict_text(row: pd.Series) -> str:
     'infeasible by 0.40 (8%)'
     >>> verdict_text(pd.Series(counts | {"infeasible": 0, "planned": 9, "failed": 3, "pending": 1}))
     'solved 3 of 9; feasible, not solved 1 of 9; failed 3 of 9; no result yet 1 of 9'
+    >>> close = {"solved": 0, "feasible": 0, "seeds": 1, "planned": 1}
+    >>> verdict_text(pd.Series(counts | close | {"worst_excess": 0.0004, "worst_share": 0.012}))
+    'infeasible by 0.0004 (1.2%)'
     """
     planned = int(row["planned"])
-    share = "" if math.isnan(row["worst_share"]) else f" ({row['worst_share']:.0%})"
-    excess = f"{number(row['worst_excess'])}{share}"
+    share = "" if math.isnan(row["worst_share"]) else f" ({_percent(row['worst_share'])})"
+    excess = f"{_small(row['worst_excess'])}{share}"
     cost = row.get("worst_cost", "")
     cost = f"cost {cost}" if cost.isdigit() else cost
     counts = {
@@ -273,6 +279,16 @@ def verdict_text(row: pd.Series) -> str:
         for kind, count in counts.items()
         if count
     )
+
+
+def _percent(share: float) -> str:
+    """Format a share; below 10% with a decimal, as it is compared with a tolerance of 1%."""
+    return f"{share:.0%}" if share >= 0.095 or round(100.0 * share, 1).is_integer() else f"{share:.1%}"
+
+
+def _small(value: float) -> str:
+    """Format a value; below 0.01 with two digits that are not 0."""
+    return f"{value:.2g}" if 0.0 < abs(value) < 0.01 else number(value)
 
 
 def _unevaluated(row: pd.Series) -> int:
@@ -437,7 +453,7 @@ def _limit_text(rows: pd.DataFrame) -> str:
 
 def _excess(rows: pd.DataFrame) -> str:
     """Format by how much infeasible policies exceed their limit: a range, if each row is one policy."""
-    low, high = number(float(rows["worst_excess"].min())), number(float(rows["worst_excess"].max()))
+    low, high = (_small(float(value)) for value in (rows["worst_excess"].min(), rows["worst_excess"].max()))
     if (rows["infeasible"] > 1).any():
         return f"up to {high}"
     return high if low == high else f"{low} to {high}"

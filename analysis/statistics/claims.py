@@ -2,7 +2,8 @@
 
 RiverGrid (sections 5, 5.1 and 5.3): on figure 1a every path crosses the river, and 1b has a safe path. Each
 sentence is a predicate of a trial's final policy. A claim about several curricula holds in a seed if it holds
-in the trials of all of them: trials with the same seed are not independent.
+in the trials of all of them: trials with the same seed are not independent. If a sweep has only some of them,
+the claim names these, and a seed without one of them is not counted.
 
 Safety Gym (section 6): which agents keep the limit is a predicate, too. Which of two curricula returns more,
 or costs more in training, is a comparison of the two trials of each seed. It has the mean paired difference,
@@ -117,7 +118,6 @@ RIVERGRID_CLAIMS = (
     Claim("5.3", "every static curriculum violates d_d on 1b", "rivergrid-1b", STATIC, violates),
     Claim("5.3", "the plain agent finds the optimum on 1b", "rivergrid-1b", ("none",), solved),
     Claim("5.3", "the dynamic curriculum finds the optimum on 1b", "rivergrid-1b", ("dynamic",), solved),
-    Claim("5.3", "the dynamic curriculum finds the crossing on 1a", "rivergrid-1a", ("dynamic",), solved),
 )
 
 
@@ -184,7 +184,7 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFram
                 else _held(own, same, its, claim)
             )
             if counted["seeds"]:
-                named = {"section": claim.section, "claim": claim.text, "agent": str(agent)}
+                named = {"section": claim.section, "claim": _text(claim, its), "agent": str(agent)}
                 lines.append(named | counted)
     table = pd.DataFrame(lines)
     return table.astype(dict.fromkeys(FEASIBLE_PAIRS, "Int64")) if lines else table
@@ -200,9 +200,20 @@ def _about(rows: pd.DataFrame, claim: Claim | Comparison) -> pd.DataFrame:
     return rows[(rows["task"] == claim.task) & agents & rows["method"].isin(methods)]
 
 
+def _text(claim: Claim | Comparison, trials: pd.DataFrame) -> str:
+    """Return the claim, and which of its curricula the sweep has, if not all."""
+    if isinstance(claim, Comparison):
+        return claim.text
+    there = [method for method in claim.methods if (trials["method"] == method).any()]
+    return claim.text if len(there) == len(claim.methods) else f"{claim.text} (here: {', '.join(there)})"
+
+
 def _held(final: pd.DataFrame, deployed: pd.DataFrame, trials: pd.DataFrame, claim: Claim) -> dict[str, Any]:
     nothing = _ends(Interval(math.nan, math.nan, math.nan, 0, True))
     failed = _failed_seeds(trials)
+    methods = trials.groupby("seed")["method"].nunique()
+    whole = methods.index[methods == trials["method"].nunique()]
+    final, deployed = (rows[rows["seed"].isin(whole)] for rows in (final, deployed))
     held, beside = (_of_all(rows, claim, trials) for rows in (final, deployed))
     counted = _counted(held, beside, failed=len(failed))
     pairs = dict.fromkeys(FEASIBLE_PAIRS)

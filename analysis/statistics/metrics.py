@@ -266,7 +266,10 @@ def _with_exact(sampled: pd.DataFrame, exact: pd.DataFrame) -> pd.DataFrame:
     if not len(exact):
         return sampled
     key = [*KEY, "measure"]
-    exact = exact.rename(columns={"policy": "measure"}).astype({name: sampled[name].dtype for name in key})
+    exact = exact.rename(columns={"policy": "measure"})
+    if not len(sampled):  # the column may have any type then
+        sampled = sampled.astype({"measure": exact["measure"].dtype})
+    exact = exact.astype({name: sampled[name].dtype for name in key})
     sampled = sampled.merge(exact[key], on=key, how="outer")
     sampled["episodes"] = sampled["episodes"].fillna(0).astype(np.int64)
     rows = sampled[key].merge(exact, on=key, how="left")

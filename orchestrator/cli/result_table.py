@@ -27,7 +27,7 @@ def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:
     Returns:
         The table, and its caption.
     """
-    if sweep.evaluations.empty:
+    if sweep.evaluations.empty and sweep.exact.empty:
         return pd.DataFrame(), ""
     rows = count_verdicts(
         outcomes(sweep), pd.DataFrame(), curriculum_flags(sweep), sweep.trials, cost_names(sweep)

@@ -346,3 +346,10 @@ def test_a_policy_table_that_does_not_fit_is_noted(
 def test_significant_digits() -> None:
     values = np.array([123456.7, 1.2345678e-9, -0.1, np.inf])
     assert export._significant(values).tolist() == [123457.0, 1.23457e-9, -0.1, np.inf]
+
+
+def test_pandas_reads_every_number_exactly() -> None:
+    """Earlier versions do not: exports would not be exact, and merged parts would differ."""
+    numbers = np.random.default_rng(0).normal(size=10_000) * 37.0
+    text = pd.DataFrame({"number": numbers}).to_csv(index=False)
+    assert (pd.read_csv(io.StringIO(text))["number"].to_numpy() == numbers).all()

@@ -1,6 +1,7 @@
 """The paper's figures show what the frames hold."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -261,6 +262,24 @@ def test_without_a_known_optimum_there_are_policies_and_limits_but_no_frontier(f
     assert not any("best return" in text for text in legend_texts(figure))
 
 
+def test_the_frontier_begins_at_the_least_limit_that_a_policy_keeps() -> None:
+    def optimum(limit: float) -> float:
+        return min(2.0 * math.sqrt(limit - 2.0), 3.0) if limit >= 2.0 else -math.inf
+
+    points = concave_frontier(optimum, 10.0, tolerance=0.003)
+    assert np.isfinite(points).all()
+    assert points[0, 0] == pytest.approx(2.0, abs=0.01)
+    middles = (points[1:, 0] + points[:-1, 0]) / 2.0
+    below = [optimum(middle) - np.interp(middle, *points.T) for middle in middles]
+    assert max(below) < 0.1
+
+
+def test_thirteen_curricula_look_different() -> None:
+    look = styles.method_styles([f"mine-{index}" for index in range(13)])
+    assert len(set(look.values())) == 13
+    assert len({(style.dashes, style.colour) for style in look.values()}) == 13
+
+
 def test_each_cost_has_its_own_row(made_up_sweep: Callable[..., SweepStore]) -> None:
     store = made_up_sweep(seeds=1, num_costs=2, tasks=["a"], agents=["cpo"], methods=["linear"])
     figure = return_against_cost(sweep_data.load(store))
@@ -282,7 +301,11 @@ def test_diagnostics_show_limit_cost_multiplier_and_noise(finished: Sweep) -> No
     figure = curriculum_diagnostics(finished, "river-a", "cpo")
     assert len(figure.axes) == 3 * 3
     assert [axes.get_title() for axes in figure.axes[:3]] == ["none", "linear", "dynamic"]
-    assert [axes.get_ylabel() for axes in figure.axes[::3]] == ["cost", "multiplier", "KL divergence"]
+    assert [axes.get_ylabel() for axes in figure.axes[::3]] == [
+        "cost\nlog above $d_d$",
+        "multiplier",
+        "KL divergence",
+    ]
     dynamic = figure.axes[2]
     assert len(lines_of(dynamic, IN_FORCE_COLOUR)) == 3
     (limit,) = lines_of(dynamic, LIMIT_COLOUR)

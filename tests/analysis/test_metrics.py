@@ -37,6 +37,9 @@ def test_exact_values_need_no_sampled_episodes(finished: Sweep) -> None:
     sweep.__dict__["exact"] = exact.reset_index().astype({name: str for name in KEY[:3]})
     rows = metrics.outcomes(sweep)
     assert rows[["task", "measure"]].equals(whole[["task", "measure"]])
+    none_typed = finished.evaluations.iloc[:0].astype({"policy": np.float64})  # as of a sweep without any
+    sweep.__dict__["evaluations"] = none_typed
+    assert metrics.outcomes(sweep)[["episode_return", "cost_0"]].equals(rows[["episode_return", "cost_0"]])
     final = rows[rows["measure"] != "deployment"]
     assert final["exact"].all()
     assert set(final["episodes"]) == {0}

@@ -62,3 +62,16 @@ def test_failed_trials_count_as_the_worst(finished: Sweep) -> None:
 def test_without_a_complete_trial_there_is_no_profile(finished: Sweep) -> None:
     trials = finished.trials.assign(status="running")
     assert performance_profiles(dataclasses.replace(finished, trials=trials), Measure.STOCHASTIC) is None
+
+
+def test_an_agent_that_always_failed_is_drawn_at_0(finished: Sweep) -> None:
+    lost = finished.trials["agent"] == "cpo"
+    trials = finished.trials.assign(status=finished.trials["status"].astype(str).mask(lost, "failed"))
+    figure = performance_profiles(dataclasses.replace(finished, trials=trials), Measure.STOCHASTIC)
+    assert figure is not None
+    titles = {axes.get_title(loc="left"): axes for axes in figure.axes}
+    assert any(title.endswith(", cpo") for title in titles)
+    for title, axes in titles.items():
+        lines = [line for line in axes.get_lines() if len(np.atleast_1d(line.get_xdata())) > 2]
+        highest = max(float(np.max(line.get_ydata())) for line in lines)
+        assert (highest == 0.0) == title.endswith(", cpo")
