@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import pickle
 import sys
 
@@ -77,6 +78,19 @@ def test_a_batch_gives_a_picture_of_each_environment() -> None:
     one, other = environment.render()
     assert not np.array_equal(one, other)
     environment.close()
+
+
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_the_end_of_one_environment_leaves_the_pictures_of_another_alone(is_closed: bool) -> None:
+    ended, other = drawing("CarGoal1"), drawing("CarGoal1")
+    before = other.render()
+    if is_closed:
+        ended.close()
+        ended.close()
+    del ended
+    gc.collect()
+    assert np.array_equal(other.render(), before)
+    other.close()
 
 
 def test_without_a_graphics_library_there_is_one_clear_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
