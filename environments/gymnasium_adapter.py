@@ -37,7 +37,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
-from recrl.environments.gymnasium_spaces import float32_vectors, supported_actions
+from recrl.environments.gymnasium_spaces import float32_vectors, integers_lie_in, supported_actions
 from recrl.environments.saved_state import SavedState
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
@@ -269,7 +269,8 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
     def _flat(self, observation: Any) -> npt.NDArray[np.float32]:
         cause: Exception | None = None
         try:
-            if observation is not None:  # NumPy would convert it to NaN
+            # NumPy would convert None to NaN.
+            if observation is not None and integers_lie_in(self._raw_observation_space, observation):
                 flat = np.asarray(self._flatten(observation), np.float32)
                 if flat.shape == self.single_observation_space.shape:
                     return flat

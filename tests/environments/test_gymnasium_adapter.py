@@ -367,6 +367,66 @@ def test_what_an_environment_returns_is_looked_at(field: str, value: Any, senten
     assert str(caught.value).startswith(sentence)
 
 
+class Observing(Countdown):
+    """Has an observation space, and observes what it is told to."""
+
+    def __init__(self, space: spaces.Space[Any], observation: Any) -> None:
+        super().__init__()
+        self.observation_space, self.observation = space, observation
+
+    def observe(self) -> Any:
+        return self.observation
+
+
+IMAGE, WHOLE = spaces.Box(0, 255, (2, 2), np.uint8), spaces.Box(-5, 5, (2,), np.int64)
+
+
+@pytest.mark.parametrize(
+    ("space", "observation"),
+    [
+        *((IMAGE, np.full((2, 2), value)) for value in (0.7, 300, -1, np.nan)),
+        (WHOLE, np.array([0.9, -0.9])),
+        (spaces.Discrete(3), -1),
+        (spaces.Discrete(3), np.array([0, 2])),
+        (spaces.Discrete(3, start=5), 2),
+        (spaces.MultiDiscrete([3, 2]), np.array([-1, 0])),
+        (spaces.MultiDiscrete([3, 2]), np.array([0, 2])),
+        (spaces.MultiDiscrete([3, 2], start=[5, 5]), np.array([4, 5])),
+        (spaces.MultiBinary(2), np.array([0, 2])),
+        (spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Box(0.0, 1.0)}), {"a": -1, "b": np.zeros(1)}),
+        (spaces.Tuple((spaces.Discrete(3), WHOLE)), (0, np.array([6, 0]))),
+        (spaces.OneOf((spaces.Discrete(3), WHOLE)), (-1, np.zeros(2, np.int64))),
+        (spaces.OneOf((spaces.Discrete(3), WHOLE)), (0, -1)),
+    ],
+)
+def test_an_integer_outside_its_space_is_refused(space: spaces.Space[Any], observation: Any) -> None:
+    environments = SyncCMDPVectorEnv("odd", [partial(Observing, space, observation)])
+    with pytest.raises(ValueError) as caught:
+        environments.reset(seed=0)
+    assert str(caught.value).startswith(f"odd: an observation must lie in {space}, got ")
+
+
+@pytest.mark.parametrize(
+    ("space", "observation", "row"),
+    [
+        (IMAGE, [[0, 255], [1, 2]], [0, 255, 1, 2]),
+        (IMAGE, np.full((2, 2), 7.0), [7, 7, 7, 7]),
+        (WHOLE, np.array([-5, 5], np.int8), [-5, 5]),
+        (spaces.Discrete(3), np.array([2]), [0, 0, 1]),
+        (spaces.Discrete(3, start=5), np.uint8(5), [1, 0, 0]),
+        (spaces.MultiDiscrete([3, 2]), [2, 1], [0, 0, 1, 0, 1]),
+        (spaces.MultiDiscrete([3, 2], start=[5, 5]), np.array([5, 6]), [1, 0, 0, 0, 1]),
+        (spaces.MultiBinary(2), np.array([True, False]), [1, 0]),
+        (spaces.Box(0.0, 1.0, (2,)), np.array([-7.5, 9.0]), [-7.5, 9.0]),
+        (spaces.Tuple((spaces.Discrete(2), WHOLE)), (1, np.array([3, 4])), [0, 1, 3, 4]),
+        (spaces.OneOf((spaces.Discrete(2), WHOLE)), (1, np.array([3, 4])), [1, 3, 4]),
+    ],
+)
+def test_integers_of_any_type_are_observed(space: spaces.Space[Any], observation: Any, row: Any) -> None:
+    environments = SyncCMDPVectorEnv("odd", [partial(Observing, space, observation)])
+    assert environments.reset(seed=0)[0].tolist() == [row]
+
+
 def _breezy(wind: float = 0.0, *, length: int = 3) -> gymnasium.Env[Any, Any]:
     return gymnasium.make("CartPole-v1")
 
