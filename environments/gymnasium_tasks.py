@@ -86,40 +86,29 @@ def make_from_callable(
 
 
 def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
-    """Return an environment of a registered id; it renders if it takes ``render_mode``."""
+    """Return an environment of a registered id; it renders RGB if it can, or as its ``keywords`` say."""
     make = functools.partial(gymnasium.make, options.id, disable_env_checker=True)
-    keywords: dict[str, Any] = dict(options.keywords)
-    try:
-        environment: Environment = make(**{**keywords, "render_mode": "rgb_array"})
-    except TypeError as error:
-        if "unexpected keyword argument 'render_mode'" not in str(error):
-            raise
-        environment = make(**keywords)
+    environment = _rendering(make, dict(options.keywords))
     return _Costless(environment, len(options.cost_names or ("cost",))) if options.costless else environment
 
 
 def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:
-    """Return an environment of a user's callable; it renders if the callable takes ``render_mode``.
-
-    A callable with ``**keywords`` may check them and refuse ``render_mode``. Then it is called without.
+    """Return an environment of a user's callable; it renders RGB if it can, or as the options say.
 
     Raises:
         ValueError: the callable does not take an option, or returns something else.
     """
     keywords = options.model_dump()
     check_keywords(factory, name, keywords)
-    plain = functools.partial(factory, **keywords)
-    rendering = functools.partial(plain, render_mode="rgb_array")
-    try:
-        parameters = inspect.signature(factory).parameters
-    except (TypeError, ValueError):  # builtins have none
-        return made_environment(name, plain)
-    if "render_mode" in parameters:
-        return made_environment(name, rendering)
-    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
-        with suppress(TypeError, ValueError):
-            return made_environment(name, rendering)
-    return made_environment(name, plain)
+    return _rendering(lambda **given: made_environment(name, functools.partial(factory, **given)), keywords)
+
+
+def _rendering(make: Callable[..., Environment], keywords: dict[str, Any]) -> Environment:
+    """Make an environment with rendering; where it refuses ``render_mode`` in whatever way, without."""
+    if "render_mode" not in keywords:
+        with suppress(Exception):
+            return make(**keywords, render_mode="rgb_array")
+    return make(**keywords)
 
 
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):

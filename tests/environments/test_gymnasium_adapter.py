@@ -481,13 +481,37 @@ class Rendering(Strict):
     known = ("length", "render_mode")
 
 
-@pytest.mark.parametrize(("factory", "render_mode"), [(Strict, None), (Rendering, "rgb_array")])
-def test_a_users_class_with_keywords_renders_if_it_takes_the_mode(
-    factory: type[Strict], render_mode: str | None
+class ForPeople(Countdown):
+    """Draws for people only."""
+
+    metadata: dict[str, Any] = {"render_modes": ["human"]}  # noqa: RUF012
+
+    def __init__(self, length: int = 3, render_mode: str | None = None) -> None:
+        assert render_mode in (None, "human")
+        super().__init__(length)
+        self.render_mode = render_mode
+
+
+@pytest.mark.parametrize(
+    ("factory", "options", "render_mode"),
+    [
+        (Strict, {}, None),
+        (Rendering, {}, "rgb_array"),
+        (ForPeople, {}, None),
+        (ForPeople, {"render_mode": "human"}, "human"),
+        (Rendering, {"render_mode": "ansi"}, "ansi"),
+    ],
+)
+def test_a_users_class_renders_if_it_takes_the_mode_or_as_it_is_told(
+    factory: type[Strict], options: dict[str, Any], render_mode: str | None
 ) -> None:
-    environment = draw_from_callable(factory, "strict", KeywordOptions(length=2))
+    environment = draw_from_callable(factory, "strict", KeywordOptions(length=2, **options))
     assert isinstance(environment, factory)
     assert (environment.render_mode, environment.steps) == (render_mode, 2)
+
+
+@pytest.mark.parametrize("factory", [Strict, Rendering])
+def test_a_users_class_that_refuses_an_option_says_which(factory: type[Strict]) -> None:
     with pytest.raises(ValueError, match=r"^unknown options \['width'\]$"):
         draw_from_callable(factory, "strict", KeywordOptions(width=2))
 
@@ -539,6 +563,10 @@ def _countdown(**keywords: Any) -> Countdown:
     return Countdown(**keywords)
 
 
+def _for_people(**keywords: Any) -> ForPeople:
+    return ForPeople(**keywords)
+
+
 def test_a_registered_environment_without_rendering_is_a_single_one_too() -> None:
     gymnasium.register("recrl-tests/Countdown-v0", entry_point=_countdown)
     try:
@@ -549,6 +577,18 @@ def test_a_registered_environment_without_rendering_is_a_single_one_too() -> Non
             draw_gymnasium("gymnasium", unknown)
     finally:
         del gymnasium.registry["recrl-tests/Countdown-v0"]
+
+
+@pytest.mark.parametrize(("keywords", "render_mode"), [({}, None), ({"render_mode": "human"}, "human")])
+def test_a_registered_environment_for_people_is_a_single_one_too(
+    keywords: dict[str, Any], render_mode: str | None
+) -> None:
+    gymnasium.register("recrl-tests/ForPeople-v0", entry_point=_for_people)
+    try:
+        options = GymnasiumOptions(id="recrl-tests/ForPeople-v0", keywords=keywords)
+        assert draw_gymnasium("gymnasium", options).render_mode == render_mode
+    finally:
+        del gymnasium.registry["recrl-tests/ForPeople-v0"]
 
 
 def test_a_users_callable_is_checked_for_a_single_environment_as_for_a_batch() -> None:
