@@ -78,17 +78,11 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.render_mode = first.render_mode
-        if cost_names is None:
-            cost_names = (
-                first.get_wrapper_attr("cost_names") if first.has_wrapper_attr("cost_names") else ("cost",)
-            )
-        if not _are_names(cost_names):
-            raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(cost_names)}")
         self.cmdp = CMDPSpec(
             name,
             self.single_observation_space,
             self.single_action_space,
-            tuple(cost_names),
+            names_of_costs(name, first, cost_names),
             _declared_horizon(first),
             _declared_components(first),
         )
@@ -337,6 +331,23 @@ def _is_flag(value: Any) -> bool:
     if isinstance(value, bool | np.bool_):  # almost always
         return True
     return isinstance(value, int | np.integer | np.ndarray) and np.ndim(value) == 0 and value in (0, 1)
+
+
+def names_of_costs(
+    name: str, environment: Environment, given: Sequence[str] | None = None
+) -> tuple[str, ...]:
+    """Return the names of the costs: those given, or else the environment's ``cost_names``, or else ``cost``.
+
+    Raises:
+        ValueError: they are no names.
+    """
+    names = given
+    if names is None:
+        declared = environment.has_wrapper_attr("cost_names")
+        names = environment.get_wrapper_attr("cost_names") if declared else ("cost",)
+    if not _are_names(names):
+        raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(names)}")
+    return tuple(names)
 
 
 def _are_names(value: object) -> bool:

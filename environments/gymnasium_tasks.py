@@ -15,7 +15,12 @@ import gymnasium
 import numpy as np
 from pydantic import BaseModel, Field, JsonValue, field_validator
 
-from recrl.environments.gymnasium_adapter import Environment, SyncCMDPVectorEnv, made_environment
+from recrl.environments.gymnasium_adapter import (
+    Environment,
+    SyncCMDPVectorEnv,
+    made_environment,
+    names_of_costs,
+)
 from recrl.environments.options import Options
 from recrl.environments.plugins import check_keywords, import_module, require_trust
 
@@ -89,7 +94,9 @@ def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
     """Return an environment of a registered id; it renders RGB if it can, or as its ``keywords`` say."""
     make = functools.partial(gymnasium.make, options.id, disable_env_checker=True)
     environment = _rendering(make, dict(options.keywords))
-    return _Costless(environment, len(options.cost_names or ("cost",))) if options.costless else environment
+    if not options.costless:
+        return environment
+    return _Costless(environment, len(names_of_costs(name, environment, options.cost_names)))
 
 
 def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:

@@ -18,6 +18,7 @@ from recrl.environments.gymnasium_tasks import (
     draw_from_callable,
     draw_gymnasium,
     make_from_callable,
+    make_gymnasium,
 )
 from recrl.environments.registry import KeywordOptions, make_vector, task_options
 
@@ -589,6 +590,19 @@ def test_a_registered_environment_for_people_is_a_single_one_too(
         assert draw_gymnasium("gymnasium", options).render_mode == render_mode
     finally:
         del gymnasium.registry["recrl-tests/ForPeople-v0"]
+
+
+@pytest.mark.parametrize(("given", "number"), [(None, 2), (("a", "b", "c"), 3)])
+def test_a_costless_environment_has_the_costs_of_a_batch(given: tuple[str, ...] | None, number: int) -> None:
+    gymnasium.register("recrl-tests/Countdown-v0", entry_point=_countdown)
+    try:
+        options = GymnasiumOptions(id="recrl-tests/Countdown-v0", costless=True, cost_names=given)
+        environment, batch = draw_gymnasium("costless", options), make_gymnasium("costless", 1, options)
+        environment.reset(seed=0)
+        assert environment.step(0)[4]["cost"].tolist() == [0.0] * number
+        assert batch.cmdp.num_costs == number
+    finally:
+        del gymnasium.registry["recrl-tests/Countdown-v0"]
 
 
 def test_a_users_callable_is_checked_for_a_single_environment_as_for_a_batch() -> None:
