@@ -53,6 +53,9 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         factories: one callable per environment; each returns a new one.
         cost_names: names of the k costs; by default the environment's ``cost_names``, else ``cost``.
         costless: report zero costs instead of reading them from the environment.
+
+    Raises:
+        ValueError: there is no factory, two environments are the same one, or agents cannot handle them.
     """
 
     def __init__(
@@ -67,6 +70,8 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             raise ValueError(f"{name}: num_envs must be at least 1, got 0")
         self.num_envs = len(factories)
         self._environments = [made_environment(name, factory) for factory in factories]
+        if len({id(each.unwrapped) for each in self._environments}) < self.num_envs:
+            raise ValueError(f"{name} must return a new environment each time")
         first = self._environments[0]
         self._raw_observation_space = first.observation_space
         # Found once: the dispatch on the space's type would take a tenth of a simple environment's step.

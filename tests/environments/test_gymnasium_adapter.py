@@ -522,6 +522,12 @@ def test_a_factory_that_makes_no_environment_is_named() -> None:
         SyncCMDPVectorEnv("os:getpid", [lambda: 3])  # type: ignore[list-item, return-value]
 
 
+def test_a_factory_that_returns_the_same_environment_twice_is_named() -> None:
+    one = Countdown()
+    with pytest.raises(ValueError, match=r"^one:make must return a new environment each time$"):
+        SyncCMDPVectorEnv("one:make", [Countdown, lambda: one, lambda: gymnasium.wrappers.TimeLimit(one, 5)])
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
