@@ -118,6 +118,28 @@ def _rendering(make: Callable[..., Environment], keywords: dict[str, Any]) -> En
     return make(**keywords)
 
 
+class FlatObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """Gymnasium's ``FlattenObservation``, but it can be pickled."""
+
+    def __init__(self, environment: Environment) -> None:
+        super().__init__(environment)
+        self.observation_space = gymnasium.spaces.flatten_space(environment.observation_space)
+
+    def observation(self, observation: Any) -> Any:
+        """Flatten an observation."""
+        return gymnasium.spaces.flatten(self.env.observation_space, observation)
+
+
+class CostArrays(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Wrapper with ``info["cost"]`` as an array [k], also if the environment reports a number."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step; convert its costs."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        costs = {"cost": np.asarray(info["cost"], np.float64).reshape(-1)} if "cost" in info else {}
+        return observation, reward, terminated, truncated, {**info, **costs}
+
+
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Wrapper that reports a cost of 0 for each of ``num_costs`` costs."""
 
