@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from recrl.environments.safety_gym.safety_gym_environments import SafetyGymEnv, SafetyGymVectorEnv
+from recrl.environments.safety_gym.scene import PARKED
+from recrl.environments.safety_gym.step_records import NO_GREMLIN, NOT_YET
+from recrl.environments.safety_gym.task_definitions import GREMLIN_HEIGHT
 from recrl.environments.simulation.camera import RenderingUnavailableError
 
 
@@ -56,6 +59,19 @@ def test_gremlins_are_seen_after_the_end_of_an_episode() -> None:
     assert environment.batch.steps[0] == 1001
     purple = environment.render().astype(int)
     assert ((purple[..., 2] > purple[..., 1] + 60) & (purple[..., 2] > purple[..., 0] + 20)).sum() > 20
+    environment.close()
+
+
+@pytest.mark.parametrize(("embodied", "is_seen"), [(NOT_YET, False), (NO_GREMLIN, False), (0, True)])
+def test_the_gremlins_body_is_seen_only_while_it_is_a_gremlin(embodied: int, is_seen: bool) -> None:
+    environment = drawing("CarButton1")
+    batch = environment.batch
+    batch.embodied[0] = embodied
+    place = slice(batch.scene.gremlin_qpos, batch.scene.gremlin_qpos + 3)
+    assert batch.qpos[0, place].tolist() == [0.0, PARKED, GREMLIN_HEIGHT]  # in sight
+    parked = environment.render()
+    batch.qpos[0, place] = 0.0, 0.0, 20.0
+    assert np.array_equal(parked, environment.render()) is not is_seen
     environment.close()
 
 
