@@ -129,10 +129,11 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
         else:
             raise RuntimeError(f"no optimum after {MAX_POLICIES} policies")
         costs = weights @ np.array([policy.costs for policy in found[: len(weights)]])
-        excess = float(np.maximum(costs[constrained] - bounds, 0.0).sum())
-        if reward_weight == 0.0 and excess > 1e-6 * (1.0 + bounds.sum()):
+        excess = np.maximum(costs[constrained] - bounds, 0.0)
+        if reward_weight == 0.0 and (excess > 1e-6 * (1.0 + bounds)).any():
             raise InfeasibleLimitsError(
-                f"no policy keeps the limits {limits.to_json()}, the smallest total excess is {excess:.6g}"
+                f"no policy keeps the limits {limits.to_json()}, the smallest total excess is "
+                f"{excess.sum():.6g}"
             )
         bounds = np.maximum(bounds, costs[constrained])  # rounding must not make the next phase infeasible
     used = [(weight, policy) for weight, policy in zip(weights, found, strict=False) if weight > 0.0]

@@ -194,6 +194,14 @@ def test_limits_that_nobody_can_keep_are_an_error(solve: type) -> None:
     assert solve(model, CostLimits((3.0,))).episode_return == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize("loose", [10.0, 1e6, 1e9, math.inf])
+def test_a_loose_limit_makes_no_other_one_feasible(loose: float) -> None:
+    """Without a turn every way from the start leads into the river."""
+    options = {"costs": ["river", "turns", "mud"]}
+    assert optimal_return("rivergrid-1a", options, CostLimits((0.0, 0.5, loose))) == -math.inf
+    assert optimal_return("rivergrid-1a", options, CostLimits((0.0, 200.0, loose))) == pytest.approx(-20.0)
+
+
 def test_the_optimum_alone_builds_no_table_of_times_states_and_actions() -> None:
     river_map = draw_instance(InstanceSettings(map_seed=3, width=14, height=14))
     model = river_cmdp(river_map, costs=("river",), horizon=800)
