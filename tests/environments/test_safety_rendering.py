@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from recrl.environments.registry import make_vector
 from recrl.environments.safety_gym.safety_gym_environments import SafetyGymEnv, SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import PARKED
 from recrl.environments.safety_gym.step_records import NO_GREMLIN, NOT_YET
@@ -128,5 +129,13 @@ def test_rendering_must_be_asked_for() -> None:
         ValueError, match="CarGoal0: to render, make the environment with render_mode='rgb_array'"
     ):
         environment.render()
+    batch = make_vector("CarGoal0", 1)
+    batch.reset(seed=0)
+    with pytest.raises(ValueError) as caught:
+        batch.render()
+    assert str(caught.value) == (
+        "CarGoal0: to render, make the environment with render_mode='rgb_array' in gymnasium.make or "
+        "gymnasium.make_vec, or with recrl.make_env"
+    )
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
         SafetyGymEnv("CarGoal0", render_mode="human")
