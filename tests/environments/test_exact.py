@@ -279,6 +279,21 @@ def test_a_policy_of_the_wrong_shape_is_refused() -> None:
         evaluate_policy(random_cmdp(0), np.ones((3, 4)))
 
 
+@pytest.mark.parametrize("row", [[1.0, 1.0, 1.0], [1.5, -0.5, 0.0], [0.5, 0.4, 0.0], [np.nan, 0.5, 0.5]])
+def test_a_policy_whose_rows_are_no_probabilities_is_refused(row: list[float]) -> None:
+    policy = np.eye(3)[[0, 1, 2, 0]]
+    exact = evaluate_policy(random_cmdp(0), policy)
+    rounded = evaluate_policy(random_cmdp(0), policy + np.array([1e-4, 0.0, -1e-17]))
+    assert rounded.episode_return == pytest.approx(exact.episode_return, abs=1e-2)
+    policy[2] = row
+    for table in (policy, np.tile(policy, (5, 1, 1))):
+        with pytest.raises(ValueError) as caught:
+            evaluate_policy(random_cmdp(0), table)
+        assert str(caught.value) == (
+            "each row of the policy must be probabilities, at least 0 and with a sum of 1"
+        )
+
+
 def test_the_optimum_is_known_in_well_under_a_second_and_then_at_once() -> None:
     limits = CostLimits((1.2345,))
     times = []
