@@ -44,7 +44,8 @@ def unbounded_numbers(space: gymnasium.Space[Any]) -> npt.NDArray[np.bool_]:
     [False, True]
     """
     if isinstance(space, Box):
-        return ~_has_bounds(*_flat_bounds(space))
+        low, high = _flat_bounds(space)
+        return (low <= -UNBOUNDED) | (high >= UNBOUNDED)
     return np.zeros(observation_size(space), np.bool_)
 
 
@@ -52,11 +53,6 @@ def _flat_bounds(space: Box) -> tuple[Floats, Floats]:
     """The lower and the upper bound of each component, [n] each."""
     low, high = (np.asarray(bound, np.float64).reshape(-1) for bound in (space.low, space.high))
     return low, high
-
-
-def _has_bounds(low: Floats, high: Floats) -> npt.NDArray[np.bool_]:
-    has_bounds: npt.NDArray[np.bool_] = (low > -UNBOUNDED) & (high < UNBOUNDED)
-    return has_bounds
 
 
 def observation_rows(space: gymnasium.Space[Any], observations: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
@@ -88,14 +84,18 @@ def action_size(space: gymnasium.Space[Any]) -> int:
 def action_range(space: Box) -> tuple[Floats, Floats]:
     """Return the middle of each action component's range and half its length, [m] each.
 
-    They are the agent's zero and unit. A component without two bounds counts as one from -1 to 1. A bound of
-    ``UNBOUNDED`` or beyond, such as the largest number of a type, is none.
+    They are the agent's zero and unit. With one bound the range has length 2 and begins there. Without bounds
+    it is -1 to 1. A bound of ``UNBOUNDED`` or beyond, such as the largest number of a type, is none.
 
-    >>> action_range(Box(np.float32([10.0, -np.inf]), np.float32([20.0, 5.0])))
-    (array([15.,  0.]), array([5., 1.]))
+    >>> action_range(Box(np.float32([10.0, 5.0, -np.inf]), np.float32([20.0, np.inf, np.inf])))
+    (array([15.,  6.,  0.]), array([5., 1., 1.]))
     """
     low, high = _flat_bounds(space)
-    low, high = np.where(_has_bounds(low, high), [low, high], [[-1.0], [1.0]])
+    has_low, has_high = low > -UNBOUNDED, high < UNBOUNDED
+    low, high = (
+        np.where(has_low, low, np.where(has_high, high - 2.0, -1.0)),
+        np.where(has_high, high, np.where(has_low, low + 2.0, 1.0)),
+    )
     return 0.5 * (low + high), 0.5 * (high - low)
 
 

@@ -37,7 +37,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
-from recrl.environments.gymnasium_spaces import float32_vectors, supported_actions
+from recrl.environments.gymnasium_spaces import float32_vectors, integers_lie_in, supported_actions
 from recrl.environments.saved_state import SavedState
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
@@ -53,6 +53,9 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         factories: one callable per environment; each returns a new one.
         cost_names: names of the k costs; by default the environment's ``cost_names``, else ``cost``.
         costless: report zero costs instead of reading them from the environment.
+
+    Raises:
+        ValueError: there is no factory, two environments are the same one, or agents cannot handle them.
     """
 
     def __init__(
@@ -67,6 +70,8 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             raise ValueError(f"{name}: num_envs must be at least 1, got 0")
         self.num_envs = len(factories)
         self._environments = [made_environment(name, factory) for factory in factories]
+        if len({id(each.unwrapped) for each in self._environments}) < self.num_envs:
+            raise ValueError(f"{name} must return a new environment each time")
         first = self._environments[0]
         self._raw_observation_space = first.observation_space
         # Found once: the dispatch on the space's type would take a tenth of a simple environment's step.
@@ -78,17 +83,11 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.render_mode = first.render_mode
-        if cost_names is None:
-            cost_names = (
-                first.get_wrapper_attr("cost_names") if first.has_wrapper_attr("cost_names") else ("cost",)
-            )
-        if not _are_names(cost_names):
-            raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(cost_names)}")
         self.cmdp = CMDPSpec(
             name,
             self.single_observation_space,
             self.single_action_space,
-            tuple(cost_names),
+            names_of_costs(name, first, cost_names),
             _declared_horizon(first),
             _declared_components(first),
         )
@@ -269,7 +268,8 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
     def _flat(self, observation: Any) -> npt.NDArray[np.float32]:
         cause: Exception | None = None
         try:
-            if observation is not None:  # NumPy would convert it to NaN
+            # NumPy would convert None to NaN.
+            if observation is not None and integers_lie_in(self._raw_observation_space, observation):
                 flat = np.asarray(self._flatten(observation), np.float32)
                 if flat.shape == self.single_observation_space.shape:
                     return flat
@@ -336,6 +336,23 @@ def _is_flag(value: Any) -> bool:
     if isinstance(value, bool | np.bool_):  # almost always
         return True
     return isinstance(value, int | np.integer | np.ndarray) and np.ndim(value) == 0 and value in (0, 1)
+
+
+def names_of_costs(
+    name: str, environment: Environment, given: Sequence[str] | None = None
+) -> tuple[str, ...]:
+    """Return the names of the costs: those given, or else the environment's ``cost_names``, or else ``cost``.
+
+    Raises:
+        ValueError: they are no names.
+    """
+    names = given
+    if names is None:
+        declared = environment.has_wrapper_attr("cost_names")
+        names = environment.get_wrapper_attr("cost_names") if declared else ("cost",)
+    if not _are_names(names):
+        raise ValueError(f"{name}: cost_names must be a sequence of names, got {_brief(names)}")
+    return tuple(names)
 
 
 def _are_names(value: object) -> bool:

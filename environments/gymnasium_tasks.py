@@ -15,7 +15,12 @@ import gymnasium
 import numpy as np
 from pydantic import BaseModel, Field, JsonValue, field_validator
 
-from recrl.environments.gymnasium_adapter import Environment, SyncCMDPVectorEnv, made_environment
+from recrl.environments.gymnasium_adapter import (
+    Environment,
+    SyncCMDPVectorEnv,
+    made_environment,
+    names_of_costs,
+)
 from recrl.environments.options import Options
 from recrl.environments.plugins import check_keywords, import_module, require_trust
 
@@ -86,40 +91,53 @@ def make_from_callable(
 
 
 def draw_gymnasium(name: str, options: GymnasiumOptions) -> Environment:
-    """Return an environment of a registered id; it renders if it takes ``render_mode``."""
+    """Return an environment of a registered id; it renders RGB if it can, or as its ``keywords`` say."""
     make = functools.partial(gymnasium.make, options.id, disable_env_checker=True)
-    keywords: dict[str, Any] = dict(options.keywords)
-    try:
-        environment: Environment = make(**{**keywords, "render_mode": "rgb_array"})
-    except TypeError as error:
-        if "unexpected keyword argument 'render_mode'" not in str(error):
-            raise
-        environment = make(**keywords)
-    return _Costless(environment, len(options.cost_names or ("cost",))) if options.costless else environment
+    environment = _rendering(make, dict(options.keywords))
+    if not options.costless:
+        return environment
+    return _Costless(environment, len(names_of_costs(name, environment, options.cost_names)))
 
 
 def draw_from_callable(factory: Callable[..., Environment], name: str, options: BaseModel) -> Environment:
-    """Return an environment of a user's callable; it renders if the callable takes ``render_mode``.
-
-    A callable with ``**keywords`` may check them and refuse ``render_mode``. Then it is called without.
+    """Return an environment of a user's callable; it renders RGB if it can, or as the options say.
 
     Raises:
         ValueError: the callable does not take an option, or returns something else.
     """
     keywords = options.model_dump()
     check_keywords(factory, name, keywords)
-    plain = functools.partial(factory, **keywords)
-    rendering = functools.partial(plain, render_mode="rgb_array")
-    try:
-        parameters = inspect.signature(factory).parameters
-    except (TypeError, ValueError):  # builtins have none
-        return made_environment(name, plain)
-    if "render_mode" in parameters:
-        return made_environment(name, rendering)
-    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
-        with suppress(TypeError, ValueError):
-            return made_environment(name, rendering)
-    return made_environment(name, plain)
+    return _rendering(lambda **given: made_environment(name, functools.partial(factory, **given)), keywords)
+
+
+def _rendering(make: Callable[..., Environment], keywords: dict[str, Any]) -> Environment:
+    """Make an environment with rendering; where it refuses ``render_mode`` in whatever way, without."""
+    if "render_mode" not in keywords:
+        with suppress(Exception):
+            return make(**keywords, render_mode="rgb_array")
+    return make(**keywords)
+
+
+class FlatObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """Gymnasium's ``FlattenObservation``, but it can be pickled."""
+
+    def __init__(self, environment: Environment) -> None:
+        super().__init__(environment)
+        self.observation_space = gymnasium.spaces.flatten_space(environment.observation_space)
+
+    def observation(self, observation: Any) -> Any:
+        """Flatten an observation."""
+        return gymnasium.spaces.flatten(self.env.observation_space, observation)
+
+
+class CostArrays(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Wrapper with ``info["cost"]`` as an array [k], also if the environment reports a number."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step; convert its costs."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        costs = {"cost": np.asarray(info["cost"], np.float64).reshape(-1)} if "cost" in info else {}
+        return observation, reward, terminated, truncated, {**info, **costs}
 
 
 class _Costless(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -29,6 +29,7 @@ from recrl.environments.finite.finite_cmdp import FiniteCMDP, InfeasibleLimitsEr
 
 Actions = npt.NDArray[np.integer[Any]]
 TOLERANCE = 1e-9  # relative; on returns and costs
+ROUNDING = 1e-3  # absolute; of the sum of a policy's probabilities, for tables from files
 MAX_POLICIES = 10_000
 
 
@@ -87,13 +88,15 @@ def evaluate_policy(model: FiniteCMDP, policy: Floats) -> PolicyValue:
         policy: pi(a | s), [S, A] (stationary) or [H, S, A].
 
     Raises:
-        ValueError: the policy has another shape.
+        ValueError: the policy has another shape, or its rows are no probabilities.
     """
     table = (model.num_states, model.num_actions)
     if policy.shape not in {table, (model.horizon, *table)}:
         raise ValueError(
             f"the policy must have shape {table} or {(model.horizon, *table)}, got {policy.shape}"
         )
+    if not ((policy >= -TOLERANCE).all() and (np.abs(policy.sum(axis=-1) - 1.0) <= ROUNDING).all()):
+        raise ValueError("each row of the policy must be probabilities, at least 0 and with a sum of 1")
     visits = _occupation(model, np.broadcast_to(policy, (model.horizon, *table))).sum(axis=0)
     return PolicyValue(
         episode_return=float(np.sum(visits * model.rewards)),
@@ -129,10 +132,11 @@ def solve_by_lagrangian(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOpt
         else:
             raise RuntimeError(f"no optimum after {MAX_POLICIES} policies")
         costs = weights @ np.array([policy.costs for policy in found[: len(weights)]])
-        excess = float(np.maximum(costs[constrained] - bounds, 0.0).sum())
-        if reward_weight == 0.0 and excess > 1e-6 * (1.0 + bounds.sum()):
+        excess = np.maximum(costs[constrained] - bounds, 0.0)
+        if reward_weight == 0.0 and (excess > 1e-6 * (1.0 + bounds)).any():
             raise InfeasibleLimitsError(
-                f"no policy keeps the limits {limits.to_json()}, the smallest total excess is {excess:.6g}"
+                f"no policy keeps the limits {limits.to_json()}, the smallest total excess is "
+                f"{excess.sum():.6g}"
             )
         bounds = np.maximum(bounds, costs[constrained])  # rounding must not make the next phase infeasible
     used = [(weight, policy) for weight, policy in zip(weights, found, strict=False) if weight > 0.0]

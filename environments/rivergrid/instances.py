@@ -22,6 +22,7 @@ can be tuned to an agent. Steps are a path's actions, turns included. Its cost i
 
 from __future__ import annotations
 
+import functools
 import heapq
 from dataclasses import dataclass
 from typing import Self
@@ -172,6 +173,7 @@ def suggested_limit(river_map: RiverMap) -> float:
     return float(cheapest.cost) if cheapest.cost else quickest.cost / LIMIT_PARTS
 
 
+@functools.lru_cache
 def draw_instance(settings: InstanceSettings) -> RiverMap:
     """Generate the map of the first attempt that is an instance.
 

@@ -18,6 +18,7 @@ from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch
 from recrl.environments.safety_gym.scene import rotation_matrices, scene_xml, upright
 from recrl.environments.safety_gym.task_definitions import GOAL_HEIGHT, LIDAR_BINS
+from recrl.environments.simulation.camera import Frame
 from recrl.environments.simulation.rendering import MujocoRenderer
 
 Colour = tuple[float, float, float]
@@ -67,6 +68,13 @@ class SafetyRenderer(MujocoRenderer[SafetyGymBatch]):
     def __init__(self, batch: SafetyGymBatch, width: int = 480, height: int = 360) -> None:
         model = _coloured_model(batch)
         super().__init__(batch, model, width, height, distance=CAMERA_DISTANCE, elevation=CAMERA_ELEVATION)
+
+    def frame(self, index: int) -> Frame:
+        """Render the present state of environment ``index``, [height, width, 3]."""
+        if self._batch.task.gremlins.number:
+            geom = self._model.body("gremlin").geomadr[0]
+            self._model.geom_rgba[geom, 3] = self._batch.embodied[index] >= 0  # else the body is none of them
+        return super().frame(index)
 
     def _add_objects(self, index: int) -> None:
         self._add_areas(index)

@@ -54,7 +54,8 @@ class Camera:
         """Render one frame [height, width, 3] of each environment."""
         if self.render_mode is None:
             raise ValueError(
-                f"{batch.task.name}: to render, make the environment with render_mode='rgb_array'"
+                f"{batch.task.name}: to render, make the environment with render_mode='rgb_array' in "
+                "gymnasium.make or gymnasium.make_vec, or with recrl.make_env"
             )
         if not batch.generators:
             raise ValueError(f"{batch.task.name}: call reset before the first frame")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any, Generic, TypeVar
 
 import mujoco
@@ -56,6 +57,8 @@ class MujocoRenderer(Generic[BatchT]):
             elevation,
             CAMERA_AZIMUTH,
         )
+        self._free = weakref.finalize(self, _free, self._context, self._drawing)
+        self._free.atexit = False  # the driver may be gone by then
 
     def frame(self, index: int) -> Frame:
         """Render the present state of environment ``index``, [height, width, 3]."""
@@ -76,12 +79,21 @@ class MujocoRenderer(Generic[BatchT]):
         return np.flipud(picture).copy()  # OpenGL counts rows from below
 
     def close(self) -> None:
-        """Free the memory of the graphics driver."""
-        self._drawing.free()
-        self._context.free()
+        """Free the memory of the graphics driver; so does forgetting the renderer."""
+        self._free()
 
     def _aim_camera(self) -> None:
         """Point the camera; by default at the origin."""
 
     def _add_objects(self, index: int) -> None:
         """Add what the model does not have to the scene of environment ``index``; by default nothing."""
+
+
+def _free(context: Any, drawing: mujoco.MjrContext) -> None:
+    """Free a drawing within its own context; a second context gives its objects the same numbers."""
+    try:
+        context.make_current()
+    except Exception:  # at the end of the process the driver may be gone; each library fails in its own way
+        return
+    drawing.free()
+    context.free()

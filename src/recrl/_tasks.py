@@ -71,7 +71,8 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
         array([0.])
     """
     from gymnasium.spaces import Box  # noqa: PLC0415
-    from gymnasium.wrappers import FlattenObservation  # noqa: PLC0415
+
+    from recrl.environments.gymnasium_tasks import CostArrays, FlatObservations  # noqa: PLC0415
 
     _check(task, options)
     try:
@@ -81,7 +82,7 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
         raise RecrlError(f"the task {task} is no single environment; use recrl.make({task!r})") from error
     space = environment.observation_space
     is_flat = isinstance(space, Box) and len(space.shape) == 1
-    return _with_cost_arrays(environment if is_flat else FlattenObservation(environment))
+    return CostArrays(environment if is_flat else FlatObservations(environment))
 
 
 @contextmanager
@@ -93,22 +94,6 @@ def _made(task: str) -> Iterator[None]:
         raise
     except USERS_ERRORS as error:
         raise RecrlError(f"the task {task} cannot be made: {described(error)}") from error
-
-
-def _with_cost_arrays(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-    """Wrapper with ``info["cost"]`` as an array [k], also if the environment reports a number."""
-    import numpy as np  # noqa: PLC0415
-    from gymnasium import Wrapper  # noqa: PLC0415
-
-    class CostArrays(Wrapper[Any, Any, Any, Any]):
-        """Convert costs to arrays."""
-
-        def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-            observation, reward, terminated, truncated, info = super().step(action)
-            costs = {"cost": np.asarray(info["cost"], np.float64).reshape(-1)} if "cost" in info else {}
-            return observation, reward, terminated, truncated, {**info, **costs}
-
-    return CostArrays(environment)
 
 
 def _check(task: str, options: dict[str, Any]) -> None:

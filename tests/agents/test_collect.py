@@ -236,8 +236,13 @@ def test_a_space_that_no_agent_handles_is_refused() -> None:
         (10.0, 20.0, 0.4, 17.0),
         (10.0, 20.0, -3.0, 10.0),
         (-np.inf, np.inf, -3.0, -3.0),
-        (0.0, np.inf, 3.0, 3.0),
+        (0.0, np.inf, 3.0, 4.0),
         (0.0, np.inf, -3.0, 0.0),
+        (5.0, np.inf, 0.0, 6.0),
+        (5.0, np.inf, -0.5, 5.5),
+        (-np.inf, 5.0, 0.0, 4.0),
+        (-np.inf, 5.0, 0.5, 4.5),
+        (-np.inf, 5.0, 3.0, 5.0),
         (np.finfo(np.float32).min, np.finfo(np.float32).max, 2.0, 2.0),
     ],
 )
@@ -265,4 +270,4 @@ def test_a_bound_of_a_types_size_is_none(bound: float) -> None:
     space = Box(np.array([0.0, -bound, 0.0], np.float32), np.array([1.0, 1.0, bound], np.float32))
     assert unbounded_numbers(space).tolist() == [False, True, True]
     middle, half = action_range(space)
-    assert (middle.tolist(), half.tolist()) == ([0.5, 0.0, 0.0], [0.5, 1.0, 1.0])
+    assert (middle.tolist(), half.tolist()) == ([0.5, 0.0, 1.0], [0.5, 1.0, 1.0])

@@ -194,6 +194,14 @@ def test_limits_that_nobody_can_keep_are_an_error(solve: type) -> None:
     assert solve(model, CostLimits((3.0,))).episode_return == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize("loose", [10.0, 1e6, 1e9, math.inf])
+def test_a_loose_limit_makes_no_other_one_feasible(loose: float) -> None:
+    """Without a turn every way from the start leads into the river."""
+    options = {"costs": ["river", "turns", "mud"]}
+    assert optimal_return("rivergrid-1a", options, CostLimits((0.0, 0.5, loose))) == -math.inf
+    assert optimal_return("rivergrid-1a", options, CostLimits((0.0, 200.0, loose))) == pytest.approx(-20.0)
+
+
 def test_the_optimum_alone_builds_no_table_of_times_states_and_actions() -> None:
     river_map = draw_instance(InstanceSettings(map_seed=3, width=14, height=14))
     model = river_cmdp(river_map, costs=("river",), horizon=800)
@@ -269,6 +277,21 @@ def test_rounding_leads_to_no_state_of_probability_0() -> None:
 def test_a_policy_of_the_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"the policy must have shape \(4, 3\) or \(5, 4, 3\), got \(3, 4\)"):
         evaluate_policy(random_cmdp(0), np.ones((3, 4)))
+
+
+@pytest.mark.parametrize("row", [[1.0, 1.0, 1.0], [1.5, -0.5, 0.0], [0.5, 0.4, 0.0], [np.nan, 0.5, 0.5]])
+def test_a_policy_whose_rows_are_no_probabilities_is_refused(row: list[float]) -> None:
+    policy = np.eye(3)[[0, 1, 2, 0]]
+    exact = evaluate_policy(random_cmdp(0), policy)
+    rounded = evaluate_policy(random_cmdp(0), policy + np.array([1e-4, 0.0, -1e-17]))
+    assert rounded.episode_return == pytest.approx(exact.episode_return, abs=1e-2)
+    policy[2] = row
+    for table in (policy, np.tile(policy, (5, 1, 1))):
+        with pytest.raises(ValueError) as caught:
+            evaluate_policy(random_cmdp(0), table)
+        assert str(caught.value) == (
+            "each row of the policy must be probabilities, at least 0 and with a sum of 1"
+        )
 
 
 def test_the_optimum_is_known_in_well_under_a_second_and_then_at_once() -> None:

@@ -18,6 +18,7 @@ from recrl.environments.gymnasium_tasks import (
     draw_from_callable,
     draw_gymnasium,
     make_from_callable,
+    make_gymnasium,
 )
 from recrl.environments.registry import KeywordOptions, make_vector, task_options
 
@@ -367,6 +368,66 @@ def test_what_an_environment_returns_is_looked_at(field: str, value: Any, senten
     assert str(caught.value).startswith(sentence)
 
 
+class Observing(Countdown):
+    """Has an observation space, and observes what it is told to."""
+
+    def __init__(self, space: spaces.Space[Any], observation: Any) -> None:
+        super().__init__()
+        self.observation_space, self.observation = space, observation
+
+    def observe(self) -> Any:
+        return self.observation
+
+
+IMAGE, WHOLE = spaces.Box(0, 255, (2, 2), np.uint8), spaces.Box(-5, 5, (2,), np.int64)
+
+
+@pytest.mark.parametrize(
+    ("space", "observation"),
+    [
+        *((IMAGE, np.full((2, 2), value)) for value in (0.7, 300, -1, np.nan)),
+        (WHOLE, np.array([0.9, -0.9])),
+        (spaces.Discrete(3), -1),
+        (spaces.Discrete(3), np.array([0, 2])),
+        (spaces.Discrete(3, start=5), 2),
+        (spaces.MultiDiscrete([3, 2]), np.array([-1, 0])),
+        (spaces.MultiDiscrete([3, 2]), np.array([0, 2])),
+        (spaces.MultiDiscrete([3, 2], start=[5, 5]), np.array([4, 5])),
+        (spaces.MultiBinary(2), np.array([0, 2])),
+        (spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Box(0.0, 1.0)}), {"a": -1, "b": np.zeros(1)}),
+        (spaces.Tuple((spaces.Discrete(3), WHOLE)), (0, np.array([6, 0]))),
+        (spaces.OneOf((spaces.Discrete(3), WHOLE)), (-1, np.zeros(2, np.int64))),
+        (spaces.OneOf((spaces.Discrete(3), WHOLE)), (0, -1)),
+    ],
+)
+def test_an_integer_outside_its_space_is_refused(space: spaces.Space[Any], observation: Any) -> None:
+    environments = SyncCMDPVectorEnv("odd", [partial(Observing, space, observation)])
+    with pytest.raises(ValueError) as caught:
+        environments.reset(seed=0)
+    assert str(caught.value).startswith(f"odd: an observation must lie in {space}, got ")
+
+
+@pytest.mark.parametrize(
+    ("space", "observation", "row"),
+    [
+        (IMAGE, [[0, 255], [1, 2]], [0, 255, 1, 2]),
+        (IMAGE, np.full((2, 2), 7.0), [7, 7, 7, 7]),
+        (WHOLE, np.array([-5, 5], np.int8), [-5, 5]),
+        (spaces.Discrete(3), np.array([2]), [0, 0, 1]),
+        (spaces.Discrete(3, start=5), np.uint8(5), [1, 0, 0]),
+        (spaces.MultiDiscrete([3, 2]), [2, 1], [0, 0, 1, 0, 1]),
+        (spaces.MultiDiscrete([3, 2], start=[5, 5]), np.array([5, 6]), [1, 0, 0, 0, 1]),
+        (spaces.MultiBinary(2), np.array([True, False]), [1, 0]),
+        (spaces.Box(0.0, 1.0, (2,)), np.array([-7.5, 9.0]), [-7.5, 9.0]),
+        (spaces.Tuple((spaces.Discrete(2), WHOLE)), (1, np.array([3, 4])), [0, 1, 3, 4]),
+        (spaces.OneOf((spaces.Discrete(2), WHOLE)), (1, np.array([3, 4])), [1, 3, 4]),
+    ],
+)
+def test_integers_of_any_type_are_observed(space: spaces.Space[Any], observation: Any, row: Any) -> None:
+    environments = SyncCMDPVectorEnv("odd", [partial(Observing, space, observation)])
+    assert environments.reset(seed=0)[0].tolist() == [row]
+
+
 def _breezy(wind: float = 0.0, *, length: int = 3) -> gymnasium.Env[Any, Any]:
     return gymnasium.make("CartPole-v1")
 
@@ -421,13 +482,37 @@ class Rendering(Strict):
     known = ("length", "render_mode")
 
 
-@pytest.mark.parametrize(("factory", "render_mode"), [(Strict, None), (Rendering, "rgb_array")])
-def test_a_users_class_with_keywords_renders_if_it_takes_the_mode(
-    factory: type[Strict], render_mode: str | None
+class ForPeople(Countdown):
+    """Draws for people only."""
+
+    metadata: dict[str, Any] = {"render_modes": ["human"]}  # noqa: RUF012
+
+    def __init__(self, length: int = 3, render_mode: str | None = None) -> None:
+        assert render_mode in (None, "human")
+        super().__init__(length)
+        self.render_mode = render_mode
+
+
+@pytest.mark.parametrize(
+    ("factory", "options", "render_mode"),
+    [
+        (Strict, {}, None),
+        (Rendering, {}, "rgb_array"),
+        (ForPeople, {}, None),
+        (ForPeople, {"render_mode": "human"}, "human"),
+        (Rendering, {"render_mode": "ansi"}, "ansi"),
+    ],
+)
+def test_a_users_class_renders_if_it_takes_the_mode_or_as_it_is_told(
+    factory: type[Strict], options: dict[str, Any], render_mode: str | None
 ) -> None:
-    environment = draw_from_callable(factory, "strict", KeywordOptions(length=2))
+    environment = draw_from_callable(factory, "strict", KeywordOptions(length=2, **options))
     assert isinstance(environment, factory)
     assert (environment.render_mode, environment.steps) == (render_mode, 2)
+
+
+@pytest.mark.parametrize("factory", [Strict, Rendering])
+def test_a_users_class_that_refuses_an_option_says_which(factory: type[Strict]) -> None:
     with pytest.raises(ValueError, match=r"^unknown options \['width'\]$"):
         draw_from_callable(factory, "strict", KeywordOptions(width=2))
 
@@ -435,6 +520,12 @@ def test_a_users_class_with_keywords_renders_if_it_takes_the_mode(
 def test_a_factory_that_makes_no_environment_is_named() -> None:
     with pytest.raises(ValueError, match=r"^os:getpid must return a Gymnasium environment, got int 3$"):
         SyncCMDPVectorEnv("os:getpid", [lambda: 3])  # type: ignore[list-item, return-value]
+
+
+def test_a_factory_that_returns_the_same_environment_twice_is_named() -> None:
+    one = Countdown()
+    with pytest.raises(ValueError, match=r"^one:make must return a new environment each time$"):
+        SyncCMDPVectorEnv("one:make", [Countdown, lambda: one, lambda: gymnasium.wrappers.TimeLimit(one, 5)])
 
 
 @pytest.mark.parametrize(
@@ -479,6 +570,10 @@ def _countdown(**keywords: Any) -> Countdown:
     return Countdown(**keywords)
 
 
+def _for_people(**keywords: Any) -> ForPeople:
+    return ForPeople(**keywords)
+
+
 def test_a_registered_environment_without_rendering_is_a_single_one_too() -> None:
     gymnasium.register("recrl-tests/Countdown-v0", entry_point=_countdown)
     try:
@@ -487,6 +582,31 @@ def test_a_registered_environment_without_rendering_is_a_single_one_too() -> Non
         unknown = GymnasiumOptions(id="recrl-tests/Countdown-v0", keywords={"width": 2})
         with pytest.raises(TypeError, match="width"):
             draw_gymnasium("gymnasium", unknown)
+    finally:
+        del gymnasium.registry["recrl-tests/Countdown-v0"]
+
+
+@pytest.mark.parametrize(("keywords", "render_mode"), [({}, None), ({"render_mode": "human"}, "human")])
+def test_a_registered_environment_for_people_is_a_single_one_too(
+    keywords: dict[str, Any], render_mode: str | None
+) -> None:
+    gymnasium.register("recrl-tests/ForPeople-v0", entry_point=_for_people)
+    try:
+        options = GymnasiumOptions(id="recrl-tests/ForPeople-v0", keywords=keywords)
+        assert draw_gymnasium("gymnasium", options).render_mode == render_mode
+    finally:
+        del gymnasium.registry["recrl-tests/ForPeople-v0"]
+
+
+@pytest.mark.parametrize(("given", "number"), [(None, 2), (("a", "b", "c"), 3)])
+def test_a_costless_environment_has_the_costs_of_a_batch(given: tuple[str, ...] | None, number: int) -> None:
+    gymnasium.register("recrl-tests/Countdown-v0", entry_point=_countdown)
+    try:
+        options = GymnasiumOptions(id="recrl-tests/Countdown-v0", costless=True, cost_names=given)
+        environment, batch = draw_gymnasium("costless", options), make_gymnasium("costless", 1, options)
+        environment.reset(seed=0)
+        assert environment.step(0)[4]["cost"].tolist() == [0.0] * number
+        assert batch.cmdp.num_costs == number
     finally:
         del gymnasium.registry["recrl-tests/Countdown-v0"]
 

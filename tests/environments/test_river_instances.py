@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -234,3 +235,17 @@ def test_the_committed_grid_has_the_first_six_maps_under_the_limits_of_the_rule(
         river_map = task_map(cell.task.name, RiverGridGeneratedOptions.model_validate(cell.task.options))
         assert cell.deploy_limits == CostLimits((suggested_limit(river_map),))
         assert "\n".join(f"  # {row}" for row in river_map.rows) in grid.text.decode()
+
+
+def test_a_map_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+
+    def counted(seed: int) -> Any:
+        drawn.append(seed)
+        return original(seed)
+
+    original = instances._Draws
+    monkeypatch.setattr(instances, "_Draws", counted)
+    for _ in range(2):
+        make_vector("rivergrid-generated", 1, options={"map_seed": 987_654})
+    assert drawn == [987_654]

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import gc
 import pickle
 import sys
 
 import numpy as np
 import pytest
 
+from recrl.environments.registry import make_vector
 from recrl.environments.safety_gym.safety_gym_environments import SafetyGymEnv, SafetyGymVectorEnv
+from recrl.environments.safety_gym.scene import PARKED
+from recrl.environments.safety_gym.step_records import NO_GREMLIN, NOT_YET
+from recrl.environments.safety_gym.task_definitions import GREMLIN_HEIGHT
 from recrl.environments.simulation.camera import RenderingUnavailableError
 
 
@@ -58,6 +63,19 @@ def test_gremlins_are_seen_after_the_end_of_an_episode() -> None:
     environment.close()
 
 
+@pytest.mark.parametrize(("embodied", "is_seen"), [(NOT_YET, False), (NO_GREMLIN, False), (0, True)])
+def test_the_gremlins_body_is_seen_only_while_it_is_a_gremlin(embodied: int, is_seen: bool) -> None:
+    environment = drawing("CarButton1")
+    batch = environment.batch
+    batch.embodied[0] = embodied
+    place = slice(batch.scene.gremlin_qpos, batch.scene.gremlin_qpos + 3)
+    assert batch.qpos[0, place].tolist() == [0.0, PARKED, GREMLIN_HEIGHT]  # in sight
+    parked = environment.render()
+    batch.qpos[0, place] = 0.0, 0.0, 20.0
+    assert np.array_equal(parked, environment.render()) is not is_seen
+    environment.close()
+
+
 def test_drawing_changes_nothing() -> None:
     seen, unseen = drawing("CarGoal2"), SafetyGymEnv("CarGoal2")
     seen.reset(seed=3)
@@ -79,6 +97,19 @@ def test_a_batch_gives_a_picture_of_each_environment() -> None:
     environment.close()
 
 
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_the_end_of_one_environment_leaves_the_pictures_of_another_alone(is_closed: bool) -> None:
+    ended, other = drawing("CarGoal1"), drawing("CarGoal1")
+    before = other.render()
+    if is_closed:
+        ended.close()
+        ended.close()
+    del ended
+    gc.collect()
+    assert np.array_equal(other.render(), before)
+    other.close()
+
+
 def test_without_a_graphics_library_there_is_one_clear_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setitem(sys.modules, "mujoco.egl", None)
@@ -98,5 +129,13 @@ def test_rendering_must_be_asked_for() -> None:
         ValueError, match="CarGoal0: to render, make the environment with render_mode='rgb_array'"
     ):
         environment.render()
+    batch = make_vector("CarGoal0", 1)
+    batch.reset(seed=0)
+    with pytest.raises(ValueError) as caught:
+        batch.render()
+    assert str(caught.value) == (
+        "CarGoal0: to render, make the environment with render_mode='rgb_array' in gymnasium.make or "
+        "gymnasium.make_vec, or with recrl.make_env"
+    )
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
         SafetyGymEnv("CarGoal0", render_mode="human")

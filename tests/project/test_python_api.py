@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import pickle
 import signal
 import subprocess
 import sys
@@ -307,6 +308,18 @@ def test_costs_of_a_single_environment_are_a_vector(folder: Path, monkeypatch: p
     env = recrl.make_env("column_room:make")
     env.reset(seed=0)
     assert env.step(env.action_space.sample())[4]["cost"].tolist() == [1.0]
+
+
+@pytest.mark.parametrize("task", ["rivergrid-1a", "PointGoal0", "pickled_room:make"])
+def test_a_single_environment_can_be_pickled(
+    task: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "pickled_room.py").write_text(OWN_TASK)
+    monkeypatch.syspath_prepend(str(folder))
+    env = recrl.make_env(task)
+    env.reset(seed=0)
+    again, action = pickle.loads(pickle.dumps(env)), env.action_space.sample()  # noqa: S301
+    assert np.array_equal(again.step(action)[0], env.step(action)[0])
 
 
 @pytest.mark.parametrize("make", [recrl.make, recrl.make_env])
