@@ -262,7 +262,9 @@ class _Check:
         """Return the entry's options with defaults, as JSON values."""
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
         try:
-            options = options_of(entry.name, entry.options).model_dump(mode="json")
+            model = options_of(entry.name, entry.options)
+            require_json(entry.options)  # of an untyped option, model_dump writes an infinite number as null
+            options = model.model_dump(mode="json")
             require_json(options)
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
