@@ -71,7 +71,7 @@ def read_grid(path: Path, *, build: bool = False) -> GridSpec:
 
     Raises:
         GridError: the file is missing or wrong; one located sentence for each mistake.
-        UncalledError: no mistake was found, but import paths were not checked, as this process refuses them.
+        UncalledError: no mistake was found, but import paths were not checked, as they are refused here.
     """
     return parse_grid(_read(path), source=str(path), build=build)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.plugins import UnknownNameError, load_attribute
+from recrl.environments.plugins import MODULES, UnknownNameError, load_attribute, modules_in
 from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
 from recrl.environments.rivergrid.maps import MAPS, parse_map
 
@@ -121,6 +122,24 @@ def test_a_users_task_is_found_by_entry_point(tmp_path: Path, monkeypatch: pytes
     (distribution / "entry_points.txt").write_text("[recrl.tasks]\nrush = goldrush:RUSH\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert find_task("rush") is TASKS["two-state"]
+
+
+def test_folders_of_modules_may_overlap_in_several_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    before, folder = list(sys.path), str(tmp_path)
+    for name in ("early_room", "late_room"):
+        (tmp_path / f"{name}.py").write_text("def make(): ...")
+    first, second = modules_in(tmp_path), modules_in(tmp_path)
+    first.__enter__()
+    assert load_attribute("early_room:make")
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert (os.environ[MODULES], sys.path) == (folder, [*before, folder])
+    assert load_attribute("late_room:make")
+    second.__exit__(None, None, None)
+    assert (os.environ.get(MODULES), sys.path) == (None, before)
 
 
 @pytest.mark.parametrize(
