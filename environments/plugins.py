@@ -18,7 +18,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -104,6 +104,14 @@ def modules_in(folder: Path) -> Iterator[None]:
                 os.environ[MODULES] = _folders[-1]
             else:
                 os.environ.pop(MODULES, None)
+
+
+def modules_here() -> AbstractContextManager[None]:
+    """Add the working directory as ``modules_in`` does, unless it has been deleted."""
+    try:
+        return modules_in(Path.cwd())
+    except FileNotFoundError:
+        return nullcontext()
 
 
 def import_module(name: str) -> ModuleType:

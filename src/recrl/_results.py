@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recrl.environments.plugins import refuse_import_paths
+from recrl.environments.plugins import modules_here, refuse_import_paths
 from recrl.orchestrator.errors import RecrlError
 
 NO_POLICIES = "an export and MLflow hold no policies; load the sweep from the folder it ran in"
@@ -151,9 +151,12 @@ def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:
 
 @contextmanager
 def following(trust: bool) -> Iterator[None]:
-    """Follow the import paths of files only if their author is trusted; errors say how."""
+    """Follow the import paths of files only if their author is trusted; errors say how.
+
+    Then modules in the working directory are found, too.
+    """
     try:
-        with nullcontext() if trust else refuse_import_paths():
+        with modules_here() if trust else refuse_import_paths():
             yield
     except RecrlError as error:
         if "add --trust" not in str(error):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from recrl._results import Policy, following, load_sweep, policy_of
-from recrl.environments.plugins import modules_in
+from recrl.environments.plugins import modules_here
 from recrl.orchestrator.errors import GridError, RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -115,7 +115,7 @@ def launch(
         mlflow=mlflow,
         figures=figures,
     )
-    with modules_in(Path.cwd()):
+    with modules_here():
         checked = _checked(grid)
         if progress:
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
@@ -180,7 +180,7 @@ def train(
     """
     from recrl.orchestrator.trial.one_thread import one_thread  # noqa: PLC0415  (imports torch)
 
-    with ExitStack() as stack:
+    with modules_here(), ExitStack() as stack:
         place = Path(folder) if folder is not None else _scratch(stack)
         grid = {
             "name": place.name,
@@ -192,7 +192,7 @@ def train(
             "deploy_limits": deploy_limits,
             "run": {"total_steps": total_steps, **run},
         }
-        with modules_in(Path.cwd()), one_thread(), shown_progress(progress):
+        with one_thread(), shown_progress(progress):
             try:
                 sweep = launch(
                     grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False

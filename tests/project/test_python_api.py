@@ -292,6 +292,30 @@ def test_files_run_no_code_unless_they_are_trusted(folder: Path, monkeypatch: py
     assert info["cost"].tolist() == [1.0]
 
 
+def test_modules_in_the_working_directory_are_found_by_every_call(folder: Path) -> None:
+    """As by the installed command; of a script, Python itself searches only the script's own folder."""
+    for name in ("room_i", "room_ii", "room_iii", "room_iv"):
+        (folder / f"{name}.py").write_text(OWN_TASK)
+    assert str(folder) not in sys.path
+    assert recrl.make("room_i:make").num_envs == 1
+    assert recrl.make_env("room_ii:make").reset(seed=0)[0].shape == (2,)
+    recrl.validate({**GRID, "tasks": [{"name": "room_iii:make", "deploy_limits": 2}]}, trust=True)
+    training = train(task="room_iv:make", folder="room")
+    del sys.modules["room_iv"]
+    assert training.folder is not None
+    assert recrl.load_policy(training.folder, trust=True).act([0.0, 0.0]).shape == (2,)
+    del sys.modules["room_iv"]
+    recrl.load_sweep("room", root=".", trust=True)
+    assert str(folder) not in sys.path
+
+
+def test_a_deleted_working_directory_does_not_matter(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "gone").mkdir()
+    monkeypatch.chdir(folder / "gone")
+    (folder / "gone").rmdir()
+    assert recrl.make("two-state").num_envs == 1
+
+
 def test_tasks_say_what_is_wrong() -> None:
     with pytest.raises(recrl.RecrlError, match="no task is called 'rivergrid-1'; did you mean 'rivergrid-1"):
         recrl.make("rivergrid-1")
