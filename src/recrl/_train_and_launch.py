@@ -33,6 +33,7 @@ Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
 SOURCE = "grid"
 NOT_FINITE_OR_TEXT = re.compile(r'"(?:[^"\\]|\\.)*"|Infinity|NaN')
+NOT_ASCII = re.compile(r"[^ -~]")
 LINE_SECONDS = 60.0  # at most between two lines of progress
 
 
@@ -258,11 +259,13 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     if isinstance(grid, str | Path):
         return read_grid(Path(grid), build=build)
     try:
-        data = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid))).encode()
+        text = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid), ensure_ascii=False))
     except (TypeError, ValueError) as error:
         raise GridError(
             [f"{SOURCE}: must hold plain values only, and code by its import path, my_module:MyTask: {error}"]
         ) from error
+    # JSON would write a character beyond U+FFFF as two escapes, which are two characters in YAML
+    data = NOT_ASCII.sub(lambda found: f"\\U{ord(found[0]):08x}", text).encode()
     try:
         return parse_grid(data, source=SOURCE, build=build)
     except GridError as error:

@@ -192,6 +192,30 @@ def test_text_that_looks_like_a_number_stays_text(folder: Path) -> None:
     assert list(trial.train_limits) == [math.inf]
 
 
+@pytest.mark.parametrize(
+    "text", ["x\U0001f600", "\\ud83d\\ude00", "a\x7f\x85\u2028\n\t\0", '"\\', "caf\xe9 \U0010ffff"]
+)
+def test_text_of_a_dictionary_arrives_as_it_is(folder: Path, text: str) -> None:
+    (folder / "texts.py").write_text(OWN_TASK.replace("render_mode=None", "**texts"))
+    task = {"name": "texts:make", "options": {text: [text]}, "deploy_limits": 2}
+    *_, trial = recrl.validate({**GRID, "tasks": [task]}, trust=True).trials()
+    assert trial.task.options == {text: [text]}
+
+
+def test_labels_have_any_character_but_half_a_pair(folder: Path) -> None:
+    task = {"name": "two-state", "label": "x\U0001f600", "deploy_limits": 2}
+    *_, trial = recrl.validate({**GRID, "tasks": [task]}).trials()
+    assert trial.task.label == "x\U0001f600"
+    with pytest.raises(recrl.GridError) as error:
+        recrl.validate({**GRID, "tasks": [{**task, "label": "x\ud83d"}]})
+    (problem,) = error.value.problems
+    assert problem.startswith("tasks.0.label: input should be a valid string, ")
+    (folder / "halves.py").write_text(OWN_TASK.replace("render_mode=None", "half"))
+    task = {"name": "halves:make", "options": {"half": "\ud83d"}, "deploy_limits": 2}
+    *_, trial = recrl.validate({**GRID, "tasks": [task]}, trust=True).trials()
+    assert trial.task.options == {"half": "\ud83d"}
+
+
 def test_sweeps_are_loaded_from_a_folder_and_an_export(finished_sweep: SweepStore, tmp_path: Path) -> None:
     sweep = recrl.load_sweep(finished_sweep.folder)
     assert len(sweep.trials) == 36
