@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_here
-from recrl.orchestrator.errors import GridError, RecrlError
+from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
@@ -116,7 +116,7 @@ def launch(
         mlflow=mlflow,
         figures=figures,
     )
-    with modules_here():
+    with modules_here(), _disk_in_words(Path(root)):
         checked = _checked(grid)
         if progress:
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
@@ -167,7 +167,7 @@ def train(
 
     Raises:
         GridError: an argument is wrong; one sentence for each mistake.
-        RecrlError: the trial failed; its traceback is a note of the error.
+        RecrlError: the trial failed, and its traceback is a note of the error; or the disk cannot be used.
         KeyboardInterrupt: Ctrl-C or SIGTERM stopped it before its end; with a ``folder`` the same call
             continues.
 
@@ -252,6 +252,24 @@ class Training:
 
 def _scratch(stack: ExitStack) -> Path:
     return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="recrl-"))) / "trial"
+
+
+@contextmanager
+def _disk_in_words(root: Path) -> Iterator[None]:
+    """Say of a path that cannot be used, and of a disk that is full or lost, what it is.
+
+    Args:
+        root: the folder of all sweeps.
+
+    Raises:
+        StorageError: there was such an error.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (*NO_ROOM, *NO_PATH):
+            raise
+        raise StorageError(f"{error.filename or root}: {error.strerror}; saved results are kept") from error
 
 
 def _checked(grid: Grid, *, build: bool = False) -> GridSpec:

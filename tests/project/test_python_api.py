@@ -389,6 +389,24 @@ def test_a_launch_refuses_what_it_would_ignore(folder: Path, options: Any, sente
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("place", "sentence"),
+    [
+        ("a.txt", "a.txt: File exists; saved results are kept"),
+        ("a.txt/below", "a.txt/below: Not a directory; saved results are kept"),
+        ("/proc/x/y", "/proc/x: No such file or directory; saved results are kept"),
+        ("x" * 300 + "/y", ": File name too long; saved results are kept"),
+    ],
+)
+def test_a_place_that_cannot_be_used_is_a_sentence(folder: Path, place: str, sentence: str) -> None:
+    (folder / "a.txt").touch()
+    with pytest.raises(recrl.RecrlError) as error:
+        train(folder=place)
+    assert str(error.value).endswith(sentence)
+    with pytest.raises(recrl.RecrlError, match=r"; saved results are kept$"):
+        recrl.launch(GRID, root=place, executor="inline", mlflow=False, figures=False, progress=False)
+
+
 def test_only_an_address_takes_the_name_of_a_sweep(finished_sweep: SweepStore) -> None:
     with pytest.raises(recrl.RecrlError, match=r"^name: only an MLflow address takes one; .* got 'other'$"):
         recrl.load_sweep(finished_sweep.folder, "other")
