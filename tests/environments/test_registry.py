@@ -96,6 +96,28 @@ def test_limits_that_nobody_can_keep_have_the_optimum_of_an_empty_set() -> None:
     assert optimal_return("rivergrid-1a", options, CostLimits((0.0, 0.0))) == -math.inf
 
 
+@pytest.mark.parametrize("limits", [5.0, 5, [5.0], (5.0,), np.array([5.0]), np.float32(5.0)])
+def test_limits_of_an_optimum_may_be_plain_numbers(limits: Any) -> None:
+    assert optimal_return("rivergrid-1a", {}, limits) == optimal_return(
+        "rivergrid-1a", {}, CostLimits((5.0,))
+    )
+
+
+@pytest.mark.parametrize(
+    ("limits", "sentence"),
+    [
+        ({"river": 5.0}, r"^limits must be a number, a list of numbers or CostLimits, got \{'river': 5.0\}$"),
+        ("many", "^limits must be a number, a list of numbers or CostLimits, got 'many'$"),
+        ([[5.0, 6.0]], "^rivergrid-1a: there must be one limit per cost, 1, got 2$"),
+        (-1.0, r"^cost limits must be at least 0, got -1\.0$"),
+        (None, "^cost limits must be at least 0, got nan$"),
+    ],
+)
+def test_limits_that_are_no_numbers_are_refused(limits: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        optimal_return("rivergrid-1a", {}, limits)
+
+
 def test_a_task_whose_optimum_nobody_knows_says_none() -> None:
     assert optimal_return("gymnasium", {"id": "CartPole-v1", "costless": True}, CostLimits((1.0,))) is None
 
