@@ -84,7 +84,8 @@ def load_policy(
         The policy, which does not learn.
 
     Raises:
-        RecrlError: there is no such trial, it has no intact checkpoint, or its code is not installed.
+        RecrlError: there is no such trial, it has no intact checkpoint, its code is not installed, or
+            ``source`` is something else.
 
     Example:
         >>> import recrl
@@ -113,6 +114,13 @@ def load_policy(
 
 def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
     """The folder of a sweep's trial."""
+    from recrl.analysis.data.sweep_data import Sweep  # noqa: PLC0415  (imports pandas)
+
+    if not isinstance(sweep, Sweep):
+        raise RecrlError(
+            f"source: must be a sweep, a folder or a name, got {type(sweep).__name__}; of a training use "
+            "training.policy or training.sweep"
+        )
     if sweep.folder is None:
         raise RecrlError(f"{sweep.name}: {NO_POLICIES}")
     if trial_id is None:
@@ -194,8 +202,8 @@ class Policy:
             deterministic: whether to take the mode of the policy instead of a sample.
 
         Returns:
-            For a batch, int64 [B] (discrete actions) or float32 [B, m] (continuous ones, within the task's
-            bounds). For one observation, an int or float32 [m].
+            For a batch, int64 [B] (discrete actions), or [B, m] with the dtype of the action space
+            (continuous ones, within the task's bounds). For one observation, an int or [m].
 
         Raises:
             ValueError: the observation has another shape, or is not finite.

@@ -247,6 +247,11 @@ def test_a_policy_is_loaded_by_its_row_in_trials(
         recrl.load_policy("one.zip", trial_id)
     with pytest.raises(recrl.RecrlError, match="one: has no trial '3f2a'; "):
         recrl.load_policy(training.sweep, "3f2a")
+    sentence = "^source: must be a sweep, .* got {}; of a training use training.policy or training.sweep$"
+    with pytest.raises(recrl.RecrlError, match=sentence.format("Training")):
+        recrl.load_policy(training)  # type: ignore[arg-type]
+    with pytest.raises(recrl.RecrlError, match=sentence.format("NoneType")):
+        recrl.load_policy(None)  # type: ignore[arg-type]
     assert train().sweep.folder is None
     store = made_up_sweep(
         seeds=2, methods=["none"], tasks=["a"], agents=["cpo"], missing=["a cpo none seed 1"]
@@ -265,7 +270,7 @@ def test_a_policy_acts_on_one_and_on_many_alike(folder: Path) -> None:
     envs = recrl.make("continuous-bandit", 5)
     observations, _ = envs.reset(seed=0)
     many = policy.act(observations, deterministic=True)
-    assert many.shape == envs.action_space.shape
+    assert (many.shape, many.dtype) == (envs.action_space.shape, envs.action_space.dtype)
     np.testing.assert_allclose(policy.act(observations[0], deterministic=True), many[0])
     np.testing.assert_array_equal(training.policy.act(observations, deterministic=True), many)
     first = policy.act(observations)
