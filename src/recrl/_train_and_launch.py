@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_here
 from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError
@@ -277,7 +279,7 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     if isinstance(grid, str | Path):
         return read_grid(Path(grid), build=build)
     try:
-        text = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid), ensure_ascii=False))
+        text = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid), ensure_ascii=False, default=_plain))
     except (TypeError, ValueError) as error:
         raise GridError(
             [f"{SOURCE}: must hold plain values only, and code by its import path, my_module:MyTask: {error}"]
@@ -289,6 +291,17 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     except GridError as error:
         problems = [re.sub(rf"^{SOURCE}:\d+: ", "", problem) for problem in error.problems]
         raise GridError(problems) from error
+
+
+def _plain(value: Any) -> Any:
+    """Return a scalar or an array of NumPy's as plain values.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
 
 
 def _in_yaml(token: re.Match[str]) -> str:

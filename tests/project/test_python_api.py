@@ -152,6 +152,16 @@ def test_wrong_arguments_get_the_sentences_of_a_grid(changes: dict[str, Any], se
     assert sentence in str(error.value)
 
 
+def test_numbers_of_numpy_are_plain_numbers(folder: Path) -> None:
+    training = train(
+        seed=np.int64(3), deploy_limits=np.array([2.0]), total_steps=np.int32(160), train_limits=np.float32(4)
+    )
+    assert training.policy.spec.seed == 3
+    assert training.evaluations.equals(train(seed=3, deploy_limits=[2.0], train_limits=4).evaluations)
+    grid = recrl.validate({**GRID, "methods": ["none"], "seeds": np.arange(3)})
+    assert [trial.seed for trial in grid.trials()] == [0, 1, 2]
+
+
 def test_a_trial_that_fails_raises_with_its_traceback(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "broken_room.py").write_text(
         OWN_TASK.replace('"cost": 1.0', '"cost": 1.0 / max(0, 3 - self.steps)')
