@@ -3,8 +3,8 @@
 A name is, in this order: one of ours; an entry point of an installed package; an import path
 ``package.module:attribute``. Imports nothing but the standard library.
 
-An import path runs the code that it names, and names come from files that others may have made. A process
-that only reads such files first calls ``refuse_import_paths``. Then only installed entry points are imported.
+An import path runs the code that it names, and names come from files that others may have made. Who only
+reads such files does so in ``refuse_import_paths``. Then only installed entry points are imported.
 SECURITY.md lists the commands that do so.
 """
 
@@ -16,8 +16,10 @@ import inspect
 import os
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -29,7 +31,7 @@ class UnknownNameError(ValueError):
 
 
 class UntrustedNameError(Exception):
-    """An import path that this process refuses to follow.
+    """An import path that is not followed, in ``refuse_import_paths``.
 
     It is not a ValueError, because pydantic would report that as an invalid option.
     """
@@ -41,30 +43,37 @@ class UntrustedNameError(Exception):
 
 IMPORT_PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 MODULES = "RECRL_MODULES"  # an environment variable: a folder of modules, searched last
-_refused = False  # of the whole process, so that it holds in all threads
+_refused = ContextVar("_refused", default=False)  # of a thread: others may follow import paths meanwhile
+# Folders of modules: that of the parent process, and those of the open blocks of ``modules_in``.
+_folders = [os.environ[MODULES]] if MODULES in os.environ else []
+_appended: set[str] = set()  # folders that import_module has appended to sys.path
+_changing = threading.Lock()
 
 
 @contextmanager
 def refuse_import_paths() -> Iterator[None]:
-    """Refuse import paths in this process until the end of the ``with`` block."""
-    global _refused  # noqa: PLW0603
-    before, _refused = _refused, True
+    """Refuse import paths until the end of the ``with`` block.
+
+    This holds in the thread of the block. It also holds in threads that start in the block with a copy of its
+    context, as all threads of this package do. It does not hold in other threads.
+    """
+    token = _refused.set(True)
     try:
         yield
     finally:
-        _refused = before
+        _refused.reset(token)
 
 
 def require_trust(path: str) -> None:
-    """Check that this process may follow an import path from a file.
+    """Check that an import path from a file may be followed here.
 
     Args:
         path: ``package.module:attribute``, or an id of Gymnasium's with a module in front.
 
     Raises:
-        UntrustedNameError: this process refuses import paths.
+        UntrustedNameError: import paths are refused here.
     """
-    if _refused:
+    if _refused.get():
         raise UntrustedNameError(path)
 
 
@@ -72,18 +81,37 @@ def require_trust(path: str) -> None:
 def modules_in(folder: Path) -> Iterator[None]:
     """Add a folder of modules for import paths until the end of the block, also in child processes.
 
-    The folder is searched last, so that it cannot shadow an installed package.
+    The folder is searched last, so that it cannot shadow an installed package. It is added for the whole
+    process. Blocks may overlap in several threads; names are then searched in the folder of the newest one.
+
+    Args:
+        folder: of modules.
     """
-    before, found = os.environ.get(MODULES), list(sys.path)
-    os.environ[MODULES] = str(folder.absolute())
+    added = str(folder.absolute())
+    with _changing:
+        _folders.append(added)
+        os.environ[MODULES] = added
     try:
         yield
     finally:
-        sys.path[:] = found
-        if before is None:
-            del os.environ[MODULES]
-        else:
-            os.environ[MODULES] = before
+        with _changing:
+            _folders.remove(added)
+            if added in _appended - set(_folders):
+                _appended.remove(added)
+                if added in sys.path:
+                    sys.path.remove(added)
+            if _folders:
+                os.environ[MODULES] = _folders[-1]
+            else:
+                os.environ.pop(MODULES, None)
+
+
+def modules_here() -> AbstractContextManager[None]:
+    """Add the working directory as ``modules_in`` does, unless it has been deleted."""
+    try:
+        return modules_in(Path.cwd())
+    except FileNotFoundError:
+        return nullcontext()
 
 
 def import_module(name: str) -> ModuleType:
@@ -93,8 +121,10 @@ def import_module(name: str) -> ModuleType:
         ImportError: it cannot be imported.
     """
     folder = os.environ.get(MODULES)
-    if folder and folder not in sys.path and not name.startswith("recrl."):
-        sys.path.append(folder)
+    with _changing:
+        if folder and folder not in sys.path and not name.startswith("recrl."):
+            sys.path.append(folder)
+            _appended.add(folder)
     return importlib.import_module(name)
 
 
@@ -127,7 +157,7 @@ def trusted_attribute(path: str) -> Any:
 
     Raises:
         UnknownNameError: the module cannot be imported or has no such attribute.
-        UntrustedNameError: this process follows no import paths.
+        UntrustedNameError: import paths are refused here.
     """
     require_trust(path)
     return load_attribute(path)
@@ -145,7 +175,7 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
     Raises:
         UnknownNameError: the name is not known, and the message names the nearest known names; or its entry
             point cannot be loaded.
-        UntrustedNameError: it is an import path, and this process refuses them.
+        UntrustedNameError: it is an import path, and they are refused here.
     """
     if name in ours:
         return ours[name]

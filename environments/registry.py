@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from recrl.environments.cmdp import CostLimits
@@ -219,26 +221,43 @@ def make_drawn(name: str, *, options: Mapping[str, Any] | None = None) -> gymnas
     return environment
 
 
-def optimal_return(name: str, options: Mapping[str, Any], limits: CostLimits) -> float | None:
+def optimal_return(name: str, options: Mapping[str, Any], limits: CostLimits | npt.ArrayLike) -> float | None:
     """Return J*(d), the largest expected undiscounted return under limits d.
 
     Args:
         name: of the task, as for ``make_vector``.
         options: the task's settings.
-        limits: d, undiscounted cost per episode, [k].
+        limits: d, undiscounted cost per episode, [k]: a number, a list of numbers or ``CostLimits``.
 
     Returns:
         The constrained optimum; None if it is not known, and -inf if no policy keeps the limits.
 
     Raises:
         UnknownNameError: the task is not known.
-        ValueError: an option is wrong, or there is another number of limits than of costs.
+        ValueError: an option is wrong, or the limits are not one number per cost.
     """
     task = find_task(name)
     if task.optimum is None:
         return None
     canonical = task_options(name, options).model_dump_json()
-    return _cached_optimum(name, canonical, limits)
+    return _cached_optimum(name, canonical, _cost_limits(limits))
+
+
+def _cost_limits(given: CostLimits | npt.ArrayLike) -> CostLimits:
+    """Return limits as ``CostLimits``.
+
+    Raises:
+        ValueError: they are not numbers of at least 0.
+    """
+    if isinstance(given, CostLimits):
+        return given
+    try:
+        values = np.asarray(given, np.float64).ravel()
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"limits must be a number, a list of numbers or CostLimits, got {given!r}"
+        ) from error
+    return CostLimits(tuple(values))
 
 
 @functools.lru_cache(maxsize=4096)

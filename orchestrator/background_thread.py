@@ -5,11 +5,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import copy_context
 
 
 @contextmanager
 def background_thread(work: Callable[[threading.Event], object], *, name: str) -> Iterator[None]:
     """Run a function in a thread until the end of the ``with`` block, which waits for it.
+
+    The thread refuses import paths if the block does.
 
     Args:
         work: the function. Its event is set when the block ends, also by an error; then it must return soon.
@@ -17,7 +20,7 @@ def background_thread(work: Callable[[threading.Event], object], *, name: str) -
         name: of the thread.
     """
     over = threading.Event()
-    thread = threading.Thread(target=work, args=(over,), name=name, daemon=True)
+    thread = threading.Thread(target=copy_context().run, args=(work, over), name=name, daemon=True)
     thread.start()
     try:
         yield

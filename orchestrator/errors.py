@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 from pathlib import Path
 
 
@@ -75,6 +76,28 @@ class ClusterError(RecrlError):
 class TrackingError(RecrlError):
     """MLflow cannot be used as requested; training does not depend on it."""
 
+
+# Invalid paths: a file for a folder, a name that is too long, circular links.
+NO_PATH = (
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.ENOENT,
+    errno.EINVAL,
+)
+# The disk is full, lost or refuses.
+NO_ROOM = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EIO,
+    errno.ESTALE,
+)
 
 # Exceptions of a user's task, agent or curriculum, which must end only their own trial.
 USERS_ERRORS = (Exception, SystemExit)

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Protocol
@@ -233,7 +234,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
 
-    answering = threading.Thread(target=answer, name="recrl-stopping", daemon=True)
+    context = copy_context()  # it refuses import paths if this thread does
+    answering = threading.Thread(target=context.run, args=(answer,), name="recrl-stopping", daemon=True)
     answering.start()
 
     signals = (signal.SIGINT, signal.SIGTERM)

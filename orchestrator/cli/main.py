@@ -5,7 +5,6 @@ Imports almost nothing until the command is known, so that ``--help`` is fast.
 
 from __future__ import annotations
 
-import errno
 import io
 import os
 import sys
@@ -17,6 +16,8 @@ from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse, readable
 from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.errors import (
+    NO_PATH,
+    NO_ROOM,
     ClusterError,
     GridError,
     RecrlError,
@@ -28,28 +29,6 @@ from recrl.orchestrator.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-# Invalid paths: a file for a folder, a name that is too long, circular links.
-NO_PATH = (
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.EEXIST,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-    errno.ENOENT,
-    errno.EINVAL,
-)
-# The disk is full, lost or refuses.
-NO_ROOM = (
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EROFS,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EIO,
-    errno.ESTALE,
-)
 
 
 def main(given: Sequence[str] | None = None) -> int:

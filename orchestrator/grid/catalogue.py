@@ -132,7 +132,7 @@ def kinds_of(name: str) -> list[Kind]:
 
     Raises:
         RecrlError: the name is not known.
-        UntrustedNameError: it is an import path, and this process refuses them.
+        UntrustedNameError: it is an import path, and they are refused here.
     """
     if ":" not in name:
         found = [kind for kind in KINDS.values() if name in kind.names]

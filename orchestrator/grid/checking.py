@@ -71,7 +71,7 @@ def read_grid(path: Path, *, build: bool = False) -> GridSpec:
 
     Raises:
         GridError: the file is missing or wrong; one located sentence for each mistake.
-        UncalledError: no mistake was found, but import paths were not checked, as this process refuses them.
+        UncalledError: no mistake was found, but import paths were not checked, as they are refused here.
     """
     return parse_grid(_read(path), source=str(path), build=build)
 
@@ -262,7 +262,9 @@ class _Check:
         """Return the entry's options with defaults, as JSON values."""
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
         try:
-            options = options_of(entry.name, entry.options).model_dump(mode="json")
+            model = options_of(entry.name, entry.options)
+            require_json(entry.options)  # of an untyped option, model_dump writes an infinite number as null
+            options = model.model_dump(mode="json")
             require_json(options)
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):

@@ -20,7 +20,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from contextvars import Context, copy_context
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 
 from recrl.orchestrator.background_thread import background_thread
@@ -213,8 +215,9 @@ class RemoteSweep(SweepPlace):
 
             before = {} if checkpoints else self._pulled
             news = [name for name in keys if _is_new(keys[name], before.get(name))]
+            contexts = [copy_context() for _ in news]  # a thread refuses import paths if this one does
             with ThreadPoolExecutor(PULLS_AT_ONCE) as pool:
-                list(pool.map(pull_trial, news))
+                list(pool.map(Context.run, contexts, repeat(pull_trial), news))
             self._pulled = keys
         self._in_touch_at = time.monotonic()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recrl.environments.plugins import refuse_import_paths
+from recrl.environments.plugins import modules_here, refuse_import_paths
 from recrl.orchestrator.errors import RecrlError
 
 NO_POLICIES = "an export and MLflow hold no policies; load the sweep from the folder it ran in"
@@ -84,7 +84,8 @@ def load_policy(
         The policy, which does not learn.
 
     Raises:
-        RecrlError: there is no such trial, it has no intact checkpoint, or its code is not installed.
+        RecrlError: there is no such trial, it has no intact checkpoint, its code is not installed, or
+            ``source`` is something else.
 
     Example:
         >>> import recrl
@@ -113,6 +114,13 @@ def load_policy(
 
 def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
     """The folder of a sweep's trial."""
+    from recrl.analysis.data.sweep_data import Sweep  # noqa: PLC0415  (imports pandas)
+
+    if not isinstance(sweep, Sweep):
+        raise RecrlError(
+            f"source: must be a sweep, a folder or a name, got {type(sweep).__name__}; of a training use "
+            "training.policy or training.sweep"
+        )
     if sweep.folder is None:
         raise RecrlError(f"{sweep.name}: {NO_POLICIES}")
     if trial_id is None:
@@ -151,9 +159,12 @@ def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:
 
 @contextmanager
 def following(trust: bool) -> Iterator[None]:
-    """Follow the import paths of files only if their author is trusted; errors say how."""
+    """Follow the import paths of files only if their author is trusted; errors say how.
+
+    Then modules in the working directory are found, too.
+    """
     try:
-        with nullcontext() if trust else refuse_import_paths():
+        with modules_here() if trust else refuse_import_paths():
             yield
     except RecrlError as error:
         if "add --trust" not in str(error):
@@ -191,8 +202,8 @@ class Policy:
             deterministic: whether to take the mode of the policy instead of a sample.
 
         Returns:
-            For a batch, int64 [B] (discrete actions) or float32 [B, m] (continuous ones, within the task's
-            bounds). For one observation, an int or float32 [m].
+            For a batch, int64 [B] (discrete actions), or [B, m] with the dtype of the action space
+            (continuous ones, within the task's bounds). For one observation, an int or [m].
 
         Raises:
             ValueError: the observation has another shape, or is not finite.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from recrl.environments.plugins import UnknownNameError
+from recrl.environments.plugins import UnknownNameError, modules_here
 from recrl.environments.registry import NotDrawnError, make_drawn, make_vector, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.validation_sentences import sentences
@@ -43,9 +43,10 @@ def make(task: str, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
         >>> observations.shape[0], envs.cmdp.cost_names
         (4, ('river',))
     """
-    _check(task, options)
-    with _made(task):
-        return make_vector(task, num_envs, options=options)
+    with modules_here():
+        _check(task, options)
+        with _made(task):
+            return make_vector(task, num_envs, options=options)
 
 
 def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
@@ -74,9 +75,9 @@ def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
 
     from recrl.environments.gymnasium_tasks import CostArrays, FlatObservations  # noqa: PLC0415
 
-    _check(task, options)
     try:
-        with _made(task):
+        with modules_here(), _made(task):
+            _check(task, options)
             environment = make_drawn(task, options=options)
     except NotDrawnError as error:
         raise RecrlError(f"the task {task} is no single environment; use recrl.make({task!r})") from error

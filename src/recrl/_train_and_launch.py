@@ -14,9 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 from recrl._results import Policy, following, load_sweep, policy_of
-from recrl.environments.plugins import modules_in
-from recrl.orchestrator.errors import GridError, RecrlError
+from recrl.environments.plugins import modules_here
+from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
@@ -33,6 +35,7 @@ Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
 SOURCE = "grid"
 NOT_FINITE_OR_TEXT = re.compile(r'"(?:[^"\\]|\\.)*"|Infinity|NaN')
+NOT_ASCII = re.compile(r"[^ -~]")
 LINE_SECONDS = 60.0  # at most between two lines of progress
 
 
@@ -115,7 +118,7 @@ def launch(
         mlflow=mlflow,
         figures=figures,
     )
-    with modules_in(Path.cwd()):
+    with modules_here(), _disk_in_words(Path(root)):
         checked = _checked(grid)
         if progress:
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
@@ -166,7 +169,7 @@ def train(
 
     Raises:
         GridError: an argument is wrong; one sentence for each mistake.
-        RecrlError: the trial failed; its traceback is a note of the error.
+        RecrlError: the trial failed, and its traceback is a note of the error; or the disk cannot be used.
         KeyboardInterrupt: Ctrl-C or SIGTERM stopped it before its end; with a ``folder`` the same call
             continues.
 
@@ -180,7 +183,7 @@ def train(
     """
     from recrl.orchestrator.trial.one_thread import one_thread  # noqa: PLC0415  (imports torch)
 
-    with ExitStack() as stack:
+    with modules_here(), ExitStack() as stack:
         place = Path(folder) if folder is not None else _scratch(stack)
         grid = {
             "name": place.name,
@@ -192,7 +195,7 @@ def train(
             "deploy_limits": deploy_limits,
             "run": {"total_steps": total_steps, **run},
         }
-        with modules_in(Path.cwd()), one_thread(), shown_progress(progress):
+        with one_thread(), shown_progress(progress):
             try:
                 sweep = launch(
                     grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False
@@ -253,21 +256,52 @@ def _scratch(stack: ExitStack) -> Path:
     return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="recrl-"))) / "trial"
 
 
+@contextmanager
+def _disk_in_words(root: Path) -> Iterator[None]:
+    """Say of a path that cannot be used, and of a disk that is full or lost, what it is.
+
+    Args:
+        root: the folder of all sweeps.
+
+    Raises:
+        StorageError: there was such an error.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (*NO_ROOM, *NO_PATH):
+            raise
+        raise StorageError(f"{error.filename or root}: {error.strerror}; saved results are kept") from error
+
+
 def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     """Read the grid of a file or of a dictionary; mistakes in a dictionary have no line numbers."""
     if isinstance(grid, str | Path):
         return read_grid(Path(grid), build=build)
     try:
-        data = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid))).encode()
+        text = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid), ensure_ascii=False, default=_plain))
     except (TypeError, ValueError) as error:
         raise GridError(
             [f"{SOURCE}: must hold plain values only, and code by its import path, my_module:MyTask: {error}"]
         ) from error
+    # JSON would write a character beyond U+FFFF as two escapes, which are two characters in YAML
+    data = NOT_ASCII.sub(lambda found: f"\\U{ord(found[0]):08x}", text).encode()
     try:
         return parse_grid(data, source=SOURCE, build=build)
     except GridError as error:
         problems = [re.sub(rf"^{SOURCE}:\d+: ", "", problem) for problem in error.problems]
         raise GridError(problems) from error
+
+
+def _plain(value: Any) -> Any:
+    """Return a scalar or an array of NumPy's as plain values.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
 
 
 def _in_yaml(token: re.Match[str]) -> str:

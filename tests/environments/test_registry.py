@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.plugins import UnknownNameError, load_attribute
+from recrl.environments.plugins import MODULES, UnknownNameError, load_attribute, modules_in
 from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
 from recrl.environments.rivergrid.maps import MAPS, parse_map
 
@@ -95,6 +96,28 @@ def test_limits_that_nobody_can_keep_have_the_optimum_of_an_empty_set() -> None:
     assert optimal_return("rivergrid-1a", options, CostLimits((0.0, 0.0))) == -math.inf
 
 
+@pytest.mark.parametrize("limits", [5.0, 5, [5.0], (5.0,), np.array([5.0]), np.float32(5.0)])
+def test_limits_of_an_optimum_may_be_plain_numbers(limits: Any) -> None:
+    assert optimal_return("rivergrid-1a", {}, limits) == optimal_return(
+        "rivergrid-1a", {}, CostLimits((5.0,))
+    )
+
+
+@pytest.mark.parametrize(
+    ("limits", "sentence"),
+    [
+        ({"river": 5.0}, r"^limits must be a number, a list of numbers or CostLimits, got \{'river': 5.0\}$"),
+        ("many", "^limits must be a number, a list of numbers or CostLimits, got 'many'$"),
+        ([[5.0, 6.0]], "^rivergrid-1a: there must be one limit per cost, 1, got 2$"),
+        (-1.0, r"^cost limits must be at least 0, got -1\.0$"),
+        (None, "^cost limits must be at least 0, got nan$"),
+    ],
+)
+def test_limits_that_are_no_numbers_are_refused(limits: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        optimal_return("rivergrid-1a", {}, limits)
+
+
 def test_a_task_whose_optimum_nobody_knows_says_none() -> None:
     assert optimal_return("gymnasium", {"id": "CartPole-v1", "costless": True}, CostLimits((1.0,))) is None
 
@@ -121,6 +144,24 @@ def test_a_users_task_is_found_by_entry_point(tmp_path: Path, monkeypatch: pytes
     (distribution / "entry_points.txt").write_text("[recrl.tasks]\nrush = goldrush:RUSH\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert find_task("rush") is TASKS["two-state"]
+
+
+def test_folders_of_modules_may_overlap_in_several_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    before, folder = list(sys.path), str(tmp_path)
+    for name in ("early_room", "late_room"):
+        (tmp_path / f"{name}.py").write_text("def make(): ...")
+    first, second = modules_in(tmp_path), modules_in(tmp_path)
+    first.__enter__()
+    assert load_attribute("early_room:make")
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert (os.environ[MODULES], sys.path) == (folder, [*before, folder])
+    assert load_attribute("late_room:make")
+    second.__exit__(None, None, None)
+    assert (os.environ.get(MODULES), sys.path) == (None, before)
 
 
 @pytest.mark.parametrize(

@@ -609,3 +609,19 @@ run: {total_steps: 10_000}
         parse_grid(data.replace(b"10_000", b"100"), source="grid.yaml")
     (problem,) = caught.value.problems
     assert problem.endswith("got 100 (on zebra, ant, two-state-2)")
+
+
+@pytest.mark.parametrize("value", [".inf", "[1, -.inf]", "{a: .nan}"])
+@pytest.mark.parametrize(
+    "task", ["name: 'own_room:make', options: {wind: %s}", "name: gymnasium, options: %s"]
+)
+def test_an_option_that_is_not_finite_is_no_null(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, value: str
+) -> None:
+    (tmp_path / "own_room.py").write_text("def make(wind): raise AssertionError")
+    monkeypatch.syspath_prepend(tmp_path)
+    options = (
+        value if "own_room" in task else f"{{id: CartPole-v1, costless: true, keywords: {{wind: {value}}}}}"
+    )
+    (problem,) = _problems(SMALL.replace("name: two-state", task % options))
+    assert problem.startswith("grid.yaml:2: tasks.0.options: must be finite JSON values (")

@@ -1,14 +1,20 @@
 """Files that somebody else made run no code, name no place outside, and lead nobody to other files."""
 
 import json
+import re
+import signal
 import sys
+import threading
 import zipfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+import recrl
 from recrl.analysis.data import export
 from recrl.analysis.data.optima import optima_of
 from recrl.analysis.report import table_formats
@@ -16,10 +22,14 @@ from recrl.analysis.report.drawing import draw
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.plugins import UntrustedNameError, refuse_import_paths
 from recrl.environments.registry import find_task, task_options
+from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.remote.remote_sweep import RemoteSweep
+from recrl.orchestrator.remote.remote_trial import RemoteTrial
+from recrl.orchestrator.run_sweep import stopping_on_signals
 from recrl.orchestrator.spec import Choice, TrialSpec
 from tests.faults.bad_inputs import changed
 
@@ -140,6 +150,54 @@ def test_a_process_that_refuses_import_paths_follows_none_until_it_does_again(na
         own = "recrl.environments.registration:recrl/CarGoal2-v0"
         assert task_options("gymnasium", {"id": own}).model_dump()["id"] == own
     assert task_options("gymnasium", {"id": "gymnasium.envs:CartPole-v1", "costless": True})
+
+
+def follows() -> bool:
+    """Whether import paths are followed here."""
+    try:
+        find_task("math:floor")
+    except UntrustedNameError:
+        return False
+    return True
+
+
+def test_a_thread_refuses_for_itself_alone() -> None:
+    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as other:
+        in_one, in_other = refuse_import_paths(), refuse_import_paths()
+        one.submit(in_one.__enter__).result()
+        other.submit(in_other.__enter__).result()
+        assert (follows(), one.submit(follows).result()) == (True, False)
+        one.submit(in_one.__exit__, None, None, None).result()
+        assert (one.submit(follows).result(), other.submit(follows).result()) == (True, False)
+        other.submit(in_other.__exit__, None, None, None).result()
+        assert other.submit(follows).result()
+
+
+def test_threads_that_start_in_a_refusal_refuse_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers: list[bool] = []
+
+    def ask(*_: object, **__: object) -> None:
+        answers.append(follows())
+
+    monkeypatch.setattr(RemoteTrial, "download", ask)
+    remote = RemoteSweep(f"file://{tmp_path}/bucket", SweepStore(tmp_path, "small"))
+    for name in ("a", "b"):
+        remote.objects.write(f"trials/{name}/spec.json", b"{}")
+    for context in (refuse_import_paths(), nullcontext()):
+        with context:
+            with background_thread(ask, name="ask"):
+                pass
+            with stopping_on_signals(threading.Event(), ask):
+                signal.raise_signal(signal.SIGINT)
+            remote.pull(checkpoints=True)
+    assert answers == [False] * 4 + [True] * 4
+
+
+def test_no_thread_starts_without_the_context_of_its_starter() -> None:
+    modules = [path.read_text() for path in Path(recrl.__file__).parent.glob("*/**/*.py")]
+    starting = [text for text in modules if re.search(r"\b(Thread|ThreadPoolExecutor|Timer)\(", text)]
+    assert len(starting) == 3
+    assert all("copy_context()" in text for text in starting)
 
 
 # Names

@@ -153,6 +153,16 @@ def test_wrong_arguments_get_the_sentences_of_a_grid(changes: dict[str, Any], se
     assert sentence in str(error.value)
 
 
+def test_numbers_of_numpy_are_plain_numbers(folder: Path) -> None:
+    training = train(
+        seed=np.int64(3), deploy_limits=np.array([2.0]), total_steps=np.int32(160), train_limits=np.float32(4)
+    )
+    assert training.policy.spec.seed == 3
+    assert training.evaluations.equals(train(seed=3, deploy_limits=[2.0], train_limits=4).evaluations)
+    grid = recrl.validate({**GRID, "methods": ["none"], "seeds": np.arange(3)})
+    assert [trial.seed for trial in grid.trials()] == [0, 1, 2]
+
+
 def test_a_trial_that_fails_raises_with_its_traceback(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "broken_room.py").write_text(
         OWN_TASK.replace('"cost": 1.0', '"cost": 1.0 / max(0, 3 - self.steps)')
@@ -193,6 +203,30 @@ def test_text_that_looks_like_a_number_stays_text(folder: Path) -> None:
     assert list(trial.train_limits) == [math.inf]
 
 
+@pytest.mark.parametrize(
+    "text", ["x\U0001f600", "\\ud83d\\ude00", "a\x7f\x85\u2028\n\t\0", '"\\', "caf\xe9 \U0010ffff"]
+)
+def test_text_of_a_dictionary_arrives_as_it_is(folder: Path, text: str) -> None:
+    (folder / "texts.py").write_text(OWN_TASK.replace("render_mode=None", "**texts"))
+    task = {"name": "texts:make", "options": {text: [text]}, "deploy_limits": 2}
+    *_, trial = recrl.validate({**GRID, "tasks": [task]}, trust=True).trials()
+    assert trial.task.options == {text: [text]}
+
+
+def test_labels_have_any_character_but_half_a_pair(folder: Path) -> None:
+    task = {"name": "two-state", "label": "x\U0001f600", "deploy_limits": 2}
+    *_, trial = recrl.validate({**GRID, "tasks": [task]}).trials()
+    assert trial.task.label == "x\U0001f600"
+    with pytest.raises(recrl.GridError) as error:
+        recrl.validate({**GRID, "tasks": [{**task, "label": "x\ud83d"}]})
+    (problem,) = error.value.problems
+    assert problem.startswith("tasks.0.label: input should be a valid string, ")
+    (folder / "halves.py").write_text(OWN_TASK.replace("render_mode=None", "half"))
+    task = {"name": "halves:make", "options": {"half": "\ud83d"}, "deploy_limits": 2}
+    *_, trial = recrl.validate({**GRID, "tasks": [task]}, trust=True).trials()
+    assert trial.task.options == {"half": "\ud83d"}
+
+
 def test_sweeps_are_loaded_from_a_folder_and_an_export(finished_sweep: SweepStore, tmp_path: Path) -> None:
     sweep = recrl.load_sweep(finished_sweep.folder)
     assert len(sweep.trials) == 36
@@ -224,6 +258,11 @@ def test_a_policy_is_loaded_by_its_row_in_trials(
         recrl.load_policy("one.zip", trial_id)
     with pytest.raises(recrl.RecrlError, match="one: has no trial '3f2a'; "):
         recrl.load_policy(training.sweep, "3f2a")
+    sentence = "^source: must be a sweep, .* got {}; of a training use training.policy or training.sweep$"
+    with pytest.raises(recrl.RecrlError, match=sentence.format("Training")):
+        recrl.load_policy(training)  # type: ignore[arg-type]
+    with pytest.raises(recrl.RecrlError, match=sentence.format("NoneType")):
+        recrl.load_policy(None)  # type: ignore[arg-type]
     assert train().sweep.folder is None
     store = made_up_sweep(
         seeds=2, methods=["none"], tasks=["a"], agents=["cpo"], missing=["a cpo none seed 1"]
@@ -242,7 +281,7 @@ def test_a_policy_acts_on_one_and_on_many_alike(folder: Path) -> None:
     envs = recrl.make("continuous-bandit", 5)
     observations, _ = envs.reset(seed=0)
     many = policy.act(observations, deterministic=True)
-    assert many.shape == envs.action_space.shape
+    assert (many.shape, many.dtype) == (envs.action_space.shape, envs.action_space.dtype)
     np.testing.assert_allclose(policy.act(observations[0], deterministic=True), many[0])
     np.testing.assert_array_equal(training.policy.act(observations, deterministic=True), many)
     first = policy.act(observations)
@@ -291,6 +330,30 @@ def test_files_run_no_code_unless_they_are_trusted(folder: Path, monkeypatch: py
     observation, _ = env.reset(seed=0)
     _, _, _, _, info = env.step(training.policy.act(observation))
     assert info["cost"].tolist() == [1.0]
+
+
+def test_modules_in_the_working_directory_are_found_by_every_call(folder: Path) -> None:
+    """As by the installed command; of a script, Python itself searches only the script's own folder."""
+    for name in ("room_i", "room_ii", "room_iii", "room_iv"):
+        (folder / f"{name}.py").write_text(OWN_TASK)
+    assert str(folder) not in sys.path
+    assert recrl.make("room_i:make").num_envs == 1
+    assert recrl.make_env("room_ii:make").reset(seed=0)[0].shape == (2,)
+    recrl.validate({**GRID, "tasks": [{"name": "room_iii:make", "deploy_limits": 2}]}, trust=True)
+    training = train(task="room_iv:make", folder="room")
+    del sys.modules["room_iv"]
+    assert training.folder is not None
+    assert recrl.load_policy(training.folder, trust=True).act([0.0, 0.0]).shape == (2,)
+    del sys.modules["room_iv"]
+    recrl.load_sweep("room", root=".", trust=True)
+    assert str(folder) not in sys.path
+
+
+def test_a_deleted_working_directory_does_not_matter(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "gone").mkdir()
+    monkeypatch.chdir(folder / "gone")
+    (folder / "gone").rmdir()
+    assert recrl.make("two-state").num_envs == 1
 
 
 def test_tasks_say_what_is_wrong() -> None:
@@ -352,6 +415,24 @@ def test_a_launch_refuses_what_it_would_ignore(folder: Path, options: Any, sente
         recrl.launch(GRID, **options)
     assert str(error.value) == sentence
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("place", "sentence"),
+    [
+        ("a.txt", "a.txt: File exists; saved results are kept"),
+        ("a.txt/below", "a.txt/below: Not a directory; saved results are kept"),
+        ("/proc/x/y", "/proc/x: No such file or directory; saved results are kept"),
+        ("x" * 300 + "/y", ": File name too long; saved results are kept"),
+    ],
+)
+def test_a_place_that_cannot_be_used_is_a_sentence(folder: Path, place: str, sentence: str) -> None:
+    (folder / "a.txt").touch()
+    with pytest.raises(recrl.RecrlError) as error:
+        train(folder=place)
+    assert str(error.value).endswith(sentence)
+    with pytest.raises(recrl.RecrlError, match=r"; saved results are kept$"):
+        recrl.launch(GRID, root=place, executor="inline", mlflow=False, figures=False, progress=False)
 
 
 def test_only_an_address_takes_the_name_of_a_sweep(finished_sweep: SweepStore) -> None:
