@@ -93,7 +93,9 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
         f"{store.name}: {number_of_trials(trials)} checked, {len(problems) or 'no'} wrong "
         f"file{'' if len(problems) == 1 else 's'}",
     )
-    if problems:
+    if problems and store.storage_path.exists():
+        say(console, "the folder is only a local copy: delete it, and it is fetched again")
+    elif problems:
         say(
             console, "launch continues damaged trials from their intact files; complete ones: --rerun-damaged"
         )

@@ -130,7 +130,9 @@ def test_a_sweep_in_an_object_store_is_the_sweep_of_a_folder(tmp_path: Path, loc
     assert not [key for key in one.storage.objects.keys_in() if "probe" in key or "launch" in key]
 
 
-def test_a_damaged_local_copy_says_that_it_is_one(tmp_path: Path, local: SweepStore) -> None:
+def test_a_damaged_local_copy_says_that_it_is_one(
+    tmp_path: Path, local: SweepStore, capsys: pytest.CaptureFixture[str]
+) -> None:
     one = machine(tmp_path, "one")
     one.launch()
     other = machine(tmp_path, "other")
@@ -143,6 +145,10 @@ def test_a_damaged_local_copy_says_that_it_is_one(tmp_path: Path, local: SweepSt
         f"episodes.csv has {len(whole) - 1:,} of its {len(whole):,} committed bytes; the sweep's folder is "
         "only a local copy: delete it, and it is fetched again"
     )
+    trial.episodes_path.write_bytes(bytes(len(whole)))  # of the right length, so it is not fetched again
+    assert main(["check", str(other.store.folder)]) == ExitCode.TRIALS_FAILED
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said == "the folder is only a local copy: delete it, and it is fetched again"
     shutil.rmtree(other.store.folder)
     again = machine(tmp_path, "other")
     again.storage.mark()
