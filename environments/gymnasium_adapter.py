@@ -37,7 +37,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
-from recrl.environments.gymnasium_spaces import float32_vectors, integers_lie_in, supported_actions
+from recrl.environments.gymnasium_spaces import float32_vectors, integer_check, supported_actions
 from recrl.environments.saved_state import SavedState
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
 
@@ -78,6 +78,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         self._flatten = functools.partial(
             spaces.flatten.dispatch(type(first.observation_space)), first.observation_space
         )
+        self._integers_lie_in = integer_check(first.observation_space)
         self.single_observation_space = float32_vectors(name, first.observation_space)
         self.single_action_space = supported_actions(name, first.action_space)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -269,7 +270,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         cause: Exception | None = None
         try:
             # NumPy would convert None to NaN.
-            if observation is not None and integers_lie_in(self._raw_observation_space, observation):
+            if observation is not None and (not self._integers_lie_in or self._integers_lie_in(observation)):
                 flat = np.asarray(self._flatten(observation), np.float32)
                 if flat.shape == self.single_observation_space.shape:
                     return flat

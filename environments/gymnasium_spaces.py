@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,29 +23,29 @@ def float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:
     return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
 
 
-def integers_lie_in(space: spaces.Space[Any], observation: Any) -> bool:
-    """Whether an observation's integers lie in its space; flattening would change others without a word.
+IntegerCheck = Callable[[Any], bool]
 
-    Numbers of floating-point boxes are not looked at.
 
-    Raises:
-        AttributeError, IndexError, KeyError, TypeError, ValueError: the observation has another form.
+def integer_check(space: spaces.Space[Any]) -> IntegerCheck | None:
+    """Return a test whether an observation's integers lie in their space; None if it has no integers.
+
+    Flattening would change others without a word. The test raises AttributeError, IndexError, KeyError,
+    TypeError or ValueError if the observation has another form.
     """
-    if isinstance(space, spaces.Dict):
-        return all(integers_lie_in(part, observation[key]) for key, part in space.spaces.items())
-    if isinstance(space, spaces.Tuple):
-        return all(map(integers_lie_in, space.spaces, observation))
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = dict(space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces))
+        checks = {key: check for key, part in parts.items() if (check := integer_check(part))}
+        return functools.partial(_parts_lie_in, checks) if checks else None
     if isinstance(space, spaces.OneOf):
-        index, chosen = observation
-        return 0 <= index < len(space.spaces) and integers_lie_in(space.spaces[index], chosen)
+        return functools.partial(_chosen_lies_in, tuple(map(integer_check, space.spaces)))
+    if isinstance(space, spaces.Discrete):
+        return functools.partial(_lies_in, int(space.start), int(space.start + space.n - 1))
     bounds = _integer_bounds(space)
-    return bounds is None or _are_integers(observation, *bounds)
+    return functools.partial(_lie_in, *map(np.ravel, bounds)) if bounds else None
 
 
 def _integer_bounds(space: spaces.Space[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
-    """Return the least and the largest value of each integer; None for other spaces."""
-    if isinstance(space, spaces.Discrete):
-        return space.start, space.start + space.n - 1
+    """Return the least and the largest value of each integer of an array; None for other spaces."""
     if isinstance(space, spaces.MultiDiscrete):
         return space.start, space.start + space.nvec - 1
     if isinstance(space, spaces.MultiBinary):
@@ -53,10 +55,29 @@ def _integer_bounds(space: spaces.Space[Any]) -> tuple[npt.NDArray[Any], npt.NDA
     return None
 
 
-def _are_integers(values: Any, low: npt.NDArray[Any], high: npt.NDArray[Any]) -> bool:
-    """Whether values are whole numbers within bounds, whatever their type."""
-    flat, least, largest = np.ravel(values), np.ravel(low), np.ravel(high)
-    if flat.shape != least.shape or not ((least <= flat) & (flat <= largest)).all():
+def _parts_lie_in(checks: Mapping[Any, IntegerCheck], observation: Any) -> bool:
+    return all(check(observation[key]) for key, check in checks.items())
+
+
+def _chosen_lies_in(checks: Sequence[IntegerCheck | None], observation: Any) -> bool:
+    index, chosen = observation
+    if not 0 <= index < len(checks):
+        return False
+    check = checks[index]
+    return check is None or check(chosen)
+
+
+def _lies_in(low: int, high: int, value: Any) -> bool:
+    """Whether one number is whole and within bounds, whatever its type."""
+    if isinstance(value, int | np.integer):
+        return bool(low <= value <= high)
+    return _lie_in(np.array([low]), np.array([high]), value)
+
+
+def _lie_in(low: npt.NDArray[Any], high: npt.NDArray[Any], values: Any) -> bool:
+    """Whether numbers are whole and within bounds, whatever their type."""
+    flat = np.ravel(values)
+    if flat.shape != low.shape or not ((low <= flat) & (flat <= high)).all():
         return False
     return flat.dtype.kind in "biu" or bool((flat == np.floor(flat)).all())
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import gymnasium
@@ -23,6 +23,8 @@ from recrl.environments.gymnasium_adapter import (
 )
 from recrl.environments.options import Options
 from recrl.environments.plugins import check_keywords, import_module, require_trust
+
+logger = logging.getLogger("recrl.environments")
 
 
 class GymnasiumOptions(Options):
@@ -111,11 +113,18 @@ def draw_from_callable(factory: Callable[..., Environment], name: str, options: 
 
 
 def _rendering(make: Callable[..., Environment], keywords: dict[str, Any]) -> Environment:
-    """Make an environment with rendering; where it refuses ``render_mode`` in whatever way, without."""
-    if "render_mode" not in keywords:
-        with suppress(Exception):
-            return make(**keywords, render_mode="rgb_array")
-    return make(**keywords)
+    """Make an environment with rendering; where it refuses ``render_mode`` in whatever way, without.
+
+    The reason is logged. It may be a missing library.
+    """
+    if "render_mode" in keywords:
+        return make(**keywords)
+    try:
+        return make(**keywords, render_mode="rgb_array")
+    except Exception as error:  # environments refuse in different ways
+        environment = make(**keywords)
+        logger.warning("%s does not render RGB: %s: %s", environment, type(error).__name__, error)
+        return environment
 
 
 class FlatObservations(gymnasium.ObservationWrapper[Any, Any, Any]):

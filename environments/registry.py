@@ -211,6 +211,8 @@ def make_vector(name: str, num_envs: int, *, options: Mapping[str, Any] | None =
 def make_drawn(name: str, *, options: Mapping[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
     """Make one rendering environment of a task: ``render()`` returns uint8 [height, width, 3].
 
+    A user's environment that does not render RGB is made without, and ``render()`` returns what it likes.
+
     Raises:
         NotDrawnError: the task cannot be rendered.
     """

@@ -61,7 +61,7 @@ def projected_step(problem: StepProblem) -> DualSolution:
     case = StepCase.CONSTRAINED if weights.any() else StepCase.UNCONSTRAINED
     if recovered:
         case = StepCase.RECOVERY
-    multipliers = weights / reach if reach > 0.0 else np.full_like(weights, np.nan)
+    multipliers = weights / reach if reach > 0.0 and not recovered else np.full_like(weights, np.nan)
     return DualSolution(case, scale * reach, scale * weights, multipliers, recovered)
 
 

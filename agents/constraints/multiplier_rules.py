@@ -3,7 +3,8 @@
 A constrained learner maximises J_r - sum_i lambda_i (J_i - d_i) over the policy and minimises it over
 lambda >= 0. A rule takes the *gaps* J_i - d_i (mean undiscounted episode cost minus limit, positive where
 the constraint is violated) and returns the next state. A dimension with an infinite limit is no constraint:
-its multiplier is 0 and the rest of its state does not change.
+its state does not change, and its multiplier is 0 (of ``projected_ascent`` it is the state, which stays;
+``multipliers.Multipliers`` takes it for 0).
 
 A state is a dict of float64 arrays [k], which a checkpoint stores directly; each has the key ``multipliers``.
 Notation: k costs.

@@ -103,7 +103,7 @@ class DualSolution:
 
     Attributes:
         case: the solved case.
-        gradient_weight: of v; 1 / lam, or 0 in recovery.
+        gradient_weight: of v; 1 / lam, or 0 in CPO's recovery.
         constraint_weights: of the w_i, [k]; nu_i / lam.
         multipliers: nu, [k], at least 0; NaN where lam is infinite and in recovery.
         recovered: the violated constraints that recovery decreases; none in the other cases.

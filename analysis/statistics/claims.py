@@ -210,9 +210,9 @@ def _text(claim: Claim | Comparison, trials: pd.DataFrame) -> str:
 
 def _held(final: pd.DataFrame, deployed: pd.DataFrame, trials: pd.DataFrame, claim: Claim) -> dict[str, Any]:
     nothing = _ends(Interval(math.nan, math.nan, math.nan, 0, True))
-    failed = _failed_seeds(trials)
     methods = trials.groupby("seed")["method"].nunique()
     whole = methods.index[methods == trials["method"].nunique()]
+    failed = _failed_seeds(trials) & set(whole)
     final, deployed = (rows[rows["seed"].isin(whole)] for rows in (final, deployed))
     held, beside = (_of_all(rows, claim, trials) for rows in (final, deployed))
     counted = _counted(held, beside, failed=len(failed))

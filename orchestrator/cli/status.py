@@ -94,12 +94,21 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
         f"file{'' if len(problems) == 1 else 's'}",
     )
     if problems and store.storage_path.exists():
-        say(console, "the folder is only a local copy: delete it, and it is fetched again")
+        if not any(map(_is_lost, store.trials())):
+            say(console, "the folder is only a local copy: delete it, and it is fetched again")
     elif problems:
         say(
             console, "launch continues damaged trials from their intact files; complete ones: --rerun-damaged"
         )
     return ExitCode.TRIALS_FAILED if problems else ExitCode.OK
+
+
+def _is_lost(trial: TrialStore) -> bool:
+    """Whether the object store has nothing of a trial that can be used, so that its copy must be kept."""
+    try:
+        return trial.stated().status is TrialState.DAMAGED
+    except StorageError:
+        return False
 
 
 def _listed(store: SweepStore) -> list[TrialSpec]:

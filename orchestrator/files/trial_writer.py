@@ -97,10 +97,14 @@ class TrialWriter:
         return tree["trial"] if tree else None
 
     def _rows_before(self, path: Path) -> int:
-        """Return the bytes of rows that must not be lost: the committed ones, or all if that is not known."""
-        if path.name in self.record.committed:
-            return self.record.committed[path.name]
-        return path.stat().st_size if path.exists() else 0
+        """Return the bytes of rows that must not be lost: the committed ones, or all if the record was lost.
+
+        A damaged file that the record named has been copied aside already.
+        """
+        is_lost = not any(file.path.name in self.record.committed for file in self._rows)
+        if is_lost and path.exists():
+            return path.stat().st_size
+        return self.record.committed.get(path.name, 0)
 
     def _newest_usable(self) -> dict[str, Any] | None:
         """Return the newest usable checkpoint; unusable ones are renamed."""

@@ -60,6 +60,14 @@ def _numbers(agent: str, method: str, kind: str, values: object) -> Mapping[str,
                 f"agent {agent}: the name of a {kind} must consist of letters, digits and _, and not begin "
                 f"with a digit, got {name!r}"
             )
-        if not isinstance(value, int | float | np.number) or math.isinf(value):
+        if not _is_number(value):
             raise RowError(f"agent {agent}: {kind} {name} must be a finite number or NaN, got {value!r}")
     return values
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value is a real number that is finite as a float, or NaN."""
+    try:
+        return isinstance(value, int | float | np.integer | np.floating) and not math.isinf(value)
+    except OverflowError:
+        return False

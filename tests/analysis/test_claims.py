@@ -83,6 +83,8 @@ def test_a_seed_without_one_of_the_curricula_is_not_counted() -> None:
     rows = [outcome("rivergrid-1b", "linear", 9.5, 5.0, seed) for seed in range(5)]
     rows.append(outcome("rivergrid-1b", "cosine", 9.5, 5.0, 0))
     assert held(*rows) == {"every static curriculum violates d_d on 1b (here: linear, cosine)": (1, 1)}
+    failed = pd.DataFrame([outcome("rivergrid-1b", "linear", 9.5, 5.0, 7)])
+    assert counted(pd.DataFrame(rows), failed=failed)["seeds"].tolist() == [1]
 
 
 def test_three_curricula_of_a_seed_are_one_seed() -> None:
@@ -92,7 +94,8 @@ def test_three_curricula_of_a_seed_are_one_seed() -> None:
     assert list(weighed[["held", "seeds"]].iloc[0]) == [3, 3]
     assert claims_table(weighed)["holds in"].item() == "3 of 3"  # too few for an interval
     pending = pd.DataFrame([outcome("rivergrid-1b", "cosine", 0.0, 0.0, 3)]).assign(status="running")
-    outcomes = pd.DataFrame([*rows, outcome("rivergrid-1b", "linear", 9.5, 5.0, 3)])
+    more = [outcome("rivergrid-1b", method, 9.5, 5.0, 3) for method in ("linear", "exponential")]
+    outcomes = pd.DataFrame([*rows, *more])
     trials = pd.concat([outcomes.assign(status="complete"), pending])
     weighed = claims.count_claims(outcomes.assign(feasible=False), NO_TRAINING, trials)
     assert list(weighed[["held", "seeds", "failed"]].iloc[0]) == [3, 3, 0]  # seed 3 may still be either

@@ -33,6 +33,8 @@ def test_what_noise_changed_is_written_as_json() -> None:
     [
         (None, "agent own: add_noise must return a mapping of numbers, got None"),
         ({"scale": "large"}, "agent own: number scale must be a finite number or NaN, got 'large'"),
+        ({"scale": np.complex64(1j)}, "agent own: number scale must be a finite number or NaN, got "),
+        ({"scale": 10**400}, "agent own: number scale must be a finite number or NaN, got 1000"),
         ({"scale": math.nan}, "agent own: number scale of add_noise must be finite, got nan"),
         ({"update": 3}, "agent own: add_noise must not name update; the event has these keys"),
         (
