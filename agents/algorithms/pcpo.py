@@ -58,11 +58,12 @@ def projected_step(problem: StepProblem) -> DualSolution:
         + float(weights @ problem.gram @ weights)
     )
     scale = min(1.0, float(np.sqrt(2.0 * problem.radius / max(length, NO_INFLUENCE))))
-    case = StepCase.CONSTRAINED if weights.any() else StepCase.UNCONSTRAINED
+    unknown = np.full_like(weights, np.nan)
     if recovered:
-        case = StepCase.RECOVERY
-    multipliers = weights / reach if reach > 0.0 and not recovered else np.full_like(weights, np.nan)
-    return DualSolution(case, scale * reach, scale * weights, multipliers, recovered)
+        return DualSolution(StepCase.RECOVERY, scale * reach, scale * weights, unknown, recovered)
+    case = StepCase.CONSTRAINED if weights.any() else StepCase.UNCONSTRAINED
+    multipliers = weights / reach if reach > 0.0 else unknown
+    return DualSolution(case, scale * reach, scale * weights, multipliers, ())
 
 
 def make_pcpo(cmdp: CMDPSpec, config: PCPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

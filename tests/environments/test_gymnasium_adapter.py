@@ -369,7 +369,7 @@ def test_what_an_environment_returns_is_looked_at(field: str, value: Any, senten
 
 
 class Observing(Countdown):
-    """Has an observation space, and observes what it is told to."""
+    """Has an observation space, and returns the observation that it was given, in the space or not."""
 
     def __init__(self, space: spaces.Space[Any], observation: Any) -> None:
         super().__init__()
