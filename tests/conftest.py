@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: a trial's sums do not depend on the machine
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -21,6 +22,7 @@ from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
+
 
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0
@@ -210,3 +212,15 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path = Path(f"{store.mlflow_database}{pragma}")
         assert path.exists() == (pragma == "")
     return store.mlflow_database
+
+
+@pytest.fixture(autouse=True)
+def modules_of_one_test(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Forget the modules that a test wrote and imported: another test may write one of the same name."""
+    before = set(sys.modules)
+    yield
+    folder = tmp_path_factory.getbasetemp()
+    for name in set(sys.modules) - before:
+        file = getattr(sys.modules[name], "__file__", None)
+        if file is not None and Path(file).is_relative_to(folder):
+            del sys.modules[name]

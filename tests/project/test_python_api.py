@@ -282,7 +282,8 @@ def test_a_policy_acts_on_one_and_on_many_alike(folder: Path) -> None:
     observations, _ = envs.reset(seed=0)
     many = policy.act(observations, deterministic=True)
     assert (many.shape, many.dtype) == (envs.action_space.shape, envs.action_space.dtype)
-    np.testing.assert_allclose(policy.act(observations[0], deterministic=True), many[0])
+    # float32: a product of one row and of five may be summed in another order
+    np.testing.assert_allclose(policy.act(observations[0], deterministic=True), many[0], rtol=1e-5)
     np.testing.assert_array_equal(training.policy.act(observations, deterministic=True), many)
     first = policy.act(observations)
     policy.seed(3)
