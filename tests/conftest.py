@@ -23,7 +23,6 @@ from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
 
-
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0
 # How the made-up agents end: return and cost without a curriculum, and with one.
