@@ -1,11 +1,14 @@
-"""What agents earn and cost above a control: Student's intervals for two independent groups, corrected tests.
+"""What agents earn and cost above a control: Student's intervals, corrected tests.
 
     cd results/safety-gym
     python ../../tests/benchmarks/differences.py margin.csv --control agents.csv
+    python ../../tests/benchmarks/differences.py curricula-today.csv --against none
 
-Tables are those of ``final_policies.py``. Each group is the seeds of one agent on one task; a task without a
-control is left out. The p values are corrected for all rows that are printed, by Holm's method. With one
-agent a task the last line averages the tasks' differences, with the variance within groups pooled.
+Tables are those of ``final_policies.py``. With ``--control`` each group is the seeds of one agent on one
+task, and the groups are independent; a task without a control is left out. With one agent a task the last
+line averages the tasks' differences, with the variance within groups pooled. With ``--against`` the control
+is that curriculum in the same tables, and trials are paired by seed. The p values are corrected for all rows
+that are printed, by Holm's method.
 """
 
 from __future__ import annotations
@@ -60,6 +63,22 @@ def differences(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> pd.Da
     return table.assign(p_holm=holm(table["p"].to_numpy()))
 
 
+def paired_differences(rows: pd.DataFrame, baseline: str, column: str) -> pd.DataFrame:
+    """A row a task, agent and curriculum: it minus the baseline, over the seeds that have both."""
+    wide = rows.pivot(index=["task", "agent", "seed"], columns="method", values=column)
+    found = []
+    for method in wide.columns.drop(baseline):
+        pairs = wide[[method, baseline]].dropna()
+        for (task, agent), pair in pairs.groupby(level=["task", "agent"]):
+            test = stats.ttest_rel(pair[method], pair[baseline])
+            low, high = test.confidence_interval(CONFIDENCE)
+            mean = float((pair[method] - pair[baseline]).mean())
+            found.append((task, agent, method, len(pair), mean, low, high, float(test.pvalue)))
+    table = pd.DataFrame(found, columns=["task", "agent", "method", "n", column, "low", "high", "p"])
+    table = table.sort_values(["task", "agent", "method"])
+    return table.assign(p_holm=holm(table["p"].to_numpy()))
+
+
 def average(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> str:
     """The mean of the tasks' differences; the tasks are fixed, the seeds random."""
     pairs = [
@@ -80,10 +99,18 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("tables", type=Path, nargs="+")
-    parser.add_argument("--control", type=Path, nargs="+", required=True)
+    control_options = parser.add_mutually_exclusive_group(required=True)
+    control_options.add_argument("--control", type=Path, nargs="+")
+    control_options.add_argument("--against", metavar="CURRICULUM")
     parser.add_argument("--policy", default="stochastic")
     arguments = parser.parse_args()
-    rows, control = read(arguments.tables, arguments.policy), read(arguments.control, arguments.policy)
+    rows = read(arguments.tables, arguments.policy)
+    if arguments.against is not None:
+        for column in ("return", "cost"):
+            print(f"{column}: paired difference, 95% interval, p, p corrected for all rows")
+            print(paired_differences(rows, arguments.against, column).round(3).to_string(index=False))
+        return
+    control = read(arguments.control, arguments.policy)
     rows = rows[rows["task"].isin(control["task"])]
     one_agent = bool((rows.groupby("task")["agent"].nunique() == 1).all())
     for column in ("return", "cost"):
