@@ -107,10 +107,6 @@ class ActorCritic:
         """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
         return self._behaviour.act(observations, generator)
 
-    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """Return the cumulative masses for ``act`` at B observations [B, n], float64 [B, A]."""
-        return self._behaviour.cumulative_masses(observations)
-
     def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         return self._behaviour.act_greedily(observations)

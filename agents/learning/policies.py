@@ -134,21 +134,11 @@ class StochasticPolicy:
             spread = np.exp(self._acting_log_std)
             outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
             return outputs
-        cumulative = _cumulative(outputs)
+        cumulative = np.exp(outputs - outputs.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
         thresholds = generator.random(len(outputs)) * cumulative[:, -1]
         # A threshold may round up to the whole mass: then the last action is taken.
         actions: npt.NDArray[np.int64] = (cumulative[:, :-1] <= thresholds[:, None]).sum(axis=1)
         return actions
-
-    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """Return the cumulative, unnormalised masses for ``sample`` at B observations, float64 [B, A].
-
-        Raises:
-            ValueError: actions are continuous.
-        """
-        if not self.is_categorical:
-            raise ValueError("continuous actions have densities, not probabilities")
-        return _cumulative(self.outputs(observations))
 
     def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """Return the most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
@@ -293,12 +283,6 @@ class _Latest:
     def is_of(self, rows: Tensor, parameters: Tensor) -> bool:
         """Whether the result is that of these rows, if unchanged, and parameters."""
         return self.rows() is rows and torch.equal(self.parameters, parameters)
-
-
-def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:
-    """Return the cumulative sums of the unnormalised softmax of logits [B, A]."""
-    masses: Floats = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
-    return masses
 
 
 @dataclass(frozen=True, eq=False)
