@@ -18,7 +18,6 @@
     claims.csv                  the paper's claims about the grid's tasks, counted, if there are any
     bounds.csv                  the cumulative cost against Proposition 1, one row per trial and cost
     outcomes.tex                the first tables for LaTeX (booktabs)
-    outcomes.parquet            outcomes.csv with its types, for programs
 
 For a running sweep, ``sketch`` draws only SKETCHED, as PNGs, and all tables and pages. This takes a
 fraction of the time, and leaves the cores to the trials.

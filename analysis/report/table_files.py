@@ -135,7 +135,6 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     written += [
         table_formats.write_csv(judged, folder / "verdicts.csv"),
         table_formats.write_csv(rows, folder / OUTCOMES),
-        table_formats.write_parquet(rows, folder / "outcomes.parquet"),
         table_formats.write_csv(whole, folder / "summary.csv"),
         table_formats.write_csv(compared, folder / "comparisons.csv"),
         table_formats.write_text("\n".join(latex), folder / "outcomes.tex"),
