@@ -1,4 +1,4 @@
-"""Stochastic policies: a tanh network with a categorical or a diagonal Gaussian head.
+"""Stochastic policies: a network with a categorical or a diagonal Gaussian head.
 
 Acting uses NumPy, on a CPU on the parameters' own memory: at 16 observations PyTorch's overhead exceeds the
 arithmetic. Learning uses PyTorch, also for the old policy's probabilities at the start of an update. So the
@@ -290,7 +290,7 @@ class PolicyEvaluation:
     """Evaluation of a policy at some rows; valid until its parameters change or it is evaluated again.
 
     PyTorch differentiates from a loss to the network's outputs, so an agent may use any loss of the
-    distribution. ``TanhStack`` differentiates the network.
+    distribution. The network itself is differentiated by its stack.
 
     Attributes:
         policy: the evaluated policy.
