@@ -32,14 +32,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from recrl.teachers.static import Decay, cosine, exponential, hold, limit_at, linear
+from recrl.teachers.static import Decay, constant, cosine, exponential, limit_at, linear
 
 # The curricula with a bound known in advance. The limits of ``dynamic`` are unknown, but at most d_t like
 # those of ``step``.
 DECAYS: dict[str, Decay] = {
     "none": lambda p, train_limit, deploy_limit: deploy_limit,
-    "step": hold,
-    "dynamic": hold,
+    "step": constant,
+    "dynamic": constant,
     "linear": linear,
     "cosine": cosine,
     "exponential": exponential,
