@@ -87,23 +87,6 @@ class DiscretePolicy(Protocol):
 
 
 @runtime_checkable
-class InvertedPolicy(Policy, Protocol):
-    """A policy that samples one of A actions by inversion; optional for agents.
-
-    With it, a finite CMDP is stepped from a table of the policy, not observation by observation. The results
-    are equal.
-    """
-
-    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """Return cumulative, unnormalised action probabilities at B observations [B, n], float64 [B, A].
-
-        ``act`` draws B numbers u by ``generator.random(B)``. It takes the first action whose cumulative mass
-        exceeds u times the total.
-        """
-        ...
-
-
-@runtime_checkable
 class EntropyRewarded(Protocol):
     """An agent whose ``update`` uses ``CurriculumStep.entropy_coefficient``; optional for agents.
 

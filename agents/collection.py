@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recrl.agents.agent import InvertedPolicy, Policy, Rollout
+from recrl.agents.agent import Policy, Rollout
 from recrl.agents.spaces import environment_actions, observation_rows, observation_size
-from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.vector import CMDPVectorEnv
 
 
@@ -95,17 +94,7 @@ class Collector:
         self._stagger()
         if self._observations is None:
             raise RuntimeError("a collector must be reset or restored before it collects")
-        environments = self._environments
-        if (
-            isinstance(environments, FiniteVectorEnv)
-            and environments.follows_tables
-            and isinstance(policy, InvertedPolicy)
-            # With more states than samples, the table would take longer than the rollout.
-            and environments.finite_cmdp().num_states <= self._num_steps * environments.num_envs
-        ):
-            rollout = self._collect_by_table(environments, policy, generator)
-        else:
-            rollout = self._collect_by_observation(self._observations, policy, generator)
+        rollout = self._take_steps(self._observations, policy, generator)
         self._observations = rollout.last_observations
         self._rollouts += 1
         return rollout, self._finished(rollout)
@@ -128,10 +117,10 @@ class Collector:
         self._returns[index] = 0.0
         self._costs[index] = 0.0
 
-    def _collect_by_observation(
+    def _take_steps(
         self, current: npt.NDArray[np.float32], policy: Policy, generator: np.random.Generator
     ) -> Rollout:
-        """Call the policy at each observation [B, n], beginning with the current ones."""
+        """Take T steps in each environment from the current observations, [B, n]."""
         environments, cmdp = self._environments, self._environments.cmdp
         shape = (self._num_steps, environments.num_envs)
         observations = np.empty((*shape, observation_size(cmdp.observation_space)), dtype=np.float32)
@@ -166,26 +155,6 @@ class Collector:
             truncated=truncated,
             final_observations=np.concatenate([observations[0, :0], *final_observations]),
             last_observations=current,
-            carried_costs=self._costs.copy(),
-            carried_lengths=self._lengths.copy(),
-        )
-
-    def _collect_by_table(
-        self, environments: FiniteVectorEnv, policy: InvertedPolicy, generator: np.random.Generator
-    ) -> Rollout:
-        """Call the policy once for every state; the results are the same, and it is many times as fast."""
-        observations = environments.observations
-        draws = generator.random((self._num_steps, environments.num_envs))
-        steps = environments.follow(policy.cumulative_masses(observations), draws)
-        return Rollout(
-            observations=observations[steps.states],
-            actions=steps.actions,
-            rewards=steps.rewards,
-            costs=steps.costs,
-            terminated=steps.terminated,
-            truncated=steps.truncated,
-            final_observations=observations[steps.successors[steps.truncated]],
-            last_observations=observations[environments.states],
             carried_costs=self._costs.copy(),
             carried_lengths=self._lengths.copy(),
         )

@@ -104,9 +104,9 @@ class Experience:
         log_probs = old.log_prob(batch.actions, batch.pair_observations)
         return cls(batch, old, log_probs, advantages, constraints)
 
-    def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
-        """Yield the minibatches of ``LearningBatch.parts``; the experience itself if there is one."""
-        for part in self.batch.parts(size, generator):
+    def minibatches(self, size: int | None, generator: np.random.Generator) -> Iterator[Experience]:
+        """Yield the minibatches of ``LearningBatch.minibatches``; the experience itself if there is one."""
+        for part in self.batch.minibatches(size, generator):
             if part.samples is None:
                 yield self
                 continue

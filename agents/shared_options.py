@@ -13,13 +13,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from recrl.environments.options import Options
+from recrl.environments.plugins import IMPORT_PATH
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Width = Annotated[int, Field(ge=1, le=4096)]
-IMPORT_PATH = r"^[A-Za-z_][\w.]*:[A-Za-z_][\w.]*$"
 
 STARTER_AGENTS_SETTING: Mapping[str, Any] = {
     "hidden_sizes": (256, 256),
@@ -91,7 +91,7 @@ class ActorCriticConfig(Options):
         default="tanh",
         description="Activation between the layers (paper tanh). tanh is the fastest.",
     )
-    network: Annotated[str, Field(pattern=IMPORT_PATH)] | None = Field(
+    network: Annotated[str, Field(pattern=f"^{IMPORT_PATH.pattern}$")] | None = Field(
         default=None,
         description="Import path package.module:function of your own network. The function takes "
         "the numbers of inputs and outputs and returns a torch.nn.Module from [U, "

@@ -20,7 +20,9 @@ def float32_vectors(name: str, space: spaces.Space[Any]) -> spaces.Box:
     flat = spaces.flatten_space(space)
     if not isinstance(flat, spaces.Box):
         raise ValueError(f"{name}: observations of {space} cannot be flattened to vectors")
-    return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+    with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
+        low, high = flat.low.astype(np.float32), flat.high.astype(np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 IntegerCheck = Callable[[Any], bool]

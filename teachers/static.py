@@ -59,7 +59,7 @@ def exponential(p: float, train_limit: float, deploy_limit: float) -> float:
     )
 
 
-def hold(p: float, train_limit: float, deploy_limit: float) -> float:
+def constant(p: float, train_limit: float, deploy_limit: float) -> float:
     """No decay: d = d_t."""
     return train_limit
 
@@ -167,12 +167,12 @@ def decay_teacher(spec: TeacherSpec, *, decay: Decay) -> StaticTeacher:
 
 def none_teacher(spec: TeacherSpec) -> StaticTeacher:
     """No curriculum: d_d from the start."""
-    return StaticTeacher(replace(spec, train_limits=spec.deploy_limits), decay=hold, start_fraction=0.0)
+    return StaticTeacher(replace(spec, train_limits=spec.deploy_limits), decay=constant, start_fraction=0.0)
 
 
 def step_teacher(spec: TeacherSpec) -> StaticTeacher:
     """A control: d_t until B, then d_d at once."""
-    return StaticTeacher(spec, decay=hold, start_fraction=0.0)
+    return StaticTeacher(spec, decay=constant, start_fraction=0.0)
 
 
 def unconstrained_teacher(spec: TeacherSpec) -> StaticTeacher:
@@ -182,4 +182,4 @@ def unconstrained_teacher(spec: TeacherSpec) -> StaticTeacher:
     shows return and cost of the unconstrained agent.
     """
     unlimited = CostLimits.unlimited(len(spec.train_limits))
-    return StaticTeacher(replace(spec, train_limits=unlimited), decay=hold, start_fraction=0.0)
+    return StaticTeacher(replace(spec, train_limits=unlimited), decay=constant, start_fraction=0.0)

@@ -12,9 +12,8 @@ steps / B in [0, 1] the progress, k the number of costs.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats
@@ -36,18 +35,6 @@ class ProgressReport:
     update: int
     env_steps: int
     episodes: tuple[EpisodeStats, ...]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by columns: a report of 500 episodes takes a quarter of the time and of the bytes."""
-        columns = tuple(zip(*map(_episode_row, self.episodes), strict=True))
-        return _report_of_columns, (self.update, self.env_steps, columns)
-
-
-_episode_row = operator.attrgetter(*(field.name for field in fields(EpisodeStats)))
-
-
-def _report_of_columns(update: int, env_steps: int, columns: tuple[Any, ...]) -> ProgressReport:
-    return ProgressReport(update, env_steps, tuple(map(EpisodeStats, *columns)) if columns else ())
 
 
 @dataclass(frozen=True)

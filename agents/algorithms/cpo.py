@@ -28,7 +28,7 @@ from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import each_by_its_spread
+from recrl.agents.learning.advantages import standardised_advantages
 from recrl.agents.learning.distributions import Distribution, mean_divergence
 from recrl.agents.learning.learning_batch import to_tensor
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
@@ -154,6 +154,24 @@ def acceptance(
     return is_acceptable
 
 
+def improvement(model: LocalModel, lowered: int | None, target_kl: float) -> Callable[[], bool]:
+    """Return the line search's test of a step on one surrogate: it is not worse, and the KL is within delta.
+
+    Args:
+        model: gives surrogates and KL.
+        lowered: the cost whose surrogate must not rise; None for the reward's, which must not fall.
+        target_kl: delta.
+    """
+    before = model.start()
+
+    def is_acceptable() -> bool:
+        now, divergence = model.measure()
+        improved = now[0] >= before[0] if lowered is None else now[1 + lowered] <= before[1 + lowered]
+        return bool(improved) and divergence <= target_kl
+
+    return is_acceptable
+
+
 class ConstrainedPolicyOptimisation:
     """The rule of ``cpo`` and ``pcpo``; a ``recrl.agents.learning.policy_rule.PolicyRule``.
 
@@ -191,7 +209,7 @@ class ConstrainedPolicyOptimisation:
                 **indexed("multiplier", multipliers),
                 **indexed("violation_integral", multipliers),
             }
-        advantages, spreads = each_by_its_spread(experience.advantages)
+        advantages, spreads = standardised_advantages(experience.advantages)
         model = LocalModel(policy, experience, advantages)
         active = ActiveConstraints.of(integral.corrected(constraints)).divided_by(spreads[1:])
         metric = model.metric(config, generator)

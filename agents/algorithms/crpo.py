@@ -31,15 +31,13 @@ Notation: N samples, k costs, of which j have a finite limit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from recrl.agents.algorithms.cpo import LocalModel, linearise, to_parameter_step
+from recrl.agents.algorithms.cpo import LocalModel, improvement, linearise, to_parameter_step
 from recrl.agents.algorithms.own_options import CRPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import each_by_its_spread
+from recrl.agents.learning.advantages import standardised_advantages
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.trust_region.cpo_dual import (
@@ -100,8 +98,7 @@ def reward_step(problem: StepProblem, config: CRPOConfig) -> DualSolution:
 def overshoot(problem: StepProblem, config: CRPOConfig) -> float:
     """Return beta, the length in units of v by which a step goes beyond a limit; needs a ``kl_penalty``."""
     squared = max(problem.squared_gradient, NO_INFLUENCE)
-    reach = np.sqrt(2.0 * problem.radius * np.diag(problem.gram))
-    at_hand = np.flatnonzero(-problem.violations <= reach)
+    at_hand = np.flatnonzero(-problem.violations <= problem.reach)
     rises = -problem.mixed[at_hand]
     weights = projection_weights(problem.gram[np.ix_(at_hand, at_hand)], rises)
     taken = 0.0 if weights is None else float(rises @ weights)
@@ -124,7 +121,7 @@ class ConstraintRectifiedPolicyOptimisation:
         if not constraints.known:
             stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
             return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
-        advantages, spreads = each_by_its_spread(experience.advantages)
+        advantages, spreads = standardised_advantages(experience.advantages)
         corrected = most_violated(constraints.gaps, spreads[1:], config.tolerance)
         active = ActiveConstraints.of(constraints).divided_by(spreads[1:])
         model = LocalModel(policy, experience, advantages)
@@ -138,18 +135,6 @@ class ConstraintRectifiedPolicyOptimisation:
         is_acceptable = improvement(model, corrected, config.target_kl)
         metrics = line_search(policy, to_parameter_step(solution, solved), is_acceptable, config)
         return {**metrics, **indexed("multiplier", multipliers)}
-
-
-def improvement(model: LocalModel, corrected: int | None, target_kl: float) -> Callable[[], bool]:
-    """Return the line search's test: KL within delta, reward not lower or cost not higher."""
-    before = model.start()
-
-    def is_acceptable() -> bool:
-        now, divergence = model.measure()
-        improved = now[0] >= before[0] if corrected is None else now[1 + corrected] <= before[1 + corrected]
-        return bool(improved) and divergence <= target_kl
-
-    return is_acceptable
 
 
 def make_crpo(cmdp: CMDPSpec, config: CRPOConfig, seed: np.random.SeedSequence) -> ActorCritic:

@@ -30,6 +30,7 @@ from recrl.agents.trust_region.cpo_dual import (
     StepCase,
     StepProblem,
     projection_weights,
+    worst_alone,
 )
 from recrl.environments.cmdp import CMDPSpec
 
@@ -46,12 +47,10 @@ def projected_step(problem: StepProblem) -> DualSolution:
     weights = projection_weights(problem.gram, excesses)
     recovered: tuple[int, ...] = ()
     if weights is None:
-        squares = np.diag(problem.gram)
-        usable = np.flatnonzero(squares > NO_INFLUENCE)
-        worst = usable[np.argmax(excesses[usable] / np.sqrt(squares[usable]))]
+        worst = worst_alone(problem.gram, excesses)
         weights = np.zeros_like(excesses)
-        weights[worst] = excesses[worst] / squares[worst]
-        recovered = (int(worst),)
+        weights[worst] = excesses[worst] / problem.gram[worst, worst]
+        recovered = (worst,)
     length = (
         reach**2 * squared
         + 2.0 * reach * float(weights @ problem.mixed)

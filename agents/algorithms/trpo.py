@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from recrl.agents.algorithms.cpo import LocalModel
+from recrl.agents.algorithms.cpo import LocalModel, improvement
 from recrl.agents.algorithms.own_options import TRPOConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
@@ -62,13 +62,7 @@ def trust_region_step(
     if squared <= 0.0:
         return {"policy_steps": 0.0, "line_search_steps": float(config.backtrack_tries), "step_norm": 0.0}
     direction.mul_(step_size(squared, config.target_kl, kl_penalty))
-    before = model.start()
-
-    def is_acceptable() -> bool:
-        now, divergence = model.measure()
-        return bool(now[0] >= before[0]) and divergence <= config.target_kl
-
-    return line_search(policy, direction, is_acceptable, config)
+    return line_search(policy, direction, improvement(model, None, config.target_kl), config)
 
 
 def step_size(squared: float, target_kl: float, kl_penalty: float) -> float:

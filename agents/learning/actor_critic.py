@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from typing import Any, ClassVar
 
@@ -44,7 +44,7 @@ from recrl.environments.cmdp import CMDPSpec, CurriculumStep, Floats
 from recrl.environments.plugins import trusted_attribute
 
 
-class ActorCritic:
+class ActorCritic(NetworkPolicy):
     """An agent; see ``recrl.agents.agent.Agent`` for the contract of its methods.
 
     Args:
@@ -72,12 +72,10 @@ class ActorCritic:
         rule: PolicyRule,
         generator: np.random.Generator,
     ) -> None:
+        super().__init__(encoder, policy)
         self._cmdp = cmdp
         self._config = config
-        self._encoder = encoder
-        self._policy = policy
         self._average = average
-        self._behaviour = NetworkPolicy(encoder, policy)
         self._critics = critics
         self._critic_optimiser = Adam(critics.parameters, config.critic_learning_rate)
         self._value_scale = RunningScale(1 + cmdp.num_costs)
@@ -103,22 +101,6 @@ class ActorCritic:
             raise ValueError(f"a rule's parts need other names than the agent's own, got {', '.join(taken)}")
         self._parts |= rule.parts
 
-    def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
-        """Sample actions for B observations [B, n]: int64 [B] or float32 [B, m]."""
-        return self._behaviour.act(observations, generator)
-
-    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """Return the cumulative masses for ``act`` at B observations [B, n], float64 [B, A]."""
-        return self._behaviour.cumulative_masses(observations)
-
-    def act_greedily(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
-        """The policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
-        return self._behaviour.act_greedily(observations)
-
-    def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """pi(a | s) at B observations [B, n], float64 [B, A]; for Discrete actions only."""
-        return self._behaviour.action_probabilities(observations)
-
     def final_policy(self) -> NetworkPolicy:
         """Return the policy with the parameters averaged over the last updates, see ``policy_average``."""
         encoder = self._encoder.with_statistics(self._average.statistics)
@@ -134,10 +116,10 @@ class ActorCritic:
         step.limits.require_one_per_cost(self._cmdp.num_costs, self._cmdp.name)
         with self._on_its_device():
             metrics = self._learn(rollout, episode_costs, step)
-        self._policy.publish()
-        require_finite("policy parameters", self._policy.parameters.to_numpy())
+        self._network.publish()
+        require_finite("policy parameters", self._network.parameters.to_numpy())
         require_finite("critic parameters", self._critics.parameters.to_numpy())
-        self._average.add(self._policy.parameters.to_numpy(), self._encoder.statistics)
+        self._average.add(self._network.parameters.to_numpy(), self._encoder.statistics)
         return metrics
 
     def _learn(self, rollout: Rollout, episode_costs: Floats, step: CurriculumStep) -> dict[str, float]:
@@ -155,11 +137,11 @@ class ActorCritic:
         estimates = self._estimate(rollout, measured.step_costs, batch)
         advantages = estimates.advantages
         constraints = Constraints.of(measured, limits)
-        experience = Experience.of(self._policy, batch, advantages, constraints)
+        experience = Experience.of(self._network, batch, advantages, constraints)
         if step.entropy_coefficient:
             experience = experience.with_entropy(step.entropy_coefficient)
         metrics = united(
-            improve_and_measure(self._rule, self._policy, experience, self._generator),
+            improve_and_measure(self._rule, self._network, experience, self._generator),
             {
                 **indexed("cost_gap", constraints.gaps),
                 **indexed("cost_advantage_max", np.abs(advantages[:, 1:]).max(axis=0)),  # eps of Lemma 1
@@ -177,16 +159,7 @@ class ActorCritic:
         require_finite("rewards and costs", signals)
         ended = rollout.terminated | rollout.truncated
         if config.value_scale == "running" and not self._value_scale.is_known:
-            zeros = np.zeros_like(signals)
-            first_returns = generalised_advantages(
-                signals,
-                zeros,
-                zeros,
-                ended=ended,
-                discount=config.discount,
-                trace_decays=np.ones(signals.shape[2]),
-            )
-            self._value_scale.add((first_returns**2).mean(axis=(0, 1)))
+            self._value_scale.add(_mean_squared_returns(signals, ended, config.discount))
         values = batch.per_sample(self._values(batch.unique_observations)).reshape(signals.shape)
         beyond = np.concatenate([rollout.final_observations, rollout.last_observations])
         beyond_values = self._values(torch.as_tensor(self._encoder(beyond)))
@@ -201,17 +174,9 @@ class ActorCritic:
         decays = np.array(
             [config.reward_trace_decay] + [config.cost_trace_decay] * self._cmdp.num_costs, dtype=np.float64
         )
-        advantages = generalised_advantages(
-            signals, values, following, ended=ended, discount=config.discount, trace_decays=decays
-        )
-        returns = values + generalised_advantages(
-            signals,
-            values,
-            following,
-            ended=ended,
-            discount=config.discount,
-            trace_decays=np.ones_like(decays),
-        )
+        estimated = partial(generalised_advantages, signals, values, following, ended=ended)
+        advantages = estimated(discount=config.discount, trace_decays=decays)
+        returns = values + estimated(discount=config.discount, trace_decays=np.ones_like(decays))
         targets = advantages + values if config.value_target == "lambda-return" else returns
         flat = (-1, signals.shape[2])
         return Estimates(
@@ -246,33 +211,33 @@ class ActorCritic:
         """
         config = self._config
         targets, scale = self._scaled(targets)
-        num_parts = batch.num_parts(config.minibatch_size)
-        steps = max(config.critic_steps, config.critic_passes * num_parts)
+        num_minibatches = batch.num_minibatches(config.minibatch_size)
+        steps = max(config.critic_steps, config.critic_passes * num_minibatches)
         regression_on = lru_cache(maxsize=1)(lambda part: row_targets(part, targets))
         losses = []
-        for part in islice(batch.parts(config.minibatch_size, self._generator), steps):
+        for part in islice(batch.minibatches(config.minibatch_size, self._generator), steps):
             means, spread = regression_on(part)
             losses.append(
                 self._critics.differentiate(part.unique_observations, part.observation_weights, means)
                 + spread
             )
             self._critic_optimiser.step()
-        mean = torch.stack(losses[-num_parts:]).mean(dim=0).numpy(force=True) * scale**2
+        mean = torch.stack(losses[-num_minibatches:]).mean(dim=0).numpy(force=True) * scale**2
         require_finite("value losses", mean)
         return {"value_loss_reward": float(mean[0])} | indexed("value_loss_cost", mean[1:])
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32]) -> dict[str, float]:
         """Make the policy more random once; see ``recrl.agents.learning.noise_scales``."""
         with self._on_its_device():
-            metrics = self._policy.add_noise(noise, self._encoder(observations), self._config.noise_form)
-        self._policy.publish()
-        require_finite("policy parameters after noise", self._policy.parameters.to_numpy())
+            metrics = self._network.add_noise(noise, self._encoder(observations), self._config.noise_form)
+        self._network.publish()
+        require_finite("policy parameters after noise", self._network.parameters.to_numpy())
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
         """Return the parameters, the generator, and the state of every part."""
         return {
-            "policy": self._policy.parameters.to_numpy(),
+            "policy": self._network.parameters.to_numpy(),
             "critics": self._critics.parameters.to_numpy(),
             "generator": self._generator.bit_generator.state,
             **{name: part.state_dict() for name, part in self._parts.items()},
@@ -280,8 +245,8 @@ class ActorCritic:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
-        self._policy.parameters.load(state["policy"])
-        self._policy.publish()
+        self._network.parameters.load(state["policy"])
+        self._network.publish()
         self._critics.parameters.load(state["critics"])
         self._generator.bit_generator.state = state["generator"]
         for name, part in self._parts.items():
@@ -289,8 +254,19 @@ class ActorCritic:
 
     def _on_its_device(self) -> AbstractContextManager[Any]:
         """Make tensors on the device of the parameters; on a CPU this does nothing, which saves time."""
-        device = self._policy.parameters.values.device
+        device = self._network.parameters.values.device
         return nullcontext() if device.type == "cpu" else device
+
+
+def _mean_squared_returns(signals: Floats, ended: npt.NDArray[np.bool_], discount: float) -> Floats:
+    """Return the mean squares of the discounted returns within a rollout, [T, B, C] -> [C]."""
+    zeros = np.zeros_like(signals)
+    trace_decays = np.ones(signals.shape[2])
+    returns = generalised_advantages(
+        signals, zeros, zeros, ended=ended, discount=discount, trace_decays=trace_decays
+    )
+    squares: Floats = (returns**2).mean(axis=(0, 1))
+    return squares
 
 
 def _normalised_numbers(cmdp: CMDPSpec, config: ActorCriticConfig) -> npt.NDArray[np.bool_]:

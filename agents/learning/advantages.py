@@ -80,7 +80,7 @@ def reward_spread(advantages: Floats) -> float:
     return max(float(advantages[:, 0].std()), SMALLEST_STD)
 
 
-def each_by_its_spread(advantages: Floats) -> tuple[Floats, Floats]:
+def standardised_advantages(advantages: Floats) -> tuple[Floats, Floats]:
     """Centre all advantages and divide each signal's by its own standard deviation.
 
     A constrained step does not depend on the units of reward and costs, if its violations are divided by

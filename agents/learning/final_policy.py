@@ -45,10 +45,6 @@ class NetworkPolicy:
         """Return the policy's mode for B observations [B, n]: int64 [B] or float32 [B, m]."""
         return self._network.mode(self._encoder(observations))
 
-    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """Return what ``act`` inverts at B observations [B, n], float64 [B, A]; Discrete actions only."""
-        return self._network.cumulative_masses(self._encoder(observations))
-
     def action_probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
         """Return pi(a | s) at B observations [B, n], float64 [B, A]; Discrete actions only."""
         return self._network.probabilities(self._encoder(observations))

@@ -156,11 +156,11 @@ def gradient_ascent(
         DivergedError: the KL is not finite.
     """
     size = config.minibatch_size
-    steps = max(config.policy_steps, config.policy_passes * experience.batch.num_parts(size))
+    steps = max(config.policy_steps, config.policy_passes * experience.batch.num_minibatches(size))
     largest_kl = config.stop_kl_factor * config.target_kl
     objective_on = lru_cache(maxsize=1)(objective_of)  # the whole batch is repeated without end
     taken, divergence = 0, 0.0
-    for taken, part in enumerate(islice(experience.parts(size, generator), steps + 1)):
+    for taken, part in enumerate(islice(experience.minibatches(size, generator), steps + 1)):
         now = policy.evaluate(part.batch.unique_observations)
         with torch.no_grad():
             divergence = float(mean_divergence(part.old, now.distribution, part.batch.observation_weights))

@@ -137,25 +137,27 @@ class LearningBatch:
         taken, at = torch.as_tensor(pairs % num_actions), torch.as_tensor(pairs // num_actions)
         return cls(rows, weights, taken, at, row, pair)
 
-    def num_parts(self, size: int | None) -> int:
+    def num_minibatches(self, size: int | None) -> int:
         """Return the number of minibatches of about ``size`` rows in an epoch; one if rows repeat."""
         if size is None or self.observation_of_sample is not None:
             return 1
         return -(-len(self.unique_observations) // size)
 
-    def parts(self, size: int | None, generator: np.random.Generator) -> Iterator[LearningBatch]:
+    def minibatches(self, size: int | None, generator: np.random.Generator) -> Iterator[LearningBatch]:
         """Yield minibatches without end: epochs over the samples, each in a new random order.
 
         Args:
             size: rows of a minibatch, at most; None for all.
             generator: for the order; not used if the batch is a single part.
         """
-        num_parts = self.num_parts(size)
+        num_minibatches = self.num_minibatches(size)
         while True:
-            if num_parts == 1:
+            if num_minibatches == 1:
                 yield self
                 continue
-            for chosen in np.array_split(generator.permutation(len(self.unique_observations)), num_parts):
+            for chosen in np.array_split(
+                generator.permutation(len(self.unique_observations)), num_minibatches
+            ):
                 yield self.minibatch(chosen)
 
     def minibatch(self, samples: Indices) -> LearningBatch:

@@ -1,4 +1,4 @@
-"""Stochastic policies: a tanh network with a categorical or a diagonal Gaussian head.
+"""Stochastic policies: a network with a categorical or a diagonal Gaussian head.
 
 Acting uses NumPy, on a CPU on the parameters' own memory: at 16 observations PyTorch's overhead exceeds the
 arithmetic. Learning uses PyTorch, also for the old policy's probabilities at the start of an update. So the
@@ -134,21 +134,11 @@ class StochasticPolicy:
             spread = np.exp(self._acting_log_std)
             outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
             return outputs
-        cumulative = _cumulative(outputs)
+        cumulative = np.exp(outputs - outputs.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
         thresholds = generator.random(len(outputs)) * cumulative[:, -1]
         # A threshold may round up to the whole mass: then the last action is taken.
         actions: npt.NDArray[np.int64] = (cumulative[:, :-1] <= thresholds[:, None]).sum(axis=1)
         return actions
-
-    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """Return the cumulative, unnormalised masses for ``sample`` at B observations, float64 [B, A].
-
-        Raises:
-            ValueError: actions are continuous.
-        """
-        if not self.is_categorical:
-            raise ValueError("continuous actions have densities, not probabilities")
-        return _cumulative(self.outputs(observations))
 
     def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
         """Return the most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
@@ -295,18 +285,12 @@ class _Latest:
         return self.rows() is rows and torch.equal(self.parameters, parameters)
 
 
-def _cumulative(logits: npt.NDArray[np.float32]) -> Floats:
-    """Return the cumulative sums of the unnormalised softmax of logits [B, A]."""
-    masses: Floats = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
-    return masses
-
-
 @dataclass(frozen=True, eq=False)
 class PolicyEvaluation:
     """Evaluation of a policy at some rows; valid until its parameters change or it is evaluated again.
 
     PyTorch differentiates from a loss to the network's outputs, so an agent may use any loss of the
-    distribution. ``TanhStack`` differentiates the network.
+    distribution. The network itself is differentiated by its stack.
 
     Attributes:
         policy: the evaluated policy.

@@ -20,7 +20,8 @@ def conjugate_gradient(metric: Callable[[Tensor], Tensor], target: Tensor, *, it
     """Solve H x = b approximately (Nocedal and Wright 2006, algorithm 5.2, from x = 0).
 
     Args:
-        metric: v -> H v, with H symmetric and positive definite.
+        metric: v -> H v, with H symmetric and positive definite. In a direction without curvature the
+            iteration ends.
         target: b, [P].
         iterations: upper bound; fewer if the residual becomes small relative to b.
 
@@ -38,7 +39,10 @@ def conjugate_gradient(metric: Callable[[Tensor], Tensor], target: Tensor, *, it
         if squared <= CONVERGED_SQUARED_RESIDUAL:
             break
         product = metric(direction)
-        step = squared / float(torch.dot(direction, product))
+        curvature = float(torch.dot(direction, product))
+        if curvature <= 0.0:  # a policy that its parameters do not change, without damping
+            break
+        step = squared / curvature
         solution.add_(direction, alpha=step)
         residual.sub_(product, alpha=step)
         previous, squared = squared, float(torch.dot(residual, residual))

@@ -162,8 +162,7 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
 def _meets(problem: StepProblem, solution: DualSolution, constraints: set[int]) -> bool:
     """Whether a step meets some constraints: b_i.x + c_i <= 0, up to rounding."""
     index = sorted(constraints)
-    reach = np.sqrt(2.0 * problem.radius * np.diag(problem.gram)[index])
-    return bool(np.all(problem.after(solution)[index] <= FEASIBILITY_TOLERANCE * reach))
+    return bool(np.all(problem.after(solution)[index] <= FEASIBILITY_TOLERANCE * problem.reach[index]))
 
 
 def _recovery(problem: StepProblem, usable: tuple[int, ...]) -> DualSolution:
@@ -171,14 +170,26 @@ def _recovery(problem: StepProblem, usable: tuple[int, ...]) -> DualSolution:
     weights = projection_weights(problem.gram, problem.violations)
     recovered = tuple(i for i in usable if problem.violations[i] > 0.0)
     if weights is None or not weights.any():
-        index = list(usable)
-        lengths = problem.violations[index] / np.sqrt(np.diag(problem.gram)[index])
-        worst = usable[int(np.argmax(lengths))]
+        worst = worst_alone(problem.gram, problem.violations)
         weights, recovered = np.zeros_like(problem.violations), (worst,)
         weights[worst] = 1.0
     weights = weights * np.sqrt(2.0 * problem.radius / float(weights @ problem.gram @ weights))
     unknown = np.full_like(problem.violations, np.nan)
     return DualSolution(StepCase.RECOVERY, 0.0, weights, unknown, recovered)
+
+
+def worst_alone(gram: Floats, excesses: Floats) -> int:
+    """Return the constraint that takes the longest step to meet, e_i / sqrt(S_ii).
+
+    Only constraints that a step can influence count; there must be one.
+
+    Args:
+        gram: S, [k, k].
+        excesses: e, [k].
+    """
+    squares = np.diag(gram)
+    usable = np.flatnonzero(squares > NO_INFLUENCE)
+    return int(usable[np.argmax(excesses[usable] / np.sqrt(squares[usable]))])
 
 
 def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:

@@ -101,10 +101,10 @@ def save(sweep: Sweep, path: Path) -> Path:
             index=False, lineterminator="\n"
         )
     digests = {name: Extent.of(text.encode()).sha256 for name, text in tables.items()}
-    facts = _told(sweep)
-    digests["sweep.json"] = _digest(json.loads(json.dumps(facts, allow_nan=False)))
-    told = json.dumps({**facts, "digests": digests}, indent=1, allow_nan=False) + "\n"
-    members = {"sweep.json": told, **tables}
+    content = _content(sweep)
+    digests["sweep.json"] = _digest(json.loads(json.dumps(content, allow_nan=False)))
+    text = json.dumps({**content, "digests": digests}, indent=1, allow_nan=False) + "\n"
+    members = {"sweep.json": text, **tables}
     size = sum(len(text.encode()) for text in members.values())
     if size > MAX_BYTES:
         raise RecrlError(f"{path}: a compact file may unpack to {MAX_BYTES} bytes, this one has {size}")
@@ -135,27 +135,27 @@ def load(path: Path) -> Sweep:
     try:
         with zipfile.ZipFile(path) as archive:
             sweep, *frames = unpacked(archive, names, max_bytes=MAX_BYTES)
-        told = json.loads(sweep)
+        content = json.loads(sweep)
         rows = {name: pd.read_csv(io.BytesIO(data)) for name, data in zip(ROWS, frames, strict=True)}
     except FileNotFoundError as error:
         raise RecrlError(f"{path}: {missing(path)}") from error
     except UNREADABLE as error:
         reason = getattr(error, "strerror", None) or error
         raise RecrlError(f"{path}: cannot be read as a sweep's compact file ({reason})") from error
-    found = told.get("format") if isinstance(told, dict) else None
+    found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:
         raise OtherVersionError(f"{path}: {OTHER_VERSION}: its format must be {FORMAT}, got {found!r:.60}")
     try:
-        checked = _SweepFile.model_validate(told)
+        checked = _SweepFile.model_validate(content)
         digests = {name: Extent.of(data).sha256 for name, data in zip(names[1:], frames, strict=True)}
         if "sweep.json" in checked.digests:  # earlier versions wrote none
             digests["sweep.json"] = _digest(
-                {name: value for name, value in told.items() if name != "digests"}
+                {name: value for name, value in content.items() if name != "digests"}
             )
         for name, digest in digests.items():
             if digest != checked.digests.get(name):
                 raise DamagedError(f"{path}: its {name} is not what was written; export the sweep again")
-        facts = [_facts(trial, checked.provenance) for trial in told["trials"]]
+        facts = [_trial_facts(trial, checked.provenance) for trial in content["trials"]]
         _check_facts(facts)
         for name, frame in rows.items():
             _check_rows(name, frame, facts)
@@ -258,12 +258,12 @@ def _check_rows(name: str, rows: pd.DataFrame, facts: Sequence[TrialFacts]) -> N
                 raise ValueError(f"{name}.csv: the column {column!r} lacks numbers")
 
 
-def _digest(facts: dict[str, Any]) -> str:
+def _digest(content: dict[str, Any]) -> str:
     """Return the digest of everything in sweep.json besides the digests."""
-    return Extent.of(json.dumps(facts, sort_keys=True).encode()).sha256
+    return Extent.of(json.dumps(content, sort_keys=True).encode()).sha256
 
 
-def _told(sweep: Sweep) -> dict[str, Any]:
+def _content(sweep: Sweep) -> dict[str, Any]:
     """Return everything except the data frames; equal provenances are stored once."""
     origins = list(Counter(it.provenance for it in sweep.facts))
     return {
@@ -287,11 +287,11 @@ def _told(sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def _facts(value: dict[str, Any], origins: list[str]) -> TrialFacts:
-    facts = TrialFacts(
+def _trial_facts(value: dict[str, Any], origins: list[str]) -> TrialFacts:
+    trial = TrialFacts(
         **{**value, "spec": TrialSpec.from_json(value["spec"]), "provenance": origins[value["provenance"]]}
     )
-    return replace(facts, status=TrialState(facts.status))
+    return replace(trial, status=TrialState(trial.status))
 
 
 def _rounded(rows: pd.DataFrame) -> pd.DataFrame:

@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.labels import TRIAL
+from recrl.analysis.data.labels import TRIAL, listed
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble
 from recrl.orchestrator.spec import TrialState
 
@@ -87,11 +87,9 @@ def _disagreements(parts: Sequence[Sweep], having: Mapping[str, Sequence[int]]) 
     if not differing:
         return []
     titles = {trial.spec.trial_id: trial.spec.title for part in parts for trial in part.facts}
-    named = ", ".join(titles[trial_id] for trial_id in differing[:NAMED])
-    more = f" and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
     return [
         f"completed in several parts with different episodes, as machines or versions differ; the first "
-        f"part's are taken: {named}{more}"
+        f"part's are taken: {listed([titles[trial_id] for trial_id in differing], NAMED)}"
     ]
 
 

@@ -107,7 +107,7 @@ def _sums(series: list[pd.DataFrame], name: str) -> Floats:
 
 
 def _legend(figure: Figure, agent: str, drawn: set[str]) -> None:
-    """Return the drawn sums: agents except CPO have no bounds, unknown tasks no trivial bound."""
+    """Draw the legend of the drawn sums: only CPO has bounds, only known tasks a trivial one."""
     handles = [Line2D([], [], color="0.2", linewidth=1.5, label="measured cost, undiscounted")]
     handles += [
         Line2D([], [], color=colour, linestyle=dashes, linewidth=0.9, label=name)

@@ -9,7 +9,7 @@ of the KL divergence, if the agent has one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,36 +76,27 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
         figure = Figure(figsize=(TEXT_WIDTH, 1.15 * len(rows) + 0.85), layout="constrained")
         grid = figure.subplots(len(rows), len(methods), squeeze=False, sharex=True, sharey="row")
         for column, method in zip(grid.T, methods, strict=True):
-            chosen, style = updates[updates["method"] == method], look[method]
-            for axes, quantity in zip(column, rows, strict=True):
-                _panel(axes, chosen, quantity, edges, style)
+            chosen = updates[updates["method"] == method]
+            by_quantity = dict(zip(rows, column, strict=True))
+            for quantity, axes in by_quantity.items():
+                _panel(axes, chosen, quantity, edges, look[method])
                 panels.phase_boundary(axes, boundary, total)
             _limits(column[0], chosen, f"limit_{cost}")
-            _event_marks(column[0], events.loc[_is_noise(events, method), "end_step"], style, NOISE_MARK)
-            if "case" in chosen and "kl" in rows:
-                recovering = chosen.loc[chosen["case"] == RECOVERY_CASE, "end_step"]
-                _event_marks(column[rows.index("kl")], recovering, style, RECOVERY_MARK)
-            if "kl" in rows and target is not None:
-                column[rows.index("kl")].axhline(target, **TARGET_LINE)
+            noise = events.loc[_is_noise(events, method), "end_step"]
+            _event_marks(column[0], noise, look[method], NOISE_MARK)
             column[0].axhline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED, zorder=2.4)
+            if "kl" in by_quantity:
+                _divergence_marks(by_quantity["kl"], chosen, look[method], target)
             column[0].set_title(method)
             panels.step_axis(column[-1], 0.0, total)
             column[-1].set_xlabel("environment steps")
         largest = updates[f"cost_{cost}"].fillna(0.0).max()  # 0 before the first episode has finished
-        scale = panels.cost_axis(grid[0, 0], limit, float(largest))
-        low, high = grid[0, 0].get_ylim()
-        for axes in grid[0]:
-            panels.shade_above_limit(axes, limit)
-        grid[0, 0].set_ylim(low, max(high, 1.2 * limit))
+        scale = _scale_costs(grid[0], limit, float(largest))
         for axes, quantity in zip(grid[:, 0], rows, strict=True):
             label = _label(quantity, cost_suffix(sweep, cost, task))
             label += f"\n{scale}" if scale and axes is grid[0, 0] else ""
             axes.set_ylabel(label, fontsize=7.0)
-            if quantity.startswith(EXPLAINED):
-                axes.set_ylim(LEAST_EXPLAINED, 1.05)
-            if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
-                axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
-                axes.set_ylim(bottom=-0.3)
+            _scale(axes, updates, quantity)
         _legend(figure, f"{panels.panel_title(trials, updates)}, {agent}", updates["seed"].nunique(), target)
     return figure
 
@@ -147,6 +138,34 @@ def _limits(axes: Axes, updates: pd.DataFrame, quantity: str) -> None:
         axes.plot(
             run["end_step"], values, color=IN_FORCE_COLOUR, linewidth=0.8, drawstyle="steps-pre", zorder=2.5
         )
+
+
+def _divergence_marks(axes: Axes, updates: pd.DataFrame, style: MethodStyle, target: float | None) -> None:
+    """Draw CPO's recovery steps and the target of the KL divergence."""
+    if "case" in updates:
+        recovering = updates.loc[updates["case"] == RECOVERY_CASE, "end_step"]
+        _event_marks(axes, recovering, style, RECOVERY_MARK)
+    if target is not None:
+        axes.axhline(target, **TARGET_LINE)
+
+
+def _scale_costs(row: Sequence[Axes], limit: float, largest: float) -> str:
+    """Scale the shared axis of the costs and shade above the limit; return the scale for its label."""
+    scale = panels.cost_axis(row[0], limit, largest)
+    low, high = row[0].get_ylim()
+    for axes in row:
+        panels.shade_above_limit(axes, limit)
+    row[0].set_ylim(low, max(high, 1.2 * limit))
+    return scale
+
+
+def _scale(axes: Axes, updates: pd.DataFrame, quantity: str) -> None:
+    """Scale the shared axis of another quantity."""
+    if quantity.startswith(EXPLAINED):
+        axes.set_ylim(LEAST_EXPLAINED, 1.05)
+    if quantity.startswith("multiplier_") and updates[quantity].max() > LARGE_MULTIPLIER:
+        axes.set_yscale("symlog", linthresh=1.0)  # CPO's have spikes
+        axes.set_ylim(bottom=-0.3)
 
 
 def _event_marks(axes: Axes, steps: Iterable[float], style: MethodStyle, marker: str) -> None:

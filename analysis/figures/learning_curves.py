@@ -138,45 +138,51 @@ def _task_row(
     averaging: CurveAverage,
 ) -> None:
     """Draw one task's panels: return, return in deployment, then the same for each cost."""
-    boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
-    count = int(trials["total_steps"].max() // trials["steps_per_update"].min())
-    whole = step_grid(boundary, total, updates=count, bins=BINS)
-    deployment_updates = max(2, round(count * (total - boundary) / total))
-    magnified = np.linspace(boundary, total, min(DEPLOYMENT_BINS, deployment_updates) + 1)
     quantities = ["episode_return", *(f"cost_{i}" for i in range((len(row) - 2) // 2))]
-    deployed = updates[updates["end_step"] > boundary]
     for position, quantity in enumerate(quantities):
+        whole, magnified = row[2 * position : 2 * position + 2]
         if not updates[quantity].notna().any():  # this task has fewer costs than another
-            row[2 * position].set_axis_off()
-            row[2 * position + 1].set_axis_off()
+            whole.set_axis_off()
+            magnified.set_axis_off()
             continue
-        for axes, edges, rows in (
-            (row[2 * position], whole, updates),
-            (row[2 * position + 1], magnified, deployed),
-        ):
-            _curves(axes, rows, quantity, edges, look, averaging=averaging)
-            panels.step_axis(axes, edges[0], edges[-1])
-            panels.reference_lines(axes, trials, quantity)
-        panels.phase_boundary(row[2 * position], boundary, total)
-        panels.phase_boundary(row[2 * position + 1], boundary, total)
-        if not len(deployed):
-            row[2 * position + 1].text(
-                0.5,
-                0.65,
-                "not yet" if boundary < total else "none",
-                transform=row[2 * position + 1].transAxes,
-                ha="center",
-                color="0.4",
-            )
-        if quantity != "episode_return":
-            limit = float(trials[f"deploy_limit_{position - 1}"].iloc[0])
-            largest = float(np.nanmax(updates[quantity].to_numpy(np.float64)))
-            panels.cost_axis(row[2 * position], limit, largest)
-            panels.widen(row[2 * position + 1], limit, LEAST_SHOWN * limit or LEAST_SHOWN)
-            _shade(row[2 * position : 2 * position + 2], limit)
+        _pair(whole, magnified, trials, updates, quantity, look=look, averaging=averaging)
+        if quantity == "episode_return":
+            panels.widen(magnified, float(trials["optimal_return"].iloc[0]), LEAST_SHOWN_RETURN)
         else:
-            panels.widen(row[1], float(trials["optimal_return"].iloc[0]), LEAST_SHOWN_RETURN)
+            limit = float(trials[f"deploy_limit_{position - 1}"].iloc[0])
+            panels.cost_axis(whole, limit, float(np.nanmax(updates[quantity].to_numpy(np.float64))))
+            panels.widen(magnified, limit, LEAST_SHOWN * limit or LEAST_SHOWN)
+            _shade([whole, magnified], limit)
     row[0].set_ylabel(panels.panel_title(trials, updates, separator="\n"))
+
+
+def _pair(
+    whole: Axes,
+    magnified: Axes,
+    trials: pd.DataFrame,
+    updates: pd.DataFrame,
+    quantity: str,
+    *,
+    look: dict[str, MethodStyle],
+    averaging: CurveAverage,
+) -> None:
+    """Draw one quantity over all of training, and magnified in the deployment phase."""
+    boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
+    count = int(total // trials["steps_per_update"].min())
+    deployment_updates = max(2, round(count * (total - boundary) / total))
+    deployment_edges = np.linspace(boundary, total, min(DEPLOYMENT_BINS, deployment_updates) + 1)
+    deployed = updates[updates["end_step"] > boundary]
+    for axes, edges, rows in (
+        (whole, step_grid(boundary, total, updates=count, bins=BINS), updates),
+        (magnified, deployment_edges, deployed),
+    ):
+        _curves(axes, rows, quantity, edges, look, averaging=averaging)
+        panels.step_axis(axes, edges[0], edges[-1])
+        panels.reference_lines(axes, trials, quantity)
+        panels.phase_boundary(axes, boundary, total)
+    if not len(deployed):
+        text = "not yet" if boundary < total else "none"
+        magnified.text(0.5, 0.65, text, transform=magnified.transAxes, ha="center", color="0.4")
 
 
 def _shade(panels_of_cost: Sequence[Axes], limit: float) -> None:

@@ -33,7 +33,6 @@ from recrl.environments.registry import task_options
 from recrl.environments.rivergrid.grid_world import (
     FORWARD,
     HEADINGS,
-    RiverGridMapOptions,
     RiverGridOptions,
     river_cmdp,
     task_map,
@@ -133,7 +132,7 @@ def river_task(sweep: Sweep, task: str) -> tuple[RiverMap, RiverGridOptions] | N
         return None
     try:
         options = task_options(name, sweep.task_options[task])
-        if not isinstance(options, RiverGridOptions | RiverGridMapOptions):
+        if not isinstance(options, RiverGridOptions):
             return None
         return task_map(name, options), options
     except USERS_ERRORS:  # options of another version: the sweep has a note of it

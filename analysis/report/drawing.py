@@ -18,7 +18,6 @@
     claims.csv                  the paper's claims about the grid's tasks, counted, if there are any
     bounds.csv                  the cumulative cost against Proposition 1, one row per trial and cost
     outcomes.tex                the first tables for LaTeX (booktabs)
-    outcomes.parquet            outcomes.csv with its types, for programs
 
 For a running sweep, ``sketch`` draws only SKETCHED, as PNGs, and all tables and pages. This takes a
 fraction of the time, and leaves the cores to the trials.
@@ -133,15 +132,7 @@ def draw(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[
         Exception: raised by the first figure that failed; all others and the report, which names it, are
             written.
     """
-    drawn, mistakes = [], _Mistakes()
-    figures = drawings(sweep, averaging=averaging)
-    for stem, drawing in figures.items():
-        with mistakes.kept(stem):
-            if (figure := drawing.make()) is not None:
-                drawn += styles.save(figure, folder, stem)
-    written = _with_pages(_noted(sweep, mistakes.notes), folder, drawn, figures)
-    mistakes.raise_first()
-    return written
+    return _draw(sweep, folder, drawings(sweep, averaging=averaging))
 
 
 def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> list[Path]:
@@ -152,13 +143,26 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> lis
         folder: where the files go.
         averaging: of the learning curves.
     """
-    drawn, mistakes = [], _Mistakes()
     figures = drawings(sweep, averaging=averaging)
+    sketched = {stem: drawing for stem, drawing in figures.items() if drawing.kind in SKETCHED}
+    return _draw(sweep, folder, sketched, unfinished=True)
+
+
+def _draw(
+    sweep: Sweep, folder: Path, figures: Mapping[str, Drawing], *, unfinished: bool = False
+) -> list[Path]:
+    """Draw some figures, write all tables and the report; of an unfinished sweep only PNGs, with a note."""
+    drawn, mistakes = [], _Mistakes()
     for stem, drawing in figures.items():
         with mistakes.kept(stem):
-            if drawing.kind in SKETCHED and (figure := drawing.make()) is not None:
+            if (figure := drawing.make()) is None:
+                continue
+            if unfinished:
                 drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
-    written = _with_pages(_noted(sweep, [*mistakes.notes, UNFINISHED]), folder, drawn, figures)
+            else:
+                drawn += styles.save(figure, folder, stem)
+    notes = [*mistakes.notes, UNFINISHED] if unfinished else mistakes.notes
+    written = _with_pages(_noted(sweep, notes), folder, drawn, figures)
     mistakes.raise_first()
     return written
 

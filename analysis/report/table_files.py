@@ -120,7 +120,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     averaged = metrics.summary(rows, sweep.trials)
     robust = metrics.robust_summary(rows, generator).drop(columns=["seeds", "too_few_seeds"])
     compared = metrics.comparisons(rows, generator)
-    weighed = claims.count_claims(rows, totals, sweep.trials)
+    counted_claims = claims.count_claims(rows, totals, sweep.trials)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], how="left", sort=False)
     whole["too_few_seeds"] = whole["seeds"] < ENOUGH_RUNS
     judged = count_verdicts(rows, compared, curriculum_flags(sweep), sweep.trials, cost_names(sweep))
@@ -128,14 +128,13 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     outcomes = _outcome_tables(rows, averaged, suffixes)
     latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
     shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
-    if len(weighed):
-        written.append(table_formats.write_csv(weighed, folder / "claims.csv"))
-        shown.append(_claims(weighed))
+    if len(counted_claims):
+        written.append(table_formats.write_csv(counted_claims, folder / "claims.csv"))
+        shown.append(_claims(counted_claims))
     shown += [_bounds(costs, suffix) for costs, suffix in zip(bounds, suffixes, strict=True) if len(costs)]
     written += [
         table_formats.write_csv(judged, folder / "verdicts.csv"),
         table_formats.write_csv(rows, folder / OUTCOMES),
-        table_formats.write_parquet(rows, folder / "outcomes.parquet"),
         table_formats.write_csv(whole, folder / "summary.csv"),
         table_formats.write_csv(compared, folder / "comparisons.csv"),
         table_formats.write_text("\n".join(latex), folder / "outcomes.tex"),
@@ -157,14 +156,14 @@ def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:
     return [table_formats.write_csv(rows, folder / OUTCOMES)] if len(rows) else []
 
 
-def _claims(weighed: pd.DataFrame) -> ShownTable:
+def _claims(counted_claims: pd.DataFrame) -> ShownTable:
     """Return the counted claims of the paper."""
-    table = claims_table(weighed)
+    table = claims_table(counted_claims)
     notes = [
         CLAIMS_NOTE,
-        COMPARED_CLAIMS_NOTE if weighed["difference"].notna().any() else "",
+        COMPARED_CLAIMS_NOTE if counted_claims["difference"].notna().any() else "",
         NO_GAIN if (table == DASH).any(axis=None) else "",
-        FAILED_CLAIMS_NOTE if weighed["failed"].any() else "",
+        FAILED_CLAIMS_NOTE if counted_claims["failed"].any() else "",
         table_formats.not_corrected(table),
     ]
     return ShownTable("What the paper says of these tasks", table, " ".join(filter(None, notes)))

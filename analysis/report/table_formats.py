@@ -192,11 +192,6 @@ def write_csv(frame: pd.DataFrame, path: Path) -> Path:
     return _written(frame.to_csv(index=False, lineterminator="\n").encode(), path)
 
 
-def write_parquet(frame: pd.DataFrame, path: Path) -> Path:
-    """Write a data frame as Parquet, with its types."""
-    return _written(frame.to_parquet(index=False), path)
-
-
 def write_text(text: str, path: Path) -> Path:
     """Write a text file that ends with a line feed."""
     return _written((text.rstrip("\n") + "\n").encode(), path)

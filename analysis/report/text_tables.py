@@ -29,29 +29,29 @@ BOUND_COLUMNS = {
 }
 
 
-def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
+def claims_table(counted: pd.DataFrame) -> pd.DataFrame:
     """Format the result of ``count_claims``: "mixed", "4 of 5 (38–96%)", "+1.2 (+0.3 to +2.1)", "+40%".
 
     Only a claim about single trials holds or does not. A comparison of returns has a dash where a policy of
     a pair is infeasible, because more return is then no gain. There is a column of failed seeds if there are
     any.
     """
-    shares = zip(weighed["held"], weighed["seeds"], weighed["share_low"], weighed["share_high"], strict=True)
-    beside = zip(weighed["deployment_held"], weighed["deployment_seeds"], strict=True)
-    compared = weighed["claim"].isin([claim.text for claim in CLAIMS if isinstance(claim, Comparison)])
-    gains = compared & weighed["feasible_pairs"].notna()
-    ended = weighed["seeds"] - weighed["failed"]
-    no_gain = gains & (weighed["feasible_pairs"] < ended)
+    shares = zip(counted["held"], counted["seeds"], counted["share_low"], counted["share_high"], strict=True)
+    beside = zip(counted["deployment_held"], counted["deployment_seeds"], strict=True)
+    compared = counted["claim"].isin([claim.text for claim in CLAIMS if isinstance(claim, Comparison)])
+    gains = compared & counted["feasible_pairs"].notna()
+    ended = counted["seeds"] - counted["failed"]
+    no_gain = gains & (counted["feasible_pairs"] < ended)
     no_gain_deployed = gains & (
-        weighed["deployment_feasible_pairs"] < weighed["deployment_seeds"] - weighed["failed"]
+        counted["deployment_feasible_pairs"] < counted["deployment_seeds"] - counted["failed"]
     )
     columns = {
-        "section": weighed["section"],
-        "claim": weighed["claim"],
-        "agent": weighed["agent"],
+        "section": counted["section"],
+        "claim": counted["claim"],
+        "agent": counted["agent"],
         "holds here": [
             "" if pair else "yes" if held == seeds else "mixed" if held else "no"
-            for held, seeds, pair in zip(weighed["held"], weighed["seeds"], compared, strict=True)
+            for held, seeds, pair in zip(counted["held"], counted["seeds"], compared, strict=True)
         ],
         "holds in": [
             DASH if dashed else share_text(*share) for share, dashed in zip(shares, no_gain, strict=True)
@@ -61,18 +61,18 @@ def claims_table(weighed: pd.DataFrame) -> pd.DataFrame:
             for (held, seeds), dashed in zip(beside, no_gain_deployed, strict=True)
         ],
     }
-    if (weighed["failed"] > 0).any():
-        columns["failed"] = weighed["failed"].astype(str)
+    if (counted["failed"] > 0).any():
+        columns["failed"] = counted["failed"].astype(str)
     if compared.any():
-        pairs = zip(weighed["feasible_pairs"], ended, strict=True)
+        pairs = zip(counted["feasible_pairs"], ended, strict=True)
         columns["feasible pairs"] = [f"{known} of {all_}" if pd.notna(known) else "" for known, all_ in pairs]
         columns["difference"] = [
             DASH if dashed else _difference_text(row)
-            for (_, row), dashed in zip(weighed.iterrows(), no_gain, strict=True)
+            for (_, row), dashed in zip(counted.iterrows(), no_gain, strict=True)
         ]
-        relative = weighed["relative_difference"].mask(no_gain)
+        relative = counted["relative_difference"].mask(no_gain)
         columns["relative"] = [f"{value:+.0%}" if math.isfinite(value) else "" for value in relative]
-        columns["paper, over its three tasks"] = weighed["paper"]
+        columns["paper, over its three tasks"] = counted["paper"]
     return pd.DataFrame(columns)
 
 

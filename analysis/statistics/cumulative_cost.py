@@ -59,7 +59,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
-    MEAN_WEIGHTS,
+    DECAYS,
     discounted_excess,
     largest_train_limit,
     undiscounted_excess,
@@ -193,16 +193,14 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
     names = {str(label): str(name) for label, name in sweep.trials[["method", "method_name"]].to_numpy()}
     lines = []
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
-        if (curriculum := names[str(group[2])]) not in MEAN_WEIGHTS:
+        if (curriculum := names[str(group[2])]) not in DECAYS:
             continue
         policies, episodes = int(runs["policies"].iloc[0]), float(runs["episodes_per_policy"].mean())
         overshoot = float((runs["overshoot_sum"] / runs["policies"]).max())
         deploy = float(runs["deploy_limit"].iloc[0])
         allowed = policies * deploy + budget / episodes
         try:
-            limit = largest_train_limit(
-                curriculum, allowed, deploy, excesses=[overshoot] * policies, clock="start"
-            )
+            limit = largest_train_limit(curriculum, allowed, deploy, excesses=[overshoot] * policies)
         except ValueError:  # less than the bound for d_t = d_d
             limit = math.nan
         lines.append(

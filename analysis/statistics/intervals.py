@@ -82,18 +82,17 @@ def mean_and_standard_error(values: Floats) -> tuple[float, float]:
     return mean, error
 
 
-def mean_interval(values: Floats, *, confidence: float = CONFIDENCE) -> Interval:
-    """Return Student's t interval of a mean: mean +- t_{n-1} s / sqrt(n).
+def mean_interval(values: Floats) -> Interval:
+    """Return Student's t 95% interval of a mean: mean +- t_{n-1} s / sqrt(n).
 
     Args:
         values: [n], assumed normal.
-        confidence: of the interval, in (0, 1).
     """
     mean, error = mean_and_standard_error(values)
     count = len(values)
     if count < 2:
         return Interval(mean, math.nan, math.nan, count, True)
-    reach = float(stdtrit(count - 1, 0.5 + confidence / 2.0)) * error
+    reach = float(stdtrit(count - 1, 0.5 + CONFIDENCE / 2.0)) * error
     return Interval(mean, mean - reach, mean + reach, count, False)
 
 
@@ -167,28 +166,26 @@ def improvement_interval(
     generator: np.random.Generator,
     *,
     tie: float = 0.0,
-    confidence: float = CONFIDENCE,
     replications: int = REPLICATIONS,
 ) -> Interval:
-    """Return the stratified bootstrap interval of P(X > Y); the runs of both are resampled independently.
+    """Return the stratified bootstrap 95% interval of P(X > Y); the runs of both are resampled independently.
 
     Args:
         scores: x, [n, m].
         others: y, [n', m].
         generator: draws the resamples.
         tie: values at most this far apart count as equal, at least 0.
-        confidence: of the interval, in (0, 1).
         replications: r, number of resamples.
     """
     replicated = probability_of_improvement(
         _resampled(scores, generator, replications), _resampled(others, generator, replications), tie=tie
     )
     estimate = float(probability_of_improvement(scores, others, tie=tie))
-    return _percentile_interval(estimate, replicated, min(len(scores), len(others)), confidence)
+    return _percentile_interval(estimate, replicated, min(len(scores), len(others)), CONFIDENCE)
 
 
-def paired_difference(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Interval:
-    """Return the mean difference between runs of equal seeds, with Student's t interval.
+def paired_difference(values: Floats, baseline: Floats) -> Interval:
+    """Return the mean difference between runs of equal seeds, with Student's t 95% interval.
 
     Equal seeds share the first policy and the stream of the environment, so that differences within a
     seed vary less than differences between seeds.
@@ -196,13 +193,12 @@ def paired_difference(values: Floats, baseline: Floats, *, confidence: float = C
     Args:
         values: [n], in the order of the seeds.
         baseline: [n], in the same order.
-        confidence: of the interval, in (0, 1).
     """
-    return mean_interval(np.subtract(values, baseline), confidence=confidence)
+    return mean_interval(np.subtract(values, baseline))
 
 
-def wilson_interval(successes: int, runs: int, *, confidence: float = CONFIDENCE) -> Interval:
-    """Return Wilson's (1927) score interval of a fraction p = successes / n.
+def wilson_interval(successes: int, runs: int) -> Interval:
+    """Return Wilson's (1927) 95% score interval of a fraction p = successes / n.
 
     With z the normal quantile: (p + z^2/2n +- z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n). Unlike
     p +- standard error it stays in [0, 1] and does not collapse at 0 or n successes. Equal to
@@ -211,12 +207,11 @@ def wilson_interval(successes: int, runs: int, *, confidence: float = CONFIDENCE
     Args:
         successes: 0 ... n.
         runs: n, at least 0.
-        confidence: of the interval, in (0, 1).
     """
     if runs == 0:
         return Interval(math.nan, math.nan, math.nan, 0, True)
     p, n = successes / runs, runs
-    z = float(ndtri(0.5 + confidence / 2.0))
+    z = float(ndtri(0.5 + CONFIDENCE / 2.0))
     centre = p + z**2 / (2 * n)
     reach = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     scale = 1 + z**2 / n

@@ -30,6 +30,8 @@ from recrl.analysis.statistics.verdicts import is_cost, solved, tie, within_limi
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialState
 
+BASELINE = "none"  # the method that others are compared with
+
 
 class Measure(StrEnum):
     """The episodes or policies that an outcome is averaged over."""
@@ -184,17 +186,14 @@ def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.Dat
     return pd.DataFrame(lines)
 
 
-def comparisons(
-    rows: pd.DataFrame, generator: np.random.Generator, *, baseline: str = "none"
-) -> pd.DataFrame:
-    """Compare every method with the baseline: one row per other GROUP and measure with a common seed.
+def comparisons(rows: pd.DataFrame, generator: np.random.Generator) -> pd.DataFrame:
+    """Compare every method with BASELINE: one row per other GROUP and measure with a common seed.
 
     All pairs count, feasible or not. More return is a gain only where feasible_pairs equals pairs.
 
     Args:
         rows: of ``outcomes``.
         generator: draws the resamples.
-        baseline: the method for comparison.
 
     Returns:
         GROUP, measure, pairs (seeds that both have), feasible_pairs (those whose trials are both feasible);
@@ -209,8 +208,8 @@ def comparisons(
         [*GROUP, "measure"], observed=True, sort=False
     ):
         same = (rows["task"] == task) & (rows["agent"] == agent) & (rows["measure"] == measure)
-        others = rows[same & (rows["method"] == baseline)]
-        if method == baseline or not len(others):
+        others = rows[same & (rows["method"] == BASELINE)]
+        if method == BASELINE or not len(others):
             continue
         pairs = chosen.merge(others, on="seed", suffixes=("", "_base"))
         if not len(pairs):

@@ -198,47 +198,20 @@ def _mixture(
     returns = np.array([policy.episode_return for policy in found])
     # With reward_weight 0, excess over the limits is allowed and minimised.
     slacks = 0 if reward_weight else len(bounds)
-    solution = _minimise(
+    solution = linprog(
         np.concatenate([-reward_weight * returns, np.ones(slacks)]),
-        at_most=(np.hstack([costs.T, -np.eye(len(bounds), slacks)]), bounds),
-        equal=(np.concatenate([np.ones(len(found)), np.zeros(slacks)])[None], np.ones(1)),
+        A_ub=np.hstack([costs.T, -np.eye(len(bounds), slacks)]),
+        b_ub=bounds,
+        A_eq=np.concatenate([np.ones(len(found)), np.zeros(slacks)])[None],
+        b_eq=np.ones(1),
+        method="highs",
     )
-    assert solution is not None, "the first phase finds a mixture that keeps the limits"
-    multipliers = np.zeros(len(constrained))
-    multipliers[constrained] = solution.multipliers
-    return solution.x[: len(found)], multipliers, -float(solution.equality_marginals[0])
-
-
-@dataclass(frozen=True, eq=False)
-class _LinearSolution:
-    """Solution of a linear program: the minimiser and the dual variables.
-
-    Attributes:
-        x: the minimiser.
-        multipliers: decrease of the minimum per unit of each upper bound, >= 0.
-        equality_marginals: increase of the minimum per unit of each equality.
-    """
-
-    x: Floats
-    multipliers: Floats
-    equality_marginals: Floats
-
-
-def _minimise(
-    objective: Floats, *, at_most: tuple[Floats, Floats], equal: tuple[Floats, Floats]
-) -> _LinearSolution | None:
-    """Minimise c . x over x >= 0 with A x <= b, A' x = b'; None if infeasible."""
-    (upper_matrix, upper), (equal_matrix, right_hand_side) = at_most, equal
-    solution = linprog(objective, upper_matrix, upper, equal_matrix, right_hand_side, method="highs")
-    if solution.status == 2:
-        return None
-    if solution.status != 0:
+    if solution.status != 0:  # the first phase finds a mixture that keeps the limits
         raise RuntimeError(f"the linear program was not solved: {solution.message}")
-    return _LinearSolution(
-        x=np.asarray(solution.x),
-        multipliers=np.maximum(-np.asarray(solution.ineqlin.marginals), 0.0),
-        equality_marginals=np.asarray(solution.eqlin.marginals),
-    )
+    multipliers = np.zeros(len(constrained))
+    multipliers[constrained] = np.maximum(-np.asarray(solution.ineqlin.marginals), 0.0)
+    weights: Floats = np.asarray(solution.x)[: len(found)]
+    return weights, multipliers, -float(solution.eqlin.marginals[0])
 
 
 def _occupation(model: FiniteCMDP, policy: Floats) -> Floats:

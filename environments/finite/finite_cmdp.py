@@ -107,29 +107,6 @@ class FiniteCMDP:
         return reached
 
 
-@dataclass(frozen=True, eq=False)
-class FiniteSteps:
-    """T steps of B environments of a finite CMDP, all [T, B] unless said otherwise.
-
-    Attributes:
-        states: the states before the step.
-        actions: the actions taken in them.
-        rewards: float64.
-        costs: float64, [T, B, k].
-        terminated: the step entered a terminal state.
-        truncated: the step reached the horizon without entering a terminal state.
-        successors: the states that were entered, before any reset.
-    """
-
-    states: Integers
-    actions: Integers
-    rewards: Floats
-    costs: Floats
-    terminated: Booleans
-    truncated: Booleans
-    successors: Integers
-
-
 class FiniteVectorEnv(CMDPVectorEnv):
     """B environments of one finite CMDP, stepped together by table look-ups.
 
@@ -232,53 +209,6 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self.states[index] = self._first_states(len(index))
         self._elapsed[index] = 0
         return self.observations[self.states]
-
-    @property
-    def follows_tables(self) -> bool:
-        """Whether ``step`` is not overridden, so that ``follow`` gives the same results."""
-        return type(self).step is FiniteVectorEnv.step and "step" not in vars(self)
-
-    def follow(self, masses: Floats, draws: Floats) -> FiniteSteps:
-        """Take T steps under a tabular policy, with the results of ``step`` but many times as fast.
-
-        The policy acts by inversion: in state s it takes the first action a with u masses[s, -1] < masses[s,
-        a]. Call it only if ``follows_tables``: otherwise ``step`` is overridden.
-
-        Args:
-            masses: cumulative sums of each state's action probabilities, not necessarily normalised, [S, A].
-            draws: the policy's uniform numbers u on [0, 1), [T, B].
-        """
-        if self._elapsed is None:
-            raise ValueError(f"{self.cmdp.name}: call reset before the first step")
-        model, (shape, bounds) = self._model, (draws.shape, masses[:, :-1])
-        pairs, successors, ended = (
-            np.empty(shape, np.int64),
-            np.empty(shape, np.int64),
-            np.empty(shape, np.bool_),
-        )
-        states, elapsed, whole = self.states, self._elapsed, masses[:, -1]
-        for step, drawn in enumerate(draws):
-            # A threshold may round up to the whole mass: then the last action is taken.
-            actions = (bounds[states] <= (drawn * whole[states])[:, None]).sum(axis=1)
-            pairs[step] = taken = states * model.num_actions + actions
-            successors[step] = states = self._next_states(taken)
-            elapsed += 1
-            over = model.terminal[states] | (elapsed >= model.horizon)
-            ended[step] = over
-            if over.any():
-                states[over] = self._first_states(int(np.count_nonzero(over)))
-                elapsed[over] = 0
-        self.states = states
-        terminated = model.terminal[successors]
-        return FiniteSteps(
-            states=pairs // model.num_actions,
-            actions=pairs % model.num_actions,
-            rewards=self._rewards[pairs],
-            costs=self._costs[pairs],
-            terminated=terminated,
-            truncated=ended & ~terminated,
-            successors=successors,
-        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return the task, the states, the steps taken in each episode, and the generator."""

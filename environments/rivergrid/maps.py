@@ -97,28 +97,16 @@ class RiverMap:
         """Return all cells whose character is in ``tiles``, row by row."""
         return tuple((x, y) for y, row in enumerate(self.rows) for x, tile in enumerate(row) if tile in tiles)
 
-    def shortest_route(self, *, through: str) -> int | None:
-        """Return the fewest steps from the start to a goal, turns included; None if there is no path.
-
-        Args:
-            through: tiles that may be entered; start and goals always may.
-        """
-        crossable = {self.start, *self.cells(through + GOAL)}
-        seen = {(*self.start, self.heading)}
-        frontier, steps = list(seen), 0
+    def reaches_goal(self) -> bool:
+        """Whether some path leads from the start to a goal."""
+        reached, frontier = {self.start}, [self.start]
         while frontier:
-            reached = []
-            for x, y, heading in frontier:
-                if self.tile((x, y)) == GOAL:
-                    return steps
-                ahead = (x + STEPS[heading][0], y + STEPS[heading][1])
-                poses = [(x, y, (heading + 1) % 4), (x, y, (heading - 1) % 4)]
-                for pose in [*poses, (*ahead, heading)] if ahead in crossable else poses:
-                    if pose not in seen:
-                        seen.add(pose)
-                        reached.append(pose)
-            frontier, steps = reached, steps + 1
-        return None
+            x, y = frontier.pop()
+            following = {(x + right, y + down) for right, down in STEPS} - reached
+            entered = [cell for cell in following if self.tile(cell) != WALL]
+            reached.update(entered)
+            frontier += entered
+        return any(cell in reached for cell in self.cells(GOAL))
 
 
 def parse_map(text: str, *, source: str = "map") -> RiverMap:
@@ -136,7 +124,7 @@ def parse_map(text: str, *, source: str = "map") -> RiverMap:
     rows = tuple(line.rstrip() for line in "\n".join(lines[first:]).rstrip().split("\n"))
     _check_drawing(rows, source, first + 1)
     river_map = RiverMap(rows)
-    if river_map.shortest_route(through=GROUND) is None:
+    if not river_map.reaches_goal():
         raise MapError(f"{source}: no goal can be reached from the start, open a way through the walls")
     return river_map
 

@@ -4,7 +4,7 @@ from pydantic import Field
 
 from recrl.agents.algorithms.trpo import trust_region_step
 from recrl.agents.learning.actor_critic import fresh_agent
-from recrl.agents.learning.advantages import each_by_its_spread
+from recrl.agents.learning.advantages import standardised_advantages
 from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.registry import AgentEntry
 from recrl.agents.shared_options import TrustRegionConfig
@@ -43,7 +43,7 @@ class FixedMultiplier:
         share = min(1.0, self.updates.value / self.config.warm_up)
         violated = experience.constraints.gaps > 0.0  # [k]; false if the limit is infinite
         multipliers = share * self.config.multiplier * violated
-        advantages, _ = each_by_its_spread(experience.advantages)  # [N, 1 + k]
+        advantages, _ = standardised_advantages(experience.advantages)  # [N, 1 + k]
         objective = advantages[:, 0] - advantages[:, 1:] @ multipliers
         metrics = trust_region_step(policy, experience, objective, self.config, generator)
         return {**metrics, **indexed("multiplier", multipliers)}

@@ -6,6 +6,7 @@ import functools
 import json
 import math
 import re
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from pydantic import ValidationError
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.plugins import IMPORT_PATH
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.files.checkpoint_format import encode
 
@@ -187,3 +189,13 @@ def test_limits_and_episode_costs_must_fit_the_task_and_the_rollout() -> None:
     with pytest.raises(ValueError, match=f"one row for each episode .* {len(costs)}, got {len(costs) - 1}"):
         agent.update(rollout, costs[1:], CurriculumStep(limits))
     agent.update(rollout, costs, CurriculumStep(limits))
+
+
+@pytest.mark.parametrize(
+    ("path", "is_one"),
+    [("my.networks:make", True), ("módulo:netz", True), ("m:A.b", False), ("m.:a", False), ("m:a\n", False)],
+)
+def test_a_network_is_an_import_path_like_those_of_tasks_and_agents(path: str, is_one: bool) -> None:
+    assert is_one == bool(IMPORT_PATH.fullmatch(path))
+    with nullcontext() if is_one else pytest.raises(ValueError, match="network"):
+        agent_config("ppo", {"network": path})

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 
-from recrl.agents.agent import DiscretePolicy, InvertedPolicy
+from recrl.agents.agent import DiscretePolicy
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.errors import UnsupportedSpaceError
 from recrl.agents.registry import make_agent
@@ -104,86 +104,15 @@ def test_a_resumed_collector_continues_exactly() -> None:
     np.testing.assert_array_equal(found.rewards, expected.rewards)
 
 
-class Tabular:
-    """A policy over few actions that keeps its table to itself."""
-
-    def __init__(self, num_observations: int, num_actions: int) -> None:
-        self._weights = np.random.default_rng(5).random((num_observations, num_actions))
-
-    def masses(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Elementwise and then summed, so that no number depends on how many rows there are."""
-        summed = (observations[:, :, None] * self._weights).sum(axis=1)
-        masses: npt.NDArray[np.float64] = (1.0 + summed).cumsum(axis=1)
-        return masses
-
-    def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
-        masses = self.masses(observations)
-        thresholds = generator.random(len(masses)) * masses[:, -1]
-        return np.asarray((masses[:, :-1] <= thresholds[:, None]).sum(axis=1))
-
-
-class ShownTabular(Tabular):
-    """It lets collecting look into the table."""
-
-    def cumulative_masses(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        self.asked = len(observations)
-        return self.masses(observations)
-
-
-@pytest.mark.parametrize(
-    ("task", "options"),
-    [
-        ("two-state-2", {"horizon": 7}),  # successors are drawn, episodes only time out
-        ("rivergrid-1b", {"horizon": 40}),
-        ("rivergrid", {"map": "####\n#>G#\n#~.#\n####", "horizon": 6, "costs": ["river", "turns"]}),
-    ],
-)
-def test_from_a_table_is_collected_what_would_be_step_by_step(task: str, options: dict[str, Any]) -> None:
-    found = []
-    for kind in (Tabular, ShownTabular):
-        environments = make_vector(task, 5, options=options)
-        cmdp = environments.cmdp
-        policy = kind(observation_size(cmdp.observation_space), action_size(cmdp.action_space))
-        collector, generator = Collector(environments, num_steps=70), np.random.default_rng(0)
-        collector.reset(seed=3)
-        rollouts = [collector.collect(policy, generator) for _ in range(3)]
-        states = (collector.state_dict(), environments.state_dict(), generator.bit_generator.state)
-        found.append((rollouts, states))
-        if isinstance(policy, ShownTabular):
-            assert policy.asked == environments.finite_cmdp().num_states  # type: ignore[attr-defined]
-    (stepped, stepped_states), (tabular, tabular_states) = found
-    assert sum(len(episodes) for _, episodes in stepped) > 0
-    for (one, episodes), (other, same_episodes) in zip(stepped, tabular, strict=True):
-        assert episodes == same_episodes
-        for name in one.__dataclass_fields__:
-            assert getattr(one, name).dtype == getattr(other, name).dtype
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    np.testing.assert_equal(tabular_states, stepped_states)
-
-
-def test_environments_with_a_step_of_their_own_take_it() -> None:
-    environments = make_vector("two-state", 2)
-    environments.step = lambda actions: (_ for _ in ()).throw(ArithmeticError("taken"))  # type: ignore[method-assign]
-    collector = Collector(environments, num_steps=5)
-    collector.reset(seed=0)
-    with pytest.raises(ArithmeticError, match="taken"):
-        collector.collect(ShownTabular(2, 2), np.random.default_rng(0))
-
-
-def test_an_agent_acts_by_the_masses_that_it_shows() -> None:
+def test_an_agent_acts_by_inversion() -> None:
     environments = make_vector("rivergrid-1a", 4)
     agent = make_agent("ppo", environments.cmdp, {}, np.random.SeedSequence(0))
-    assert isinstance(agent, InvertedPolicy)
     observations, _ = environments.reset(seed=0)
-    masses = agent.cumulative_masses(observations)
     assert isinstance(agent, DiscretePolicy)
-    np.testing.assert_allclose(
-        np.diff(masses, prepend=0.0) / masses[:, -1:], agent.action_probabilities(observations), rtol=1e-6
-    )
+    cumulative = agent.action_probabilities(observations).cumsum(axis=1)
     draws = np.random.default_rng(1).random(4)
     expected = [
-        int(np.searchsorted(row, draw * row[-1], side="right"))
-        for row, draw in zip(masses, draws, strict=True)
+        int(np.searchsorted(row, draw, side="right")) for row, draw in zip(cumulative, draws, strict=True)
     ]
     assert agent.act(observations, np.random.default_rng(1)).tolist() == expected
 

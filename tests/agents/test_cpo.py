@@ -8,8 +8,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, LocalModel, acceptance
-from recrl.agents.algorithms.crpo import improvement
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, LocalModel, acceptance, improvement
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience

@@ -84,9 +84,9 @@ def distinct_batch(num_samples: int = 10) -> LearningBatch:
 def test_a_pass_has_every_sample_once_in_a_new_order() -> None:
     generator = np.random.default_rng(0)
     batch = distinct_batch()
-    assert batch.num_parts(4) == 3
+    assert batch.num_minibatches(4) == 3
     passes = []
-    parts = batch.parts(4, generator)
+    parts = batch.minibatches(4, generator)
     for _ in range(2):
         found = [next(parts) for _ in range(3)]
         assert [len(part.unique_observations) for part in found] == [4, 3, 3]
@@ -108,13 +108,13 @@ def test_a_minibatch_picks_its_own_of_the_samples_values() -> None:
 def test_a_batch_no_larger_than_a_minibatch_is_not_parted(size: int | None) -> None:
     batch, generator = distinct_batch(), np.random.default_rng(0)
     before = generator.bit_generator.state
-    assert next(batch.parts(size, generator)) is batch
+    assert next(batch.minibatches(size, generator)) is batch
     assert generator.bit_generator.state == before
 
 
 def test_repeated_rows_are_not_parted() -> None:
     batch = LearningBatch.deduplicate(ROWS[STATES], ACTIONS, compact=True)
-    assert next(batch.parts(1, np.random.default_rng(0))) is batch
+    assert next(batch.minibatches(1, np.random.default_rng(0))) is batch
 
 
 def test_more_distinct_rows_than_asked_for_leave_the_samples_alone() -> None:

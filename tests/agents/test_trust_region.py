@@ -28,6 +28,11 @@ def test_conjugate_gradients_of_nothing_are_nothing() -> None:
     assert found.tolist() == [0.0, 0.0, 0.0]
 
 
+def test_conjugate_gradients_of_a_metric_that_is_0_give_no_step() -> None:
+    found = conjugate_gradient(torch.zeros_like, torch.ones(3), iterations=10)
+    assert found.tolist() == [0.0, 0.0, 0.0]
+
+
 def test_conjugate_gradients_bear_a_saturated_policys_tiny_gradients() -> None:
     matrix = torch.diag(torch.tensor([1.0, 2.0, 4.0]))
     found = conjugate_gradient(lambda vector: matrix @ vector, torch.full((3,), 1e-14), iterations=10)

@@ -47,7 +47,6 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
         "bounds.csv",
         "verdicts.csv",
         "outcomes.csv",
-        "outcomes.parquet",
         "summary.csv",
         "comparisons.csv",
         "outcomes.tex",
@@ -99,7 +98,7 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     pictures = {path.name for path in sketched if path.suffix == ".png"}
     assert pictures == {"return-against-cost.png", "learning-curves_cpo.png", "curricula.png"}
     assert not any(path.suffix == ".pdf" for path in sketched)
-    tables = {path.name for path in sketched if path.suffix in (".csv", ".tex", ".parquet")}
+    tables = {path.name for path in sketched if path.suffix in (".csv", ".tex")}
     assert tables == {path.name for path in table_files.write_tables(sweep, tmp_path / "tables")[0]}
     text = sketched[1].read_text()
     assert f"- {drawing.UNFINISHED}" in text.splitlines()

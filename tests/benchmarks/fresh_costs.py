@@ -65,7 +65,7 @@ def continued(
     assert isinstance(agent, ActorCritic)
     assert isinstance(spare, ActorCritic)
     agent.load_state_dict(tree["agent"])
-    averages = {decay: PolicyAverage(spare._policy, decay) for decay in decays}
+    averages = {decay: PolicyAverage(spare._network, decay) for decay in decays}
     collector = Collector(environments, num_steps=spec.rollout_steps, staggered=True)
     collector.load_state_dict(tree["collector"])
     environments.load_state_dict(tree["environments"])
@@ -102,7 +102,7 @@ def continued(
         )
         agent.update(rollout, episode_costs(finished, 1), CurriculumStep(spec.deploy_limits))
         for average in averages.values():
-            average.add(agent._policy.parameters.to_numpy(), agent._encoder.statistics)
+            average.add(agent._network.parameters.to_numpy(), agent._encoder.statistics)
     return rows
 
 

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
+from recrl.environments.gymnasium_spaces import float32_vectors
 from recrl.environments.gymnasium_tasks import (
     GymnasiumOptions,
     draw_from_callable,
@@ -204,6 +205,13 @@ def test_another_number_of_costs_than_named_is_refused() -> None:
         match=r"info\['cost'\] must be a finite number for each of time \(.*cost_names\), got \[1, 2\]",
     ):
         environment.step(np.array([0]))
+
+
+def test_bounds_beyond_float32_are_infinite() -> None:
+    largest = np.finfo(np.float64).max
+    space = float32_vectors("x", spaces.Box(-largest, largest, (2,), np.float64))
+    assert space.low.tolist() == [-np.inf, -np.inf]
+    assert space.high.tolist() == [np.inf, np.inf]
 
 
 def test_continuous_actions_reach_the_environment_within_its_bounds() -> None:

@@ -45,16 +45,6 @@ def test_the_papers_maps_are_drawn_as_defined() -> None:
     )
 
 
-def test_only_1b_can_be_walked_round() -> None:
-    assert parse_map(MAPS["1a"]).shortest_route(through=DRY) is None
-    assert parse_map(MAPS["1b"]).shortest_route(through=DRY) is not None
-
-
-def test_routes_are_counted_in_steps_with_their_turns() -> None:
-    assert parse_map(MAPS["1a"]).shortest_route(through=DRY + RIVER) == 6
-    assert parse_map(MAPS["1b"]).shortest_route(through=DRY) == 11  # reward -0.1 * 10 + 10 = 9
-
-
 def test_cells_count_from_the_top_left_and_headings_from_east() -> None:
     river_map = parse_map("####\n#~G#\n#.^#\n####")
     assert (river_map.width, river_map.height) == (4, 4)

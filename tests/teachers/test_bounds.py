@@ -1,4 +1,4 @@
-"""Lemma 1, Proposition 1 and their inverse: by hand, against plain sums, and on random CMDPs."""
+"""Lemma 1, the sums of limits and their inverse: by hand, and on random CMDPs."""
 
 import math
 from collections.abc import Callable
@@ -6,25 +6,27 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits, Floats
 from recrl.teachers.bounds import (
-    MEAN_WEIGHTS,
-    Clock,
-    cumulative_bound,
+    DECAYS,
     discounted_excess,
     largest_train_limit,
-    proposition_1,
     undiscounted_excess,
     weight_sum,
 )
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.static import cosine, exponential, hold, limit_at, linear
 from recrl.teachers.teacher import ProgressReport, TeacherSpec
 
-CLOCKS: tuple[Clock, ...] = ("start", "end")
+# integral_0^1 w(p) dp, as docs/explanation/bounds.md has them
+MEAN_WEIGHTS = {
+    "none": 0.0,
+    "step": 1.0,
+    "dynamic": 1.0,
+    "linear": 1 / 2,
+    "cosine": 2 / math.pi,
+    "exponential": (math.e - 2) / (math.e - 1),
+}
 
 
 def test_lemma_1_by_hand() -> None:
@@ -43,72 +45,30 @@ def test_an_update_that_changes_nothing_exceeds_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("curriculum", "at_end"),
+    ("curriculum", "weights"),
     [
-        ("none", 80.0),
-        ("linear", 80.0 + 60.0 + 40.0 + 20.0),
-        ("step", 3 * 100.0 + 20.0),
-        ("dynamic", 3 * 100.0 + 20.0),
-        # 4 * 20 + 80 * (cos 22.5 + cos 45 + cos 67.5 degrees)
-        ("cosine", 80.0 + 80.0 * (0.9238795 + 0.7071068 + 0.3826834)),
-        # (80 * (0.7788008 + 0.6065307 + 0.4723666) + 3 * (20 - 36.7879441)) / 0.6321206 + 20
-        ("exponential", 175.43239),
+        ("none", 0.0),
+        ("linear", 1.0 + 0.75 + 0.5 + 0.25),
+        ("step", 4.0),
+        ("dynamic", 4.0),
+        ("cosine", 1.0 + 0.9238795 + 0.7071068 + 0.3826834),  # cos 0, 22.5, 45 and 67.5 degrees
+        # (e^-p - 1 / e) / (1 - 1 / e)
+        ("exponential", 1.0 + (0.7788008 + 0.6065307 + 0.4723666 - 3 * 0.3678794) / 0.6321206),
     ],
 )
-def test_limits_from_100_to_20_over_four_policies_by_hand(curriculum: str, at_end: float) -> None:
-    sums = {
-        clock: cumulative_bound(curriculum, 100.0, 20.0, excesses=[0.0] * 4, clock=clock) for clock in CLOCKS
-    }
-    assert sums["end"] == pytest.approx(at_end, abs=1e-4)
-    assert sums["start"] - sums["end"] == pytest.approx(0.0 if curriculum == "none" else 80.0)
+def test_the_weights_over_four_policies_by_hand(curriculum: str, weights: float) -> None:
+    assert weight_sum(curriculum, 4) == pytest.approx(weights, abs=1e-6)
 
 
-def test_proposition_1_as_the_paper_has_it() -> None:
-    excesses = [0.5, 1.0, 1.5, 2.0]
-    assert proposition_1("linear", 100.0, 20.0, excesses=excesses) == 4 * (20 + 100) / 2 + 5.0
-
-
-def test_proposition_1_exceeds_the_linear_sum_by_half_the_difference_of_the_limits() -> None:
-    excesses = [0.5, 1.0, 1.5, 2.0]
-    exact = cumulative_bound("linear", 100.0, 20.0, excesses=excesses, clock="end")
-    assert proposition_1("linear", 100.0, 20.0, excesses=excesses) - exact == (100 - 20) / 2
-    exact = cumulative_bound("linear", 100.0, 20.0, excesses=excesses, clock="start")
-    assert proposition_1("linear", 100.0, 20.0, excesses=excesses) - exact == -(100 - 20) / 2
-
-
-DECAYS = {"step": hold, "dynamic": hold, "linear": linear, "cosine": cosine, "exponential": exponential}
-
-
-def summed_limits(
-    curriculum: str, train_limit: float, deploy_limit: float, *, policies: int, clock: Clock
-) -> float:
-    """The sum of a curriculum's limits, sum_b D(b), by adding them up."""
-    if curriculum == "none":
-        return policies * deploy_limit
-    first = 1 if clock == "end" else 0
-    return math.fsum(
-        limit_at(b / policies, train_limit, deploy_limit, DECAYS[curriculum])
-        for b in range(first, policies + first)
-    )
-
-
-@pytest.mark.parametrize("clock", CLOCKS)
-@pytest.mark.parametrize("curriculum", MEAN_WEIGHTS)
-@settings(max_examples=50, deadline=None)
-@given(deploy=st.floats(0.0, 50.0), relaxed=st.floats(0.0, 500.0), policies=st.integers(1, 400))
-def test_closed_forms_are_the_sums(
-    curriculum: str, clock: Clock, deploy: float, relaxed: float, policies: int
-) -> None:
-    closed = cumulative_bound(curriculum, deploy + relaxed, deploy, excesses=[0.0] * policies, clock=clock)
-    summed = summed_limits(curriculum, deploy + relaxed, deploy, policies=policies, clock=clock)
-    assert closed == pytest.approx(summed, rel=1e-9, abs=1e-9)
-
-
-@pytest.mark.parametrize("curriculum", MEAN_WEIGHTS)
+@pytest.mark.parametrize("curriculum", DECAYS)
 @pytest.mark.parametrize("policies", [1, 2, 10, 333])
-def test_proposition_1_lies_between_the_two_clocks(curriculum: str, policies: int) -> None:
-    early, late = (weight_sum(curriculum, policies=policies, clock=clock) for clock in ("start", "end"))
-    assert late - 1e-9 <= policies * MEAN_WEIGHTS[curriculum] <= early + 1e-9
+def test_the_papers_mean_lies_between_the_sums_of_algorithm_1_and_of_a_trial(
+    curriculum: str, policies: int
+) -> None:
+    """Algorithm 1 has p = b / n, so its sum lacks w(0) - w(1) of a trial's."""
+    trial = weight_sum(curriculum, policies)
+    algorithm_1 = trial - (curriculum != "none")
+    assert algorithm_1 - 1e-9 <= policies * MEAN_WEIGHTS[curriculum] <= trial + 1e-9
 
 
 @pytest.mark.parametrize("curriculum", ["none", "step", "linear", "cosine", "exponential"])
@@ -119,33 +79,29 @@ def test_the_clock_of_a_trial_is_that_of_its_teacher(curriculum: str) -> None:
     for update in range(1, 7):
         lesson, state = teacher.step(state, ProgressReport(update, 100 * update, ()))
         limits.append(lesson.limits[0])
-    assert sum(limits) == pytest.approx(
-        cumulative_bound(curriculum, 100.0, 20.0, excesses=[0.0] * 7, clock="start")
-    )
+    assert sum(limits) == pytest.approx(7 * 20.0 + weight_sum(curriculum, 7) * 80.0)
 
 
-@pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("curriculum", ["step", "linear", "cosine", "exponential", "dynamic"])
-def test_the_inverse_spends_the_budget_exactly(curriculum: str, clock: Clock) -> None:
+def test_the_inverse_spends_the_budget_exactly(curriculum: str) -> None:
     excesses = [0.1 * b for b in range(50)]
-    train_limit = largest_train_limit(curriculum, 4000.0, 20.0, excesses=excesses, clock=clock)
-    assert cumulative_bound(curriculum, train_limit, 20.0, excesses=excesses, clock=clock) == pytest.approx(
-        4000.0
-    )
+    train_limit = largest_train_limit(curriculum, 4000.0, 20.0, excesses=excesses)
+    spent = 50 * 20.0 + weight_sum(curriculum, 50) * (train_limit - 20.0) + sum(excesses)
+    assert spent == pytest.approx(4000.0)
     assert train_limit > 20.0
 
 
 def test_a_budget_without_slack_allows_d_d_only() -> None:
-    assert largest_train_limit("linear", 81.0, 20.0, excesses=[0.25] * 4, clock="end") == 20.0
+    assert largest_train_limit("linear", 81.0, 20.0, excesses=[0.25] * 4) == 20.0
 
 
 def test_d_t_does_not_matter_without_a_curriculum() -> None:
-    assert largest_train_limit("none", 81.0, 20.0, excesses=[0.25] * 4, clock="end") == math.inf
+    assert largest_train_limit("none", 81.0, 20.0, excesses=[0.25] * 4) == math.inf
 
 
 def test_a_budget_below_that_of_d_d_is_refused() -> None:
     with pytest.raises(ValueError) as error:
-        largest_train_limit("linear", 50.0, 20.0, excesses=[0.25] * 4, clock="end")
+        largest_train_limit("linear", 50.0, 20.0, excesses=[0.25] * 4)
     assert str(error.value) == (
         "budget must be at least 81, the bound for d_t = d_d = 20 over 4 policies, got 50"
     )
@@ -165,27 +121,19 @@ def test_a_budget_below_that_of_d_d_is_refused() -> None:
         ),
         (lambda: undiscounted_excess(0.02, 3.0, horizon=0), "horizon must be at least 1, got 0"),
         (
-            lambda: cumulative_bound("linear", 20.0, 100.0, excesses=[0.0], clock="start"),
-            "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), got 20 and 100",
+            lambda: largest_train_limit("linear", 100.0, -5.0, excesses=[0.0]),
+            "deploy_limit must be finite and at least 0, got -5",
         ),
         (
-            lambda: proposition_1("linear", math.inf, 20.0, excesses=[0.0]),
-            "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), got inf and 20",
+            lambda: largest_train_limit("linear", 100.0, math.inf, excesses=[0.0]),
+            "deploy_limit must be finite and at least 0, got inf",
         ),
         (
-            lambda: largest_train_limit("linear", 100.0, -5.0, excesses=[0.0], clock="start"),
-            "limits must be finite with train_limit >= deploy_limit >= 0 (d_t >= d_d), got -5 and -5",
-        ),
-        (
-            lambda: largest_train_limit("linear", math.nan, 5.0, excesses=[0.0], clock="start"),
+            lambda: largest_train_limit("linear", math.nan, 5.0, excesses=[0.0]),
             "budget must be at least 5, the bound for d_t = d_d = 5 over 1 policies, got nan",
         ),
         (
-            lambda: cumulative_bound("linear", 100.0, 20.0, excesses=[], clock="start"),
-            "there must be at least 1 policy, got 0",
-        ),
-        (
-            lambda: proposition_1("linear", 100.0, 20.0, excesses=[]),
+            lambda: largest_train_limit("linear", 100.0, 20.0, excesses=[]),
             "there must be at least 1 policy, got 0",
         ),
     ],
@@ -198,7 +146,7 @@ def test_arguments_out_of_their_range_are_one_sentence(wrong: Callable[[], float
 
 def test_a_curriculum_without_a_bound_is_refused() -> None:
     with pytest.raises(ValueError) as error:
-        proposition_1("unconstrained", 100.0, 20.0, excesses=[0.0])
+        weight_sum("unconstrained", 3)
     assert str(error.value) == (
         "only none, step, dynamic, linear, cosine, exponential have a bound before they have run, "
         "got 'unconstrained'"

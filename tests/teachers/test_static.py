@@ -7,7 +7,7 @@ import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.static import Decay, StaticTeacher, cosine, exponential, hold, limit_at, linear
+from recrl.teachers.static import Decay, StaticTeacher, constant, cosine, exponential, limit_at, linear
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 
 DECAYS = (linear, cosine, exponential)
@@ -57,12 +57,12 @@ def test_exponential_lies_below_linear_and_linear_below_cosine(p: float) -> None
     assert exponential(p, 250.0, 25.0) < linear(p, 250.0, 25.0) < cosine(p, 250.0, 25.0)
 
 
-@pytest.mark.parametrize("decay", [*DECAYS, hold])
+@pytest.mark.parametrize("decay", [*DECAYS, constant])
 def test_a_limit_is_d_d_exactly_from_the_end_of_the_budget_on(decay: Decay) -> None:
     assert limit_at(1.0, 0.3, 0.1, decay) == 0.1
 
 
-@pytest.mark.parametrize("decay", [*DECAYS, hold])
+@pytest.mark.parametrize("decay", [*DECAYS, constant])
 @pytest.mark.parametrize("p", [0.0, 0.5, 0.99])
 def test_an_infinite_start_stays_infinite_until_the_end(decay: Decay, p: float) -> None:
     assert limit_at(p, math.inf, 25.0, decay) == math.inf
