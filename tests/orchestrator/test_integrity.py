@@ -1,7 +1,6 @@
 """What is committed is held against its length and digest: damage is named, and nothing is made of it."""
 
 import shutil
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -542,7 +541,6 @@ def test_an_agent_whose_metrics_change_is_named_and_one_that_reorders_them_is_no
         names = [str(name) for name in one if name not in ("time", "collect_seconds", "update_seconds")]
         assert sorted(map(str, one)) == sorted(map(str, other))
         assert one[names].equals(other[names])
-    del sys.modules["my_fickle_agent"]
 
 
 def test_episodes_must_all_have_the_same_costs(tmp_path: Path) -> None:

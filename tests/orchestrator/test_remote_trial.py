@@ -578,7 +578,7 @@ STEPS = st.lists(
 
 
 @given(steps=STEPS)
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_fails_readers_see_one_commit_and_the_end_is_complete(
     steps: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:

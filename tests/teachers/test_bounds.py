@@ -94,7 +94,7 @@ def summed_limits(
 
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("curriculum", MEAN_WEIGHTS)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(deploy=st.floats(0.0, 50.0), relaxed=st.floats(0.0, 500.0), policies=st.integers(1, 400))
 def test_closed_forms_are_the_sums(
     curriculum: str, clock: Clock, deploy: float, relaxed: float, policies: int
