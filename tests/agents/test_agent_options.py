@@ -98,21 +98,19 @@ def _learnt(agent: str, task: str, options_json: str) -> bytes:
     return encode(student.state_dict())
 
 
-CASES = [
-    (agent, option)
-    for agent in AGENTS
-    for option in sorted(set(agent_config(agent, {}).model_dump()) - ELSEWHERE)
-]
-
-
-@pytest.mark.parametrize(("agent", "option"), CASES)
-def test_another_value_of_an_option_gives_another_agent(agent: str, option: str) -> None:
-    value, needed = OTHERS[option]
+@pytest.mark.parametrize("agent", AGENTS)
+def test_another_value_of_an_option_gives_another_agent(agent: str) -> None:
     known = set(agent_config(agent, {}).model_dump())
-    basis = {"hidden_sizes": [8], "critic_steps": 5} | {
-        name: given for name, given in needed.items() if name in known
-    }
-    assert any(learnt(agent, task, basis) != learnt(agent, task, basis | {option: value}) for task in TASKS)
+    without_effect = []
+    for option in sorted(known - ELSEWHERE):
+        value, needed = OTHERS[option]
+        basis = {"hidden_sizes": [8], "critic_steps": 5} | {
+            name: given for name, given in needed.items() if name in known
+        }
+        changed = basis | {option: value}
+        if all(learnt(agent, task, basis) == learnt(agent, task, changed) for task in TASKS):
+            without_effect.append(option)
+    assert not without_effect
 
 
 @pytest.mark.parametrize(
