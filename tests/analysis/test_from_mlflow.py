@@ -14,6 +14,7 @@ from urllib.parse import urlparse
 import pandas as pd
 import pytest
 
+import recrl
 from recrl.analysis.data import export, from_mlflow, sweep_data
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.orchestrator.cli.main import main
@@ -107,6 +108,10 @@ def test_a_database_gives_the_sweep_and_says_what_is_missing(sweep: SweepStore, 
     assert note.endswith(ended)
     told = calendar.timegm(time.strptime(note.removeprefix(started).removesuffix(ended), "%Y-%m-%d %H:%M:%S"))
     assert abs(artifact(sweep).stat().st_mtime - told) < 60  # by a machine under load
+
+
+def test_the_python_api_takes_an_address(sweep: SweepStore, exported: Sweep) -> None:
+    same(recrl.load_sweep(tracking_uri(sweep, None), sweep.name), exported)
 
 
 @pytest.mark.usefixtures("server")

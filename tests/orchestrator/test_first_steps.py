@@ -148,6 +148,13 @@ def test_options_of_nobody_and_of_a_stranger(
     assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
 
 
+def test_options_of_a_task_of_ones_own_are_shown_to_who_trusts_it(capsys: pytest.CaptureFixture[str]) -> None:
+    output(capsys, "init", "--template", "own-task")
+    out = output(capsys, "options", "my_task:make", "--trust")
+    assert out.startswith("my_task:make, in a grid's tasks: ")
+    assert out.endswith("Its options are these keyword arguments.\n")
+
+
 def test_the_schema_accepts_every_grid_of_ours(capsys: pytest.CaptureFixture[str]) -> None:
     schema = json.loads(output(capsys, "schema"))
     jsonschema.Draft202012Validator.check_schema(schema)
