@@ -148,8 +148,9 @@ def test_an_option_without_effect_is_an_error(agent: str, options: dict[str, Any
 @pytest.mark.parametrize("preset", ["recommended", "paper"])
 @pytest.mark.parametrize("agent", sorted(AGENTS))
 def test_the_full_options_of_an_agent_are_its_options(agent: str, preset: str) -> None:
-    full = agent_config(agent, {"preset": preset}).model_dump()
-    assert agent_config(agent, full).model_dump() == full
+    config = agent_config(agent, {"preset": preset})
+    for mode in ("python", "json"):
+        assert agent_config(agent, config.model_dump(mode=mode)) == config
 
 
 @pytest.mark.parametrize(

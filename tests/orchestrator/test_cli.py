@@ -714,16 +714,16 @@ def _own_room(folder: Path, module: str, info: str, task: str) -> None:
 SCRIPT = "import sys; sys.path.remove(''); from recrl.orchestrator.cli.main import main; sys.exit(main({}))"
 
 
-@pytest.mark.parametrize("task", ["name: 'room_a:Room'", "name: gymnasium, options: {id: 'room_a:Room-v0'}"])
-def test_modules_in_the_working_directory_are_found(folder: Path, task: str) -> None:
+def test_modules_in_the_working_directory_are_found(folder: Path) -> None:
     """Also by Ray's workers; the installed command does not look there by itself."""
-    _own_room(folder, "room_a", "{'cost': 1.0}", task)
+    other = "name: gymnasium, deploy_limits: 2, options: {id: 'room_a:Room-v0'}}, {name: 'room_a:Room'"
+    _own_room(folder, "room_a", "{'cost': 1.0}", other)
     done = _python(SCRIPT.format(["validate", "grid.yaml", "--trust"]), folder)
     assert (done.returncode, done.stderr) == (0, "")
     done = _python(SCRIPT.format(["launch", "grid.yaml", "--no-mlflow", "--no-figures"]), folder)
     assert (done.returncode, done.stderr) == (0, "")
     assert "\nStarting Ray ...\n" in done.stdout
-    assert "small: 2 of 2 complete" in done.stdout
+    assert "small: 4 of 4 complete" in done.stdout
 
 
 def test_a_module_that_is_nowhere_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -86,7 +86,7 @@ def test_every_option_is_described(capsys: pytest.CaptureFixture[str], name: str
 
     (kind,) = kinds_of(name)
     for option in options_of(kind.model(name)):
-        assert option.description, f"{name}: {option.name}"
+        assert option.description.endswith("."), f"{name}: {option.name}"
         assert not re.search(r"[<\[]|typing|None", option.type), f"{name}: {option.name}: {option.type}"
 
 

@@ -2,13 +2,12 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from recrl.analysis.data import sweep_data
@@ -583,9 +582,3 @@ def _only_for_writing(open_path: Callable[..., object]) -> Callable[..., object]
 
 def _refuse(*_: object) -> bytes:
     raise AssertionError("a commit reads nothing")
-
-
-@pytest.fixture(autouse=True)
-def _no_numpy_warnings() -> Iterator[None]:
-    with np.errstate(all="ignore"):
-        yield
