@@ -20,28 +20,14 @@ from recrl.agents.learning.gradient_ascent import (
     normalised_by_penalties,
     with_entropy,
 )
-from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
 from recrl.agents.networks.flat_parameters import Adam
 from recrl.environments.cmdp import Floats
+from tests.agents.sampled import sampled
 
 SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
 DELTA = 0.01
-
-
-def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floats]:
-    """A policy, what it did, and advantages of the reward and two costs."""
-    generator = np.random.default_rng(0)
-    policy = StochasticPolicy(
-        3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
-    )
-    observations = generator.normal(size=(400, 3)).astype(np.float32)
-    actions = policy.sample(observations, generator)
-    liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
-    advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    return policy, LearningBatch.deduplicate(observations, actions, compact=True), advantages
 
 
 def rule_of(name: str, policy: StochasticPolicy) -> PolicyRule:

@@ -34,6 +34,7 @@ from recrl.orchestrator.trial import speed
 from recrl.orchestrator.trial.saved_policy import SavedTrial
 from recrl.orchestrator.trial.speed import measured_speed
 from recrl.orchestrator.trial.trial import Trial
+from tests.orchestrator.launches import INLINE
 
 GRID = """\
 name: small
@@ -52,7 +53,6 @@ def make(cmdp, config, seed):
 
 ENTRY = AgentEntry("An unlucky agent.", PPOLagConfig, make)
 """
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 
 
 @pytest.fixture

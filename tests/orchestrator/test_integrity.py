@@ -26,6 +26,7 @@ from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_swee
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
+from tests.orchestrator.launches import INLINE
 
 GRID = """\
 name: small
@@ -35,7 +36,6 @@ methods: [none, linear]
 seeds: 1
 run: {total_steps: 120, deploy_fraction: 0.5, num_envs: 2, rollout_steps: 10, evaluation_episodes: 2}
 """
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 RERUN = "launch --rerun-damaged runs the trial again and moves the damaged files aside"
 GOES_ON = "the next launch continues from the intact files and moves the damaged ones aside"
 SPECS = parse_grid(GRID.encode(), source="grid.yaml").trials()

@@ -39,6 +39,7 @@ from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
+from tests.orchestrator.launches import INLINE
 
 GRID = """\
 name: small
@@ -48,7 +49,6 @@ methods: [none, linear]
 seeds: 1
 run: {total_steps: 320, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 
 
 @dataclass(frozen=True)
