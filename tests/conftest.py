@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from recrl.analysis.data.sweep_data import Sweep, load
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
@@ -22,6 +23,9 @@ from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
+
+settings.register_profile("recrl", deadline=None)  # a loaded machine is no failure
+settings.load_profile("recrl")
 
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0

@@ -12,29 +12,16 @@ from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, LocalMode
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
-from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
 from recrl.agents.networks.architecture import NetworkForm, orthogonal
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.environments.cmdp import Floats
+from tests.agents.sampled import sampled
 
-NUM_SAMPLES, DELTA = 400, 0.01
+DELTA = 0.01
 LENGTH = 10.0
 SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
-
-
-def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floats]:
-    """A policy, what it did, and advantages: the reward likes what the first cost dislikes."""
-    generator = np.random.default_rng(0)
-    policy = StochasticPolicy(
-        3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
-    )
-    observations = generator.normal(size=(NUM_SAMPLES, 3)).astype(np.float32)
-    actions = policy.sample(observations, generator)
-    liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
-    advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    return policy, LearningBatch.deduplicate(observations, actions, compact=True), advantages
 
 
 def improve(

@@ -1,6 +1,6 @@
 """The gradient of every loss of every agent against finite differences, in float64, through the network."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -32,11 +32,7 @@ CLIP = 0.1
 STEP = 1e-6
 
 
-@pytest.fixture(autouse=True)
-def double_precision() -> Iterator[None]:
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
+pytestmark = pytest.mark.usefixtures("double_precision")
 
 
 def moved_policy(space: Space[object], compact: bool) -> tuple[StochasticPolicy, Experience]:

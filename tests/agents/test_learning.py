@@ -32,12 +32,12 @@ class Lesson:
 # The closed-form optimum is of a policy without noise.
 NO_BOUND = {"min_std": 0.0}
 LESSONS = [
-    Lesson("ppo-lag", "two-state", (3.0,), 150, seeds=2),
-    Lesson("cpo", "two-state", (3.0,), 80, seeds=2),
-    Lesson("ppo-lag", "two-state-2", (5.0, 2.0), 150, seeds=2, num_envs=64),
-    Lesson("cpo", "two-state-2", (5.0, 2.0), 80, seeds=2),
-    Lesson("ppo-lag", "continuous-bandit", (2.5,), 500, seeds=2, options=NO_BOUND),
-    Lesson("cpo", "continuous-bandit", (2.5,), 80, seeds=2, options=NO_BOUND),
+    Lesson("ppo-lag", "two-state", (3.0,), 150),
+    Lesson("cpo", "two-state", (3.0,), 80),
+    Lesson("ppo-lag", "two-state-2", (5.0, 2.0), 150, num_envs=64),
+    Lesson("cpo", "two-state-2", (5.0, 2.0), 80),
+    Lesson("ppo-lag", "continuous-bandit", (2.5,), 500, options=NO_BOUND),
+    Lesson("cpo", "continuous-bandit", (2.5,), 80, options=NO_BOUND),
     Lesson("trpo-lag", "two-state", (3.0,), 150),
     Lesson("trpo-lag", "two-state-2", (5.0, 2.0), 200),
     Lesson("trpo-lag", "continuous-bandit", (2.5,), 150, options=NO_BOUND),

@@ -1,7 +1,5 @@
 """Policies: their distributions, sampling, noise, and the trust region's metric."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -18,13 +16,6 @@ FORM = NetworkForm((5, 4), orthogonal)
 THREE_ACTIONS = Discrete(3)
 TWO_COMPONENTS = Box(np.array([-1.0, -2.0], np.float32), np.array([1.0, 2.0], np.float32))
 SPACES = [THREE_ACTIONS, TWO_COMPONENTS]
-
-
-@pytest.fixture
-def double_precision() -> Iterator[None]:
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
 
 
 def policy_for(space: Space[object], last_scale: float = 1.0) -> StochasticPolicy:

@@ -1,7 +1,5 @@
 """Networks differentiated by hand against PyTorch's automatic differentiation, and Adam against PyTorch's."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -15,13 +13,6 @@ from recrl.agents.networks.tanh_stack import FEW_COLUMNS, TanhStack
 
 # One layer wider than what add_product multiplies as rows, the others not.
 SIZES = (3, FEW_COLUMNS + 2, 4, 2)
-
-
-@pytest.fixture
-def double_precision() -> Iterator[None]:
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
 
 
 def stack_of(num_networks: int, seed: int = 0) -> tuple[FlatParameters, TanhStack]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, Floats
+from recrl.environments.finite import exact_solver
 from recrl.environments.finite.exact_solver import ConstrainedOptimum, evaluate_policy, solve_by_lagrangian
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv, InfeasibleLimitsError
 from recrl.environments.registry import make_vector, optimal_return
@@ -294,15 +295,21 @@ def test_a_policy_whose_rows_are_no_probabilities_is_refused(row: list[float]) -
         )
 
 
-def test_the_optimum_is_known_in_well_under_a_second_and_then_at_once() -> None:
+def test_the_optimum_is_solved_once_in_well_under_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = []
+
+    def timed(model: FiniteCMDP, limits: CostLimits) -> ConstrainedOptimum:
+        before = time.thread_time()  # without what other threads of the process do
+        solved = solve_by_lagrangian(model, limits)
+        seconds.append(time.thread_time() - before)
+        return solved
+
+    monkeypatch.setattr(exact_solver, "solve_by_lagrangian", timed)
     limits = CostLimits((1.2345,))
-    times = []
-    for _ in range(2):
-        before = time.process_time()
-        optimal_return("rivergrid-1b", {}, limits)
-        times.append(time.process_time() - before)
-    assert times[0] < 1.0
-    assert times[1] < 0.05
+    first, again = (optimal_return("rivergrid-1b", {}, limits) for _ in range(2))
+    assert first == again
+    assert len(seconds) == 1
+    assert seconds[0] < 1.0
 
 
 @pytest.mark.parametrize("name", ["two-state", "two-state-2", "rivergrid-1a"])

@@ -30,8 +30,20 @@ def test_everything_a_task_refers_to_exists_and_explains_itself(name: str) -> No
     assert issubclass(model, BaseModel)
     assert model.model_config["frozen"]
     assert model.model_config["extra"] == "forbid"
-    for field_name, field in model.model_fields.items():
-        assert (field.description or "").endswith("."), field_name
+
+
+@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.optimum is not None])
+def test_a_looser_limit_never_lowers_the_optimum(name: str) -> None:
+    options = dict(TASKS[name].sample_options)
+    if "horizon" in type(task_options(name, options)).model_fields:
+        options["horizon"] = 12
+    num_costs = make_vector(name, 1, options=options).cmdp.num_costs
+    optima = [
+        optimal_return(name, options, CostLimits((limit,) * num_costs)) for limit in (0.0, 0.5, 2.0, math.inf)
+    ]
+    known = [optimum for optimum in optima if optimum is not None]
+    assert len(known) == len(optima)
+    assert known == sorted(known)
 
 
 def test_building_rivergrid_imports_nothing_slow() -> None:

@@ -111,7 +111,7 @@ def test_a_map_on_which_the_river_does_not_matter_is_no_instance_and_has_no_limi
         suggested_limit(river_map)
 
 
-@settings(max_examples=25, deadline=None)  # a loaded machine is no failure
+@settings(max_examples=25)
 @given(
     map_seed=st.integers(0, 2**64),
     width=st.integers(6, 12),

@@ -101,11 +101,12 @@ def test_a_single_environment_is_the_first_of_a_batch_with_its_seed() -> None:
 @pytest.mark.parametrize("name", LEVEL_2)
 def test_results_do_not_depend_on_threads(name: str) -> None:
     streams = []
-    for num_threads in (1, 2):
-        environment = SafetyGymVectorEnv(name, 3, num_threads=num_threads)
+    for num_threads in (1, 2, 3, 8):
+        environment = SafetyGymVectorEnv(name, 6, num_threads=num_threads)
         environment.reset(seed=0)
-        streams.append([as_bytes(environment.step(action)) for action in held_actions(60, 3)])
-    assert streams[0] == streams[1]
+        steps = [as_bytes(environment.step(action)) for action in held_actions(60, 6)]
+        streams.append([*steps, environment.batch.simulations.rows.tobytes()])
+    assert streams[1:] == streams[:1] * 3
 
 
 @pytest.mark.parametrize("name", LEVEL_2)

@@ -14,7 +14,6 @@ import pytest
 from numba.core import types
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.safety_gym_environments import SafetyGymVectorEnv
 from recrl.environments.safety_gym.scene import make_scene
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.saved_state import SavedState
@@ -233,19 +232,6 @@ def test_a_failure_in_an_interrupted_call_is_told(tmp_path: Path, monkeypatch: p
 def test_simulations_that_are_not_there_or_named_twice_are_refused(ids: list[Any]) -> None:
     with pytest.raises(ValueError, match=r"must be different whole numbers from 0 to 11, got \["):
         many(2).apply(count, counters().ctypes.data, ids)
-
-
-def _states(num_threads: int) -> bytes:
-    environment = SafetyGymVectorEnv("CarPush2", 6, num_threads=num_threads)
-    environment.reset(seed=3)
-    for actions in np.random.default_rng(0).uniform(-1.0, 1.0, (40, 6, 2)):
-        environment.step(actions)
-    return environment.batch.simulations.rows.tobytes()
-
-
-@pytest.mark.parametrize("num_threads", [2, 3, 8])
-def test_threads_change_no_bit(num_threads: int) -> None:
-    assert _states(num_threads) == _states(1)
 
 
 def test_a_view_outlives_its_simulations() -> None:

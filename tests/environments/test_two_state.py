@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits
@@ -23,7 +23,6 @@ from recrl.environments.registry import make_vector
 options = st.builds(TwoStateOptions, horizon=st.integers(2, 15), arrival=st.floats(0.1, 1.0))
 
 
-@settings(deadline=None)  # a loaded machine is no failure
 @given(options, st.floats(0.0, 20.0))
 def test_the_closed_form_is_the_exact_optimum_for_one_cost(options: TwoStateOptions, wear: float) -> None:
     limits = CostLimits((wear,))
@@ -31,7 +30,6 @@ def test_the_closed_form_is_the_exact_optimum_for_one_cost(options: TwoStateOpti
     assert two_state_optimum("two-state", options, limits) == pytest.approx(exact, abs=1e-6)
 
 
-@settings(deadline=None)  # a loaded machine is no failure
 @given(options, st.floats(0.0, 20.0), st.floats(0.0, 20.0))
 def test_the_closed_form_is_the_exact_optimum_for_two_costs(
     options: TwoStateOptions, wear: float, noise: float
@@ -41,7 +39,6 @@ def test_the_closed_form_is_the_exact_optimum_for_two_costs(
     assert two_state_optimum("two-state-2", options, limits) == pytest.approx(exact, abs=1e-6)
 
 
-@settings(deadline=None)  # a loaded machine is no failure
 @given(options, st.floats(0.0, 20.0), st.floats(0.0, 20.0))
 def test_a_stationary_policy_reaches_the_optimum_with_both_constraints_binding(
     options: TwoStateOptions, wear: float, noise: float

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import io
 import json
 import os
@@ -556,7 +557,18 @@ def _flip(at: float) -> None:
 
 
 def _bomb() -> None:
-    _pack({**_read_good(), "updates.csv": b"0" * 600 * 2**20})
+    Path("evil.zip").write_bytes(_bomb_of(Path("good.zip").read_bytes()))
+
+
+@functools.cache  # packing 600 MiB takes seconds
+def _bomb_of(good: bytes) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(good)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in {**members, "updates.csv": b"0" * 600 * 2**20}.items():
+            archive.writestr(name, data)
+    return packed.getvalue()
 
 
 def _liar() -> None:
@@ -677,19 +689,18 @@ def cases() -> list[Case]:
 
 
 @contextlib.contextmanager
-def workplace() -> Iterator[Path]:
-    """A working directory with a right grid, a finished sweep ``small`` and its compact file."""
+def workplace(folder: Path) -> Iterator[None]:
+    """Put a right grid, a finished sweep ``small`` and its compact file into a folder, and work there."""
     before = Path.cwd()
-    with tempfile.TemporaryDirectory(prefix="bad-inputs-") as name:
-        os.chdir(name)
-        try:
-            Path("grid.yaml").write_text(yaml.safe_dump(GRID))
-            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                assert main(["launch", "grid.yaml", *INLINE]) == 0
-                assert main(["export", "small", "--to", "good.zip"]) == 0
-            yield Path(name)
-        finally:
-            os.chdir(before)
+    os.chdir(folder)
+    try:
+        Path("grid.yaml").write_text(yaml.safe_dump(GRID))
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            assert main(["launch", "grid.yaml", *INLINE]) == 0
+            assert main(["export", "small", "--to", "good.zip"]) == 0
+        yield
+    finally:
+        os.chdir(before)
 
 
 def ask(case: Case, home: Path) -> Answer:
@@ -751,9 +762,9 @@ def run() -> int:
     given = parser.parse_args()
     chosen = cases()[:: given.every]
     answers = []
-    with workplace() as home:
+    with tempfile.TemporaryDirectory(prefix="bad-inputs-") as name, workplace(Path(name)):
         for case in chosen:
-            answers.append(ask(case, home))
+            answers.append(ask(case, Path(name)))
             if answers[-1].problem:
                 last = answers[-1].text.strip().splitlines()[-1:] or [""]
                 print(f"{case.name}: {answers[-1].problem}: {last[0][:300]}", flush=True)

@@ -1,5 +1,6 @@
 """Every wrong input gets a sentence; the whole list is run by ``python tests/faults/bad_inputs.py``."""
 
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,13 +13,19 @@ ALWAYS = ("task: ", "--only ", "evaluate --video", "figures --to", "--cores", "s
 
 
 @pytest.fixture(scope="module")
-def home() -> Iterator[Path]:
-    with workplace() as folder:
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("bad-inputs")
+    with workplace(folder):
         yield folder
 
 
+def is_chosen(name: str) -> bool:
+    """Whether a case is tried; a new case changes nothing for the others."""
+    return zlib.crc32(name.encode()) % EVERY == 0 or any(word in name for word in ALWAYS)
+
+
 def chosen() -> list[Case]:
-    return [it for at, it in enumerate(cases()) if at % EVERY == 0 or any(word in it.name for word in ALWAYS)]
+    return [case for case in cases() if is_chosen(case.name)]
 
 
 def test_there_are_hundreds_and_each_is_there_once() -> None:

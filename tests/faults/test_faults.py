@@ -222,7 +222,6 @@ def test_numbers_that_break_down_are_located(tmp_path: Path, monkeypatch: pytest
     assert "in update 5" in store.error_path.read_text()
     assert store.updates()["update"].tolist() == [1, 2, 3, 4]
     assert store.latest_checkpoint() is not None
-    del sys.modules["my_poisoned_task"]
 
 
 def test_a_thread_that_works_is_heard_and_one_that_waits_is_not() -> None:
@@ -246,7 +245,7 @@ def test_a_trial_that_takes_long_to_begin_is_heard_meanwhile(
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("recrl.orchestrator.trial.attempt.HEARTBEAT_SECONDS", 0.01)
     assert run_recorded(spec, store, should_stop=lambda: True) is TrialState.WAITING
-    assert sys.modules.pop("my_slow_task").heard
+    assert sys.modules["my_slow_task"].heard
 
 
 def test_a_trial_that_was_taken_over_learns_it_from_its_heartbeat() -> None:

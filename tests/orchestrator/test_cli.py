@@ -1,6 +1,7 @@
 """The command line: quick to start, honest in its exit codes, and its errors are sentences."""
 
 import errno
+import itertools
 import os
 import re
 import resource
@@ -8,16 +9,17 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from recrl.analysis.figures import learning_curves
 from recrl.environments.plugins import load_attribute
-from recrl.orchestrator.cli import status
+from recrl.orchestrator.cli import display, status
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse
 from recrl.orchestrator.cli.main import main
@@ -26,10 +28,13 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.find_sweep import find_sweep
 from recrl.orchestrator.grid.checked_grid import GridSpec
-from recrl.orchestrator.grid.checking import parse_grid, read_grid
+from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.trial import speed
 from recrl.orchestrator.trial.saved_policy import SavedTrial
 from recrl.orchestrator.trial.speed import measured_speed
+from recrl.orchestrator.trial.trial import Trial
+from tests.orchestrator.launches import INLINE
 
 GRID = """\
 name: small
@@ -48,7 +53,6 @@ def make(cmdp, config, seed):
 
 ENTRY = AgentEntry("An unlucky agent.", PPOLagConfig, make)
 """
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 
 
 @pytest.fixture
@@ -236,7 +240,6 @@ def test_failed_trials_are_named_with_their_log(
         GRID.replace("[ppo-lag]", "[{name: 'my_unlucky_student:ENTRY', label: unlucky}]")
     )
     assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
-    del sys.modules["my_unlucky_student"]
     trial = SweepStore(Path("runs"), "small").trials()[0].folder.name
     assert capsys.readouterr().out.splitlines()[-4:] == [
         "small: 0 of 1 complete, 0 running, 0 waiting, 1 failed; 0%",
@@ -256,7 +259,6 @@ def test_an_error_without_a_text_fails_its_trial(
     monkeypatch.syspath_prepend(folder)
     (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_silent_student:ENTRY'"))
     assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
-    del sys.modules["my_silent_student"]
     assert "none seed 0: Silent: its text cannot be read\n" in capsys.readouterr().out
 
 
@@ -268,7 +270,6 @@ def test_no_password_is_printed(
     (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_unlucky_student:ENTRY'"))
     uri = "postgresql://me:hunter2@database/mlflow"
     assert main(["launch", "grid.yaml", *INLINE, "--tracking-uri", uri]) == ExitCode.TRIALS_FAILED
-    del sys.modules["my_unlucky_student"]
     out = capsys.readouterr().out
     assert "--tracking-uri postgresql://***@database/mlflow --retry-failed" in out
     assert "hunter2" not in out
@@ -337,15 +338,6 @@ def test_a_plan_for_a_cluster_that_is_not_there_is_a_sentence(
 ) -> None:
     assert main(["plan", "grid.yaml", "--address", "127.0.0.1:1"]) == ExitCode.CANNOT_RUN
     assert capsys.readouterr().err.startswith("recrl-sweep: cannot use the Ray cluster at 127.0.0.1:1: ")
-
-
-@pytest.mark.parametrize(
-    "arguments", [["lunch"], [], ["launch"], ["launch", "g.yaml", "--max-concurrent", "0"]]
-)
-def test_what_cannot_be_parsed_is_wrong_input(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(arguments)
-    assert end.value.code == ExitCode.WRONG_INPUT
 
 
 def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
@@ -537,8 +529,9 @@ def test_lists_and_films_do_not_swallow_what_follows(
 def test_a_wrong_option_is_a_sentence(
     folder: Path, capsys: pytest.CaptureFixture[str], option: str, sentence: str
 ) -> None:
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as end:
         main(["plan", "grid.yaml", option])
+    assert end.value.code == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.splitlines()[-1] == f"recrl-sweep plan: error: {sentence}"
 
 
@@ -666,13 +659,32 @@ def test_plan_measures_what_has_not_run_yet(folder: Path, capsys: pytest.Capture
     assert not (folder / "runs").exists()
 
 
-def test_a_measured_speed_is_that_of_a_run(folder: Path) -> None:
-    """Within a factor of three, as other processes share the machine."""
-    (folder / "grid.yaml").write_text(GRID.replace("total_steps: 160", "total_steps: 20_000"))
-    speed = measured_speed(read_grid(folder / "grid.yaml").trials()[0], seconds=0.5)
-    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
-    record = SweepStore(Path("runs"), "small").trials()[0].record()
-    assert 1 / 3 < speed / (record.env_steps / record.cpu_seconds) < 3
+@pytest.mark.parametrize(
+    ("total_steps", "first", "expected"),
+    [
+        (20_000, 2.0, 160.0),  # 12 updates in 3 s after the first one
+        (20_000, 4.0, 10.0),  # the first one takes the whole time
+        (160, 2.0, 160.0),  # the trial ends before the time is over: 3 updates in 0.75 s
+        (40, 2.0, 20.0),  # it ends with the first one
+    ],
+)
+def test_a_measured_speed_is_steps_by_cpu_seconds_after_the_first_update(
+    monkeypatch: pytest.MonkeyPatch, total_steps: int, first: float, expected: float
+) -> None:
+    """Updates of 40 steps; by the clock the first takes ``first`` seconds, each of the others 0.25."""
+    clock = [100.0]
+    takes = itertools.chain([first], itertools.repeat(0.25))
+    advance = Trial.advance
+
+    def advance_clock(trial: Trial) -> None:
+        clock[0] += next(takes)
+        advance(trial)
+
+    monkeypatch.setattr(Trial, "advance", advance_clock)
+    monkeypatch.setattr(speed, "time", SimpleNamespace(process_time=lambda: clock[0]))
+    grid = GRID.replace("total_steps: 160", f"total_steps: {total_steps}")
+    spec = parse_grid(grid.encode(), source="grid.yaml").trials()[0]
+    assert measured_speed(spec, seconds=3.0) == expected
 
 
 ROOM = """\
@@ -702,16 +714,16 @@ def _own_room(folder: Path, module: str, info: str, task: str) -> None:
 SCRIPT = "import sys; sys.path.remove(''); from recrl.orchestrator.cli.main import main; sys.exit(main({}))"
 
 
-@pytest.mark.parametrize("task", ["name: 'room_a:Room'", "name: gymnasium, options: {id: 'room_a:Room-v0'}"])
-def test_modules_in_the_working_directory_are_found(folder: Path, task: str) -> None:
+def test_modules_in_the_working_directory_are_found(folder: Path) -> None:
     """Also by Ray's workers; the installed command does not look there by itself."""
-    _own_room(folder, "room_a", "{'cost': 1.0}", task)
+    other = "name: gymnasium, deploy_limits: 2, options: {id: 'room_a:Room-v0'}}, {name: 'room_a:Room'"
+    _own_room(folder, "room_a", "{'cost': 1.0}", other)
     done = _python(SCRIPT.format(["validate", "grid.yaml", "--trust"]), folder)
     assert (done.returncode, done.stderr) == (0, "")
     done = _python(SCRIPT.format(["launch", "grid.yaml", "--no-mlflow", "--no-figures"]), folder)
     assert (done.returncode, done.stderr) == (0, "")
     assert "\nStarting Ray ...\n" in done.stdout
-    assert "small: 2 of 2 complete" in done.stdout
+    assert "small: 4 of 4 complete" in done.stdout
 
 
 def test_a_module_that_is_nowhere_is_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -764,40 +776,48 @@ def test_logs_show_return_and_cost(folder: Path, capsys: pytest.CaptureFixture[s
     assert len(re.findall(line, out)) == 1
 
 
-def _log_of_a_trial_that_begins_later(store: SweepStore, grid: GridSpec, *words: str) -> None:
-    """Follow a log during a launch whose first trial begins after a second, and runs for another."""
+def _log_of_a_trial_that_begins_later(
+    monkeypatch: pytest.MonkeyPatch, store: SweepStore, grid: GridSpec, *words: str
+) -> None:
+    """Follow a log during a launch whose first trial begins in a third pause, and ends in a sixth."""
     spec = grid.trials()[0]
 
-    def begin_later() -> None:
-        time.sleep(1.0)
+    def happens() -> Iterator[None]:
+        yield from [None] * 2
         writer = store.trial(spec).begin(spec)
         store.trial(spec).log_path.write_text("it began\n")
-        time.sleep(1.0)
+        yield from [None] * 3
         writer.close(TrialState.WAITING)
+        yield
 
+    pauses = happens()
+    clock = SimpleNamespace(sleep=lambda seconds: next(pauses), monotonic=time.monotonic, time=time.time)
+    for module in (status, display):
+        monkeypatch.setattr(module, "time", clock)
     with store.lock():
         store.write_info({"name": store.name})
         store.write_specs(grid.trials(), grid.text)
-        thread = threading.Thread(target=begin_later)
-        thread.start()
         assert main(["logs", "small", *words, "--follow"]) == ExitCode.OK
-        thread.join()
+    assert list(pauses) == []
 
 
-def test_following_a_log_waits_for_the_start(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_following_a_log_waits_for_the_start(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = SweepStore(folder / "runs", "small")
-    _log_of_a_trial_that_begins_later(store, parse_grid(GRID.encode(), source="grid.yaml"))
+    grid = parse_grid(GRID.encode(), source="grid.yaml")
+    _log_of_a_trial_that_begins_later(monkeypatch, store, grid)
     assert capsys.readouterr().out == "small: waiting for a trial to start\nit began\n"
 
 
 def test_following_the_log_of_a_stopped_trial_waits_until_it_runs_again(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(folder / "runs", "small")
     spec = grid.trials()[0]
     store.trial(spec).begin(spec).close(TrialState.WAITING)
-    _log_of_a_trial_that_begins_later(store, grid, spec.trial_id)
+    _log_of_a_trial_that_begins_later(monkeypatch, store, grid, spec.trial_id)
     assert "it began\n" in capsys.readouterr().out
 
 

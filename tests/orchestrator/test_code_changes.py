@@ -35,6 +35,7 @@ from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_swee
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
+from tests.orchestrator.launches import INLINE
 
 TASK = """\
 from recrl.environments.registry import Task
@@ -62,7 +63,6 @@ seeds: [SEEDS]
 train_limits: 9
 run: {total_steps: 80, deploy_fraction: 0.5, num_envs: 2, rollout_steps: 10, evaluation_episodes: 2}
 """
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 SENTENCE = (
     "warning: 1 complete trial comes from other code than is installed now; launch --rerun-changed runs it "
     "again"

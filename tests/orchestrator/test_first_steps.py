@@ -24,10 +24,9 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty working directory; modules that are imported from it are forgotten afterwards."""
+    """An empty working directory."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.delitem(sys.modules, "my_task", raising=False)
     return tmp_path
 
 
@@ -87,7 +86,7 @@ def test_every_option_is_described(capsys: pytest.CaptureFixture[str], name: str
 
     (kind,) = kinds_of(name)
     for option in options_of(kind.model(name)):
-        assert option.description, f"{name}: {option.name}"
+        assert option.description.endswith("."), f"{name}: {option.name}"
         assert not re.search(r"[<\[]|typing|None", option.type), f"{name}: {option.name}: {option.type}"
 
 
@@ -147,6 +146,13 @@ def test_options_of_nobody_and_of_a_stranger(
 ) -> None:
     assert main(["options", name]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
+
+
+def test_options_of_a_task_of_ones_own_are_shown_to_who_trusts_it(capsys: pytest.CaptureFixture[str]) -> None:
+    output(capsys, "init", "--template", "own-task")
+    out = output(capsys, "options", "my_task:make", "--trust")
+    assert out.startswith("my_task:make, in a grid's tasks: ")
+    assert out.endswith("Its options are these keyword arguments.\n")
 
 
 def test_the_schema_accepts_every_grid_of_ours(capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,9 +20,7 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
 
 EXAMPLES = int(os.environ.get("RECRL_FUZZ_EXAMPLES", "60"))
-FUZZED = settings(
-    max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck), print_blob=True
-)
+FUZZED = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck), print_blob=True)
 
 RIGHT: dict[str, Any] = {
     "name": "fuzzed",

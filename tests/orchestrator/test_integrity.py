@@ -1,15 +1,13 @@
 """What is committed is held against its length and digest: damage is named, and nothing is made of it."""
 
 import shutil
-import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from recrl.analysis.data import sweep_data
@@ -28,6 +26,7 @@ from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_swee
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
+from tests.orchestrator.launches import INLINE
 
 GRID = """\
 name: small
@@ -37,7 +36,6 @@ methods: [none, linear]
 seeds: 1
 run: {total_steps: 120, deploy_fraction: 0.5, num_envs: 2, rollout_steps: 10, evaluation_episodes: 2}
 """
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 RERUN = "launch --rerun-damaged runs the trial again and moves the damaged files aside"
 GOES_ON = "the next launch continues from the intact files and moves the damaged ones aside"
 SPECS = parse_grid(GRID.encode(), source="grid.yaml").trials()
@@ -542,7 +540,6 @@ def test_an_agent_whose_metrics_change_is_named_and_one_that_reorders_them_is_no
         names = [str(name) for name in one if name not in ("time", "collect_seconds", "update_seconds")]
         assert sorted(map(str, one)) == sorted(map(str, other))
         assert one[names].equals(other[names])
-    del sys.modules["my_fickle_agent"]
 
 
 def test_episodes_must_all_have_the_same_costs(tmp_path: Path) -> None:
@@ -585,9 +582,3 @@ def _only_for_writing(open_path: Callable[..., object]) -> Callable[..., object]
 
 def _refuse(*_: object) -> bytes:
     raise AssertionError("a commit reads nothing")
-
-
-@pytest.fixture(autouse=True)
-def _no_numpy_warnings() -> Iterator[None]:
-    with np.errstate(all="ignore"):
-        yield

@@ -64,9 +64,11 @@ CRASHING = replace(LINEAR, task=Choice("os:abort"))
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[None]:
+def cluster() -> Iterator[object]:
+    """A cluster of ours; the value is the handler of SIGTERM before it was started."""
+    before = signal.getsignal(signal.SIGTERM)
     with local_cluster(num_cpus=2):
-        yield
+        yield before
 
 
 @pytest.fixture(scope="module")
@@ -385,9 +387,8 @@ def test_a_cluster_of_ours_has_no_process_that_serves_nobody() -> None:
     assert not any(name in command for command in commands for name in (b"log_monitor", b"monitor.py"))
 
 
-@pytest.mark.usefixtures("cluster")
-def test_rays_signal_handlers_do_not_replace_ours() -> None:
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+def test_rays_signal_handlers_do_not_replace_ours(cluster: object) -> None:
+    assert signal.getsignal(signal.SIGTERM) is cluster
 
 
 def test_a_cluster_that_is_not_there_is_a_sentence() -> None:

@@ -20,7 +20,7 @@ tasks: [{name: two-state, deploy_limits: 3, options: {horizon: 10}}]
 agents: [{name: ppo-lag, options: {hidden_sizes: [8]}}]
 methods: [linear]
 seeds: 1
-run: {total_steps: 100_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
+run: {total_steps: 50_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
 """
 COMMAND = [
     sys.executable,
@@ -73,6 +73,7 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
     while comm(trial) and time.monotonic() < end:  # it is killed; the kernel takes its time
         time.sleep(0.1)
     assert comm(trial) == ""
+    assert all(it.record().update < it.spec.num_updates for it in store.trials())  # it died in the middle
     again = launch(tmp_path)
     _, errors = again.communicate(timeout=300.0)
     assert again.returncode == 0, errors
@@ -81,12 +82,14 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
 
 def test_what_a_killed_launch_left_of_ray_is_ended_by_the_next_one(tmp_path: Path) -> None:
     (tmp_path / "grid.yaml").write_text(GRID)
+    store = SweepStore(tmp_path / "runs", "bereft")
     driver = launch(tmp_path)
-    running_trial(SweepStore(tmp_path / "runs", "bereft"))
+    running_trial(store)
     processes = [pid for pid in descendants(driver.pid, "") if comm(pid).startswith(("ray::", "raylet"))]
     assert len(processes) >= 4
     driver.kill()
     driver.communicate()
+    assert all(it.record().update < it.spec.num_updates for it in store.trials())  # it died in the middle
     again = launch(tmp_path)
     _, errors = again.communicate(timeout=300.0)
     assert again.returncode == 0, errors

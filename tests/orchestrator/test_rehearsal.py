@@ -1,6 +1,5 @@
 """The user's own parts are tried before a launch: do they work, and do they resume exactly?"""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -192,7 +191,6 @@ STAIRCASE, TOO_LOW, NO_STEP, LONG = (TeacherKind(kind.__name__, NoOptions, kind)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_rehearsed.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "own_rehearsed", raising=False)
 
 
 def problems(

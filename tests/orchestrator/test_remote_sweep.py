@@ -18,6 +18,7 @@ import fsspec
 import numpy as np
 import pytest
 
+from recrl.analysis.data import export
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
 from recrl.orchestrator.executors import InlineExecutor
@@ -38,6 +39,7 @@ from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
+from tests.orchestrator.launches import INLINE
 
 GRID = """\
 name: small
@@ -47,7 +49,6 @@ methods: [none, linear]
 seeds: 1
 run: {total_steps: 320, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 
 
 @dataclass(frozen=True)
@@ -469,6 +470,31 @@ def test_the_command_line_takes_the_address_once(
     assert main(["stop", "small", *elsewhere]) == ExitCode.OK
     assert capsys.readouterr().out == "small: no launch runs this sweep\n"
     assert main(["evaluate", "small", "two-state ppo-lag none", "--root", "third", "--storage", uri]) == 0
+
+
+def test_commands_that_read_take_the_address_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grid.yaml").write_text(GRID)
+    uri = f"file://{tmp_path}/bucket"
+    launch = ["launch", "grid.yaml", *INLINE, "--only", "method=none"]
+    assert main([*launch, "--storage", uri]) == ExitCode.OK
+
+    def read(*arguments: str) -> str:
+        """What a command shows on a machine that has seen nothing of the sweep."""
+        capsys.readouterr()
+        root = Path("machine", arguments[0])
+        assert main([*arguments, "--root", str(root), "--storage", uri]) == ExitCode.OK
+        assert len(SweepStore(root, "small").trials()) == 1
+        return capsys.readouterr().out
+
+    assert "small: " in read("check", "small")
+    assert "complete: 8 updates" in read("logs", "small", "two-state ppo-lag none")
+    read("figures", "small", "--sketch", "--to", "drawn")
+    assert list(Path("drawn").glob("learning-curves*.png"))
+    read("export", "small", "--to", "small.zip")
+    assert export.load(Path("small.zip")).trials["status"].tolist() == ["complete", "waiting"]
 
 
 def test_a_launch_says_that_the_store_does_not_have_the_sweep_of_its_local_copy(

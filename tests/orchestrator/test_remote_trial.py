@@ -578,7 +578,7 @@ STEPS = st.lists(
 
 
 @given(steps=STEPS)
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_fails_readers_see_one_commit_and_the_end_is_complete(
     steps: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -681,7 +681,7 @@ def test_a_store_without_exclusive_writes_is_looked_at_first(bucket: RemoteTrial
 
 def test_who_cannot_create_exclusively_for_once_does_not_write_all_the_same(bucket: RemoteTrial) -> None:
     Unreliable.plan.append("refused")
-    with pytest.raises(StorageError, match=r"launch|cannot be written"):
+    with pytest.raises(StorageError, match=r"/bucket: cannot be written \(OSError: the network is down\)$"):
         bucket.objects.create("launch.json", b"first")
     assert bucket.objects.read("launch.json") is None
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -176,7 +175,6 @@ def test_one_trial_that_fails_leaves_the_others_alone(
     (tmp_path / "broken").unlink()
     assert _launch(store, grid).plan.to_do == ()  # not tried again by itself
     assert _launch(store, grid, retry_failed=True).progress.is_complete
-    del sys.modules["my_fragile_student"]
 
 
 def test_what_a_dead_launch_left_running_is_resumed(store: SweepStore) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,14 +65,27 @@ def contents(store: TrialStore) -> dict[str, bytes]:
     }
 
 
-@pytest.fixture
-def complete(tmp_path: Path) -> TrialStore:
-    return run(tmp_path, SPEC)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TrialStore]:
+    """Complete trials, by the name of their task."""
+    return {spec.task.name: run(tmp_path_factory.mktemp("made"), spec) for spec in (SPEC, RIVER)}
+
+
+def copied(trial: TrialStore, folder: Path) -> TrialStore:
+    """A copy of a trial and its sweep."""
+    shutil.copytree(trial.folder.parents[2], folder, dirs_exist_ok=True)
+    [copy] = SweepStore(folder, "small").trials()
+    return copy
 
 
 @pytest.fixture
-def crossing(tmp_path: Path) -> TrialStore:
-    return run(tmp_path, RIVER)
+def complete(made: dict[str, TrialStore], tmp_path: Path) -> TrialStore:
+    return copied(made["two-state"], tmp_path)
+
+
+@pytest.fixture
+def crossing(made: dict[str, TrialStore], tmp_path: Path) -> TrialStore:
+    return copied(made["rivergrid-1a"], tmp_path)
 
 
 def test_a_complete_trials_evaluation_comes_out_again(complete: TrialStore) -> None:

@@ -52,9 +52,6 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
     from mlflow.tracking import MlflowClient
 
-# MLflow 3.17 maps its tables in a way that SQLAlchemy 2.1 calls deprecated; not ours to mend.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy is deprecated")
-
 ROWS = b"update,phase,noise\n1,training,0.0\n2,training,0.5\n3,training,0.0\n4,training,0.0\n"
 
 
@@ -688,6 +685,26 @@ def test_sync_measures_the_final_policies_that_no_report_has(
     written = (store.figures_folder / "outcomes.csv").stat().st_mtime_ns
     assert main(["sync", "small"]) == ExitCode.OK
     assert (store.figures_folder / "outcomes.csv").stat().st_mtime_ns == written
+
+
+def test_sync_rebuilds_what_mlflow_shows(
+    tmp_path: Path, made_up_sweep: Callable[..., SweepStore], empty_database: Path
+) -> None:
+    store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none"])
+    shutil.copy(empty_database, store.mlflow_database)
+    command = ["sync", store.name, "--root", str(tmp_path)]
+    assert main(command) == ExitCode.OK
+    before = runs(store)
+    sent = before["a cpo none seed 0"]
+    connect(store).log_metric(sent.info.run_id, "stray", 1.0)
+    assert main(command) == ExitCode.OK
+    assert "stray" in runs(store)["a cpo none seed 0"].data.metrics
+    assert main([*command, "--rebuild"]) == ExitCode.OK
+    after = runs(store)
+    rebuilt = after["a cpo none seed 0"]
+    assert after.keys() == before.keys()
+    assert rebuilt.info.run_id != sent.info.run_id
+    assert rebuilt.data.metrics == sent.data.metrics
 
 
 def test_failed_trials_are_in_the_table_of_verdicts() -> None:

@@ -2,11 +2,11 @@
 
 import json
 import re
+import shutil
 import signal
 import sys
 import threading
 import zipfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
@@ -32,8 +32,8 @@ from recrl.orchestrator.remote.remote_trial import RemoteTrial
 from recrl.orchestrator.run_sweep import stopping_on_signals
 from recrl.orchestrator.spec import Choice, TrialSpec
 from tests.faults.bad_inputs import changed
+from tests.orchestrator.launches import INLINE
 
-INLINE = ("--executor", "inline", "--no-mlflow", "--no-figures")
 SPY = """\
 from pathlib import Path
 from recrl.environments.registry import Task
@@ -49,24 +49,29 @@ TASK = Task("Leaves a trace when it is imported.", TwoStateOptions, make)
 REFUSED = "because a file that is only read must run no code"
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished sweep, and its zip, whose task is named by an import path."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "spy.py").write_text(SPY)
+    (folder / "grid.yaml").write_text(changed("tasks", 0, "name", to="spy:TASK"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(folder)
+        assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+        assert main(["export", "small", "--to", "small.zip"]) == ExitCode.OK
+    (folder / "RUN").unlink()
+    del sys.modules["spy"]
+    return folder
+
+
 @pytest.fixture
-def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A working directory with a finished sweep, and its zip, whose task is named by an import path."""
+def foreign(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory that is a copy of it; nothing has imported its task."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "spy.py").write_text(SPY)
-    (tmp_path / "grid.yaml").write_text(changed("tasks", 0, "name", to="spy:TASK"))
-    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
-    assert main(["export", "small", "--to", "small.zip"]) == ExitCode.OK
-    forget(tmp_path)
-    yield tmp_path
-    sys.modules.pop("spy", None)
-
-
-def forget(folder: Path) -> None:
-    """Let the task be imported anew, if anybody does."""
-    (folder / "RUN").unlink(missing_ok=True)
-    sys.modules.pop("spy", None)
+    return tmp_path
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 GENERATED = DOCS / "reference" / "generated"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if GENERATED not in page.parents)
+README = ROOT / "README.md"
 FENCE = re.compile(
     r"^(?P<ticks>`{3,}|:{3,})(?P<info>[^\n]*)\n(?P<body>.*?)^(?P=ticks)\s*$", re.DOTALL | re.MULTILINE
 )

@@ -59,6 +59,16 @@ def sentences(text: str) -> list[str]:
     return [it for it in found if it]
 
 
+def line_of(source: str, sentence: str) -> int:
+    """The line of a source on which a sentence begins, by as many of its words as are found; 1 if none is."""
+    words = sentence.split()
+    for number in range(len(words), 0, -1):
+        found = re.search(r"\W+".join(map(re.escape, words[:number])), source)
+        if found:
+            return source.count("\n", 0, found.start()) + 1
+    return 1
+
+
 def misnamed(text: str) -> Iterator[str]:
     """The banned words of a text, each with what to write."""
     for sentence in sentences(text):

@@ -10,12 +10,9 @@ import io
 import re
 import tokenize
 from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
 
 from tests.project.documentation import ROOT, label
-from tests.project.prose import misnamed, sentences
+from tests.project.prose import line_of, misnamed, sentences
 
 MOST_WORDS = 25  # of a sentence; symbols and code do not count
 FOLDERS = ("agents", "analysis", "environments", "orchestrator", "teachers", "src/recrl", "docs/_ext")
@@ -91,17 +88,27 @@ def is_word(token: str) -> bool:
     )
 
 
-@pytest.mark.parametrize("module", MODULES, ids=label)
-def test_sentences_are_short(module: Path) -> None:
-    found = [it for text in texts(module.read_text(encoding="utf-8")) for it in sentences(text)]
-    long = [it for it in found if sum(map(is_word, it.split())) > MOST_WORDS]
-    assert not long, f"more than {MOST_WORDS} words: {long}"
+def test_sentences_are_short() -> None:
+    long = [
+        f"{label(module)}:{line_of(source, it)}: {it}"
+        for module in MODULES
+        for source in [module.read_text(encoding="utf-8")]
+        for text in texts(source)
+        for it in sentences(text)
+        if sum(map(is_word, it.split())) > MOST_WORDS
+    ]
+    assert not long, f"more than {MOST_WORDS} words:\n" + "\n".join(long)
 
 
-@pytest.mark.parametrize("module", MODULES, ids=label)
-def test_words_are_those_of_the_field(module: Path) -> None:
-    found = [it for text in texts(module.read_text(encoding="utf-8")) for it in misnamed(text)]
-    assert not found
+def test_words_are_those_of_the_field() -> None:
+    found = [
+        f"{label(module)}:{line_of(source, it.split(': ', 2)[-1])}: {it}"
+        for module in MODULES
+        for source in [module.read_text(encoding="utf-8")]
+        for text in texts(source)
+        for it in misnamed(text)
+    ]
+    assert not found, "\n".join(found)
 
 
 def test_docstrings_comments_and_messages_are_read_without_examples_and_code() -> None:

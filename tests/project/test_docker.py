@@ -17,7 +17,8 @@ import kubernetes_validate
 import pytest
 import yaml
 
-ROOT = Path(__file__).parents[2]
+from tests.project.documentation import ROOT
+
 DOCKER = ROOT / "docker"
 MANIFESTS = sorted((DOCKER / "k8s").glob("*.yaml"))
 COMPOSE_SCHEMA = ["--builtin-schema", "vendor.compose-spec"]

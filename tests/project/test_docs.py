@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+import recrl
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.analysis.data import sweep_data
@@ -18,9 +19,10 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files import trial_files
+from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.file_models import GridFile
-from tests.project.documentation import DOCS, PAGES, ROOT, Fence, fences, label
+from tests.project.documentation import DOCS, PAGES, README, ROOT, Fence, fences, label
 
 BASE: dict[str, Any] = {
     "name": "page",
@@ -31,21 +33,38 @@ BASE: dict[str, Any] = {
     "deploy_limits": 5,
     "run": {"total_steps": 10_000},
 }
+WALK = """\
+import gymnasium
+import numpy as np
+
+class Walk(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, True, {"cost": 1.0}
+
+gymnasium.register("Walk-v0", Walk)
+"""  # the environment of the README's reader
 REFERENCE = DOCS / "reference"
 
 
 def grids() -> Iterator[Any]:
     """Every fence that is a grid, or a part of one."""
-    for page in PAGES:
+    for page in (README, *PAGES):
         for number, fence in enumerate(fences(page)):
             if fence.language == "yaml":
                 yield pytest.param(fence, id=f"{label(page)}-{number}")
 
 
 @pytest.mark.parametrize("fence", list(grids()))
-def test_every_grid_and_part_of_a_grid_is_valid(fence: Fence, monkeypatch: pytest.MonkeyPatch) -> None:
-    for example in (ROOT / "examples").iterdir():
-        monkeypatch.syspath_prepend(str(example))
+def test_every_grid_and_part_of_a_grid_is_valid(
+    fence: Fence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_env.py").write_text(WALK)
+    for folder in (tmp_path, *(ROOT / "examples").iterdir()):
+        monkeypatch.syspath_prepend(str(folder))
     given = yaml.safe_load(fence.text)
     assert set(given) <= set(GridFile.model_fields), "a yaml fence must hold keys of a grid"
     complete = yaml.safe_dump(given if fence.caption else BASE | given)
@@ -61,6 +80,28 @@ def test_python_in_fences_runs(page: Path, tmp_path: Path, monkeypatch: pytest.M
     for fence in fences(page):
         if fence.language == "python" and not fence.caption:
             exec(compile(fence.text, label(page), "exec"), names)
+
+
+def test_python_of_the_readme_runs(
+    finished_sweep: SweepStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With the steps of two updates, and another sweep in the place of the demo."""
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "demo").symlink_to(finished_sweep.folder)
+    monkeypatch.chdir(tmp_path)
+    train = recrl.train
+    short = {"total_steps": 1_600, "deploy_fraction": 0.5, "evaluation_episodes": 2}
+    short |= {"num_envs": 4, "rollout_steps": 200}
+    monkeypatch.setattr(recrl, "train", lambda *words, **options: train(*words, **options | short))
+    names: dict[str, Any] = {}
+    (fence,) = (fence for fence in fences(README) if fence.language == "python")
+    exec(compile(fence.text, label(README), "exec"), names)
+    assert list(names["training"].evaluations["policy"].unique()) == ["stochastic", "deterministic"]
+    assert "cost_0" in capsys.readouterr().out
+    assert len(names["sweep"].trials) == 36
 
 
 def test_every_metric_of_every_agent_is_explained() -> None:

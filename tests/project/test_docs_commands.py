@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.project.documentation import DOCS, PAGES, ROOT, fences, label
+from tests.project.documentation import DOCS, PAGES, README, ROOT, fences, label
 
 TUTORIALS = sorted(
     page for page in (DOCS / "tutorials").glob("*.md") if any(f.language == "shell" for f in fences(page))
@@ -53,11 +53,14 @@ def test_only_tutorials_have_commands_that_are_executed() -> None:
 def test_commands_that_are_not_executed_are_commands_that_exist() -> None:
     from recrl.orchestrator.cli.arguments import parser, spread  # noqa: PLC0415
 
-    for page in PAGES:
+    parsed = set()
+    for page in (README, *PAGES):
         for fence in fences(page):
-            if fence.language != "console":
+            if fence.language not in ("console", ""):
                 continue
             for line in fence.text.splitlines():
                 words = line.split("#")[0].split()
                 if words[:1] == ["recrl-sweep"]:
                     parser().parse_args(spread([word.strip("'\"") for word in words[1:]]))
+                    parsed.add(page)
+    assert README in parsed

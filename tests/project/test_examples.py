@@ -16,8 +16,8 @@ from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
+from tests.project.documentation import ROOT
 
-ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 GRID = """\
 name: plugged

@@ -1,11 +1,11 @@
 """The wheel carries every module of the five folders."""
 
 import tomllib
-from pathlib import Path
 
 from setuptools import find_packages
 
-ROOT = Path(__file__).parents[2]
+from tests.project.documentation import ROOT
+
 FOLDERS = ("orchestrator", "agents", "environments", "teachers", "analysis")
 
 

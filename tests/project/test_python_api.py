@@ -17,9 +17,12 @@ import torch
 
 import recrl
 from recrl.analysis.data import export
+from recrl.orchestrator.cli import launch
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.launch_grid import LaunchOptions
 from recrl.orchestrator.trial.trial import Trial
 
 RUN = {"total_steps": 160, "deploy_fraction": 0.5, "num_envs": 4, "rollout_steps": 10}
@@ -439,6 +442,25 @@ def test_a_place_that_cannot_be_used_is_a_sentence(folder: Path, place: str, sen
 def test_only_an_address_takes_the_name_of_a_sweep(finished_sweep: SweepStore) -> None:
     with pytest.raises(recrl.RecrlError, match=r"^name: only an MLflow address takes one; .* got 'other'$"):
         recrl.load_sweep(finished_sweep.folder, "other")
+
+
+def test_a_launch_without_options_is_that_of_the_command(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On Ray, with MLflow and figures."""
+    asked: list[LaunchOptions] = []
+
+    def launched(grid: GridSpec, options: LaunchOptions, *_: object, **__: object) -> ExitCode:
+        asked.append(options)
+        return ExitCode.STOPPED
+
+    monkeypatch.setattr(launch, "launch_and_print", launched)
+    with pytest.raises(KeyboardInterrupt):
+        recrl.launch(GRID)
+    (folder / "grid.yaml").write_text(json.dumps(GRID))
+    assert main(["launch", "grid.yaml"]) == ExitCode.STOPPED
+    assert asked[0] == asked[1]
+    assert (asked[0].executor, asked[0].mlflow, asked[0].figures) == ("ray", True, True)
 
 
 def test_validate_takes_a_file_or_a_dictionary(folder: Path) -> None:

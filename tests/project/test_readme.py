@@ -13,8 +13,8 @@ import pandas as pd
 import pytest
 
 from recrl.analysis.statistics.verdicts import solved
+from tests.project.documentation import ROOT
 
-ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 TABLES = (".csv", ".txt")
 

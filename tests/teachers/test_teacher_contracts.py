@@ -31,7 +31,7 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
     ("dynamic", {"window": 2, "window_unit": "episodes", "start_fraction": 0.0}),
     ("dynamic", {"preset": "paper", "window": 2, "return_tolerance": 0.5}),
 ]
-CONTRACT = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+CONTRACT = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 TRAIN_STEPS = 100
 
 
