@@ -1,9 +1,8 @@
 """Many MuJoCo simulations of one model, stepped together, with exact save and restore.
 
 They are one MuJoCo batch (``mjbatch.h``, MuJoCo 4), used through its C interface, on MuJoCo's own threads.
-MuJoCo's Python class ``mujoco.batch.Batch`` cannot run a compiled function on each simulation. Nor can it put
-sleeping bodies back to sleep, and sleep is no part of a state row. Here ``load`` does, so that a simulation
-with sleeping bodies continues to the last bit.
+MuJoCo's Python class ``mujoco.batch.Batch`` cannot put sleeping bodies back to sleep, and sleep is no part of
+a state row. Here ``load`` does, so that a simulation with sleeping bodies continues to the last bit.
 
 A batch with several threads cannot be used after a fork: the child process has none of the threads.
 
@@ -17,6 +16,7 @@ import functools
 import os
 import weakref
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -25,7 +25,6 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.saved_state import SavedState
-from recrl.environments.simulation.machine_code import mujoco_library
 
 Integers = npt.NDArray[np.int32]
 Ids = Sequence[int] | npt.NDArray[np.intp] | None
@@ -49,8 +48,12 @@ class _Config(ctypes.Structure):
 
 @functools.cache
 def _library() -> Any:
-    """Return MuJoCo's shared library, with the types of the functions that are used here."""
-    library = mujoco_library()
+    """Load MuJoCo's shared library, and declare the types of the functions that are used here."""
+    folder = Path(mujoco.__file__).parent
+    found = [path for pattern in ("libmujoco*", "mujoco.dll") for path in sorted(folder.glob(pattern))]
+    if not found:
+        raise ImportError(f"MuJoCo's shared library must lie in {folder.name}, found none")
+    library = ctypes.CDLL(str(found[0]))
     pointer, integer = ctypes.c_void_p, ctypes.c_int
     signatures: dict[str, tuple[Any, tuple[Any, ...]]] = {
         "mjb_makeBatch": (
@@ -63,6 +66,15 @@ def _library() -> Any:
         "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
         "mjb_warning": (pointer, (pointer,)),
         "mjb_status": (pointer, (pointer,)),
+        "mjb_output": (
+            pointer,
+            (pointer, ctypes.c_char_p, ctypes.POINTER(integer), ctypes.POINTER(integer)),
+        ),
+        "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
+        "mjb_rollout": (
+            integer,
+            (pointer, pointer, integer, integer, pointer, integer, pointer, integer),
+        ),
         "mjb_forward": (integer, (pointer, pointer, integer, integer)),
         "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
         "mjb_error": (ctypes.c_char_p, (pointer, integer)),
@@ -163,6 +175,46 @@ class Simulations:
             PhysicsError: the simulations use threads, and this process is a fork of their owner.
         """
         self._call(self._library.mjb_apply, ids, function.address, argument, 1)
+
+    def output(self, field: str, shape: tuple[int, ...]) -> Floats:
+        """Return a field of ``mjData`` as MuJoCo computed it last, a live view, [B, *shape].
+
+        MuJoCo copies it after each call. Writing to it has no effect on the simulations.
+
+        Args:
+            field: its name, of numbers in double precision and of a size that the model fixes.
+            shape: of one simulation's.
+        """
+        address = self._library.mjb_output(self._batch.address, field.encode(), None, None)
+        view: Floats = self._batch.view(address, np.float64, (self.number, *shape))
+        return view
+
+    def step(self, count: int, *, derive: bool) -> None:
+        """Take physics steps in all simulations.
+
+        Args:
+            count: number of steps.
+            derive: whether to compute what follows from the last state. Otherwise fields of ``mjData`` are as
+                they were before the last step ended.
+        """
+        self._call(self._library.mjb_step, None, count, _EVERYTHING if derive else _NOTHING)
+
+    def step_with_inputs(self, inputs: Floats, components: int) -> None:
+        """Take physics steps in all simulations, each with inputs of its own; compute what follows.
+
+        Args:
+            inputs: for each step, [B, steps, numbers], contiguous.
+            components: what they are, bits of ``mjtState``.
+        """
+        self._call(self._library.mjb_rollout, None, inputs.shape[1], inputs.ctypes.data, components, None, 0)
+        self._call(self._library.mjb_forward, None, _EVERYTHING)
+
+    def compute_body_forces(self) -> None:
+        """Compute the forces on bodies (``cfrc_ext``), which MuJoCo does not compute in a step."""
+        function = ctypes.cast(self._library.mj_rnePostConstraint, ctypes.c_void_p)
+        # MuJoCo passes (model, data, index, argument); this function takes the first two of them.
+        self._call(self._library.mjb_apply, None, function, None, 0)
+        self._call(self._library.mjb_forward, None, _NOTHING)  # copies the outputs
 
     def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
