@@ -114,6 +114,8 @@ class _Batch:
     def view(self, address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
         """Return the batch's memory at an address as an array, which keeps the batch alive."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        if not size:
+            return np.zeros(shape, dtype)
         memory = (ctypes.c_char * size).from_address(address)
         memory.batch = self
         return np.frombuffer(memory, dtype).reshape(shape)
@@ -150,6 +152,7 @@ class Simulations:
         view = self._batch.view
         self.rows: Floats = view(self._library.mjb_state(address), np.float64, (number, size))
         self._warnings = view(self._library.mjb_warning(address), np.int32, (number, _NUM_WARNINGS, 2))
+        self._bad_states = self._warnings[:, min(BAD_STATES) : max(BAD_STATES) + 1, 1]
         self._status = view(self._library.mjb_status(address), np.int32, (number,))
         self.stopped = np.zeros(number, np.bool_)
         self.any_stopped = False
@@ -161,20 +164,6 @@ class Simulations:
         start = (address - self._library.mjb_state(batch)) // self.rows.itemsize
         view: Floats = self.rows[:, start : start + size.value].reshape(self.number, *shape)
         return view
-
-    def apply(self, function: Any, argument: int, ids: Ids = None) -> None:
-        """Run a compiled function on simulations; it may step them.
-
-        Args:
-            function: from ``machine_code.compiled_for_batch``.
-            argument: an address, passed to the function.
-            ids: the simulations, each once; None for all.
-
-        Raises:
-            ValueError: there is no such simulation, or one is named twice.
-            PhysicsError: the simulations use threads, and this process is a fork of their owner.
-        """
-        self._call(self._library.mjb_apply, ids, function.address, argument, 1)
 
     def output(self, field: str, shape: tuple[int, ...]) -> Floats:
         """Return a field of ``mjData`` as MuJoCo computed it last, a live view, [B, *shape].
@@ -189,25 +178,32 @@ class Simulations:
         view: Floats = self._batch.view(address, np.float64, (self.number, *shape))
         return view
 
-    def step(self, count: int, *, derive: bool) -> None:
-        """Take physics steps in all simulations.
+    def step(self, count: int, ids: Ids = None, *, derive: bool) -> None:
+        """Take physics steps.
 
         Args:
             count: number of steps.
+            ids: the simulations, each once; None for all.
             derive: whether to compute what follows from the last state. Otherwise fields of ``mjData`` are as
                 they were before the last step ended.
-        """
-        self._call(self._library.mjb_step, None, count, _EVERYTHING if derive else _NOTHING)
 
-    def step_with_inputs(self, inputs: Floats, components: int) -> None:
-        """Take physics steps in all simulations, each with inputs of its own; compute what follows.
+        Raises:
+            ValueError: there is no such simulation, or one is named twice.
+            PhysicsError: the simulations use threads, and this process is a fork of their owner.
+        """
+        self._call(self._library.mjb_step, ids, count, _EVERYTHING if derive else _NOTHING)
+
+    def step_with_inputs(self, inputs: Floats, components: int, ids: Ids) -> None:
+        """Take physics steps, each with inputs of its own, and compute what follows; see ``step``.
 
         Args:
-            inputs: for each step, [B, steps, numbers], contiguous.
+            inputs: for each step, [n, steps, numbers], contiguous.
             components: what they are, bits of ``mjtState``.
+            ids: n simulations, in ascending order; None for all.
         """
-        self._call(self._library.mjb_rollout, None, inputs.shape[1], inputs.ctypes.data, components, None, 0)
-        self._call(self._library.mjb_forward, None, _EVERYTHING)
+        steps, address = inputs.shape[1], inputs.ctypes.data
+        self._call(self._library.mjb_rollout, ids, steps, address, components, None, 0)
+        self._call(self._library.mjb_forward, ids, _EVERYTHING)
 
     def compute_body_forces(self) -> None:
         """Compute the forces on bodies (``cfrc_ext``), which MuJoCo does not compute in a step."""
@@ -232,11 +228,11 @@ class Simulations:
         After divergence MuJoCo restarts from the model's defaults. If it cannot compute a step, it leaves the
         state unchanged.
         """
-        return np.asarray(self._warnings[:, BAD_STATES, 1].any(axis=1) | self.stopped)
+        return np.asarray(self._bad_states.any(axis=1) | self.stopped)
 
     def any_broken(self) -> bool:
         """Whether any simulation has diverged since its last reset; cheaper than ``broken``."""
-        return self.any_stopped or bool(self._warnings[:, BAD_STATES, 1].any())
+        return self.any_stopped or bool(self._bad_states.any())
 
     def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
         """Copy one simulation, for rendering or any function of MuJoCo; into a new object, or ``into``."""
@@ -280,6 +276,7 @@ class Simulations:
 
             function = ctypes.cast(_BatchFunction(put_back), ctypes.c_void_p)
             self._check(self._library.mjb_apply, [index], function, None, 1)
+        self._check(self._library.mjb_forward, None, _NOTHING)  # copies the outputs
         self._warnings[:, :, 1] = warnings
         self.stopped[...] = stopped
         self.any_stopped = bool(self.stopped.any())
@@ -352,6 +349,14 @@ class Simulations:
         if ids is None:
             return np.arange(self.number, dtype=np.int32)
         chosen = np.asarray(ids)
+        if (
+            chosen.dtype.kind in "iu"
+            and chosen.size
+            and chosen[0] >= 0
+            and chosen[-1] < self.number
+            and (chosen[1:] > chosen[:-1]).all()
+        ):
+            return chosen.astype(np.int32)
         ordered = np.unique(chosen)  # required by MuJoCo
         if chosen.size and (
             chosen.dtype.kind not in "iu"
