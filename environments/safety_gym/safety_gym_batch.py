@@ -152,8 +152,8 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
 
     def set_actions(self, actions: npt.NDArray[Any]) -> bool:
         """Set the actions of the next step, [B, 2]; return False if one is not a number within [-1, 1]."""
-        self._action[...] = actions
-        return bool(np.abs(self._action).max() <= 1.0)  # False with NaN
+        self._action[...] = given = np.asarray(actions, np.float64)
+        return bool(np.abs(given).max() <= 1.0)  # False with NaN
 
     def advance(self) -> SafetyGymOutcome:
         """Take one step in every environment, with the actions that were set."""
