@@ -18,7 +18,7 @@ circle's centre at 0.1 m: so do ours.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -43,8 +43,7 @@ IDLE_PLACE = (0.0, 0.0, 20.0)
 """Place of the body while it represents no gremlin, metres."""
 
 
-@dataclass(frozen=True)
-class Course:
+class Course(NamedTuple):
     """f(t): motion of an undisturbed gremlin relative to the centre of its circle.
 
     Attributes:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from recrl.environments.safety_gym.step_records import BUTTONS, robot_place, robot_rotation, turned
+from recrl.environments.safety_gym.step_records import BUTTONS, turned
 from recrl.environments.simulation.machine_code import compiled
 
 
@@ -45,17 +45,17 @@ def add_to_lidar(x: float, y: float, lidar_range: float, bins: Any) -> None:
 
 
 @compiled
-def write_lidar(task: Any, environment: Any, data: int, seen: Any) -> None:
+def write_lidar(task: Any, environment: Any, data: Any, seen: Any) -> None:
     """Write the readings of all lidars, one for each kind of object, into an observation.
 
     Args:
         task: a record ``TASK``.
         environment: a record ``ENVIRONMENT``.
-        data: address of MuJoCo's ``mjData``.
+        data: its ``Physics``.
         seen: the observation, [observed]; buttons are not seen while they are inactive.
     """
     size = task.lidar_bins
-    rotation, robot = robot_rotation(task, data), robot_place(task, data)
+    rotation, robot = data.rotation, data.place
     for kind in range(len(task.lidar)):
         if task.lidar[kind] < 0:
             continue

@@ -18,26 +18,23 @@ from recrl.environments.safety_gym.step_records import (
     HAZARDS,
     PILLARS,
     VASES,
-    field,
-    outcomes_at,
-    robot_place,
 )
 from recrl.environments.simulation.machine_code import compiled
 
 
 @compiled
-def measure_distances(task: Any, environment: Any, data: int) -> None:
+def measure_distances(task: Any, environment: Any, data: Any) -> None:
     """Compute the distances of the reward, metres.
 
     Goal and Button: from the robot to the goal, horizontally. Push: from the robot to the box and from the
     box to the goal, in three dimensions.
     """
-    robot = robot_place(task, data)
+    robot = data.place
     goal = environment.points[task.start[GOAL]]
     if not task.is_push:
         environment.measured[0] = math.hypot(goal[0] - robot[0], goal[1] - robot[1])
         return
-    box = field(data, task.qpos, task.nq)[task.box_qpos : task.box_qpos + 3]
+    box = data.qpos[task.box_qpos : task.box_qpos + 3]
     to_box = math.hypot(box[0] - robot[0], box[1] - robot[1])
     to_goal = math.hypot(goal[0] - box[0], goal[1] - box[1])
     environment.measured[0] = math.hypot(to_box, box[2] - robot[2])
@@ -65,9 +62,9 @@ def presses_wrongly(task: Any, environment: Any) -> bool:
 
 
 @compiled
-def over_a_hazard(task: Any, environment: Any, data: int) -> bool:
+def over_a_hazard(task: Any, environment: Any, data: Any) -> bool:
     """Whether the horizontal distance between the robot and a hazard's centre is below the hazard's size."""
-    robot = robot_place(task, data)
+    robot = data.place
     for hazard in range(task.start[HAZARDS], task.stop[HAZARDS]):
         place = environment.points[hazard]
         if math.hypot(place[0] - robot[0], place[1] - robot[1]) < task.hazard_size:
@@ -76,9 +73,9 @@ def over_a_hazard(task: Any, environment: Any, data: int) -> bool:
 
 
 @compiled
-def moves_a_vase(task: Any, data: int) -> bool:
+def moves_a_vase(task: Any, data: Any) -> bool:
     """Whether any vase moves; a sleeping vase has no velocity."""
-    qvel = field(data, task.qvel, task.nv)
+    qvel = data.qvel
     for vase in range(task.stop[VASES] - task.start[VASES]):
         address = task.vase_qvel + 6 * vase
         x, y, z = qvel[address], qvel[address + 1], qvel[address + 2]
@@ -88,7 +85,7 @@ def moves_a_vase(task: Any, data: int) -> bool:
 
 
 @compiled
-def compute_costs(task: Any, environment: Any, data: int) -> None:
+def compute_costs(task: Any, environment: Any, data: Any) -> None:
     """Compute the distances, the cost terms, and whether the goal is reached."""
     measure_distances(task, environment, data)
     for column in range(task.num_terms):
@@ -113,9 +110,8 @@ def compute_costs(task: Any, environment: Any, data: int) -> None:
 
 
 @compiled
-def write_outcome(task: Any, environment: Any, index: int) -> None:
+def write_outcome(task: Any, environment: Any, outcome: Any) -> None:
     """Write the results of this step; the reward is the progress in metres, within bounds."""
-    outcome = outcomes_at(task.outcomes, task.number)[index]
     progress = environment.distances[0] - environment.measured[0]
     if task.is_push:
         progress += environment.distances[1] - environment.measured[1]
@@ -126,6 +122,4 @@ def write_outcome(task: Any, environment: Any, index: int) -> None:
     outcome.numbers[0] = min(max(progress, -task.reward_bound), task.reward_bound)
     outcome.numbers[1] = cost
     outcome.flags[0] = environment.goal_met
-    outcome.flags[1] = environment.broken
-    outcome.flags[2] = environment.broken  # other reasons to terminate are not known here
-    outcome.flags[3] = environment.steps >= task.horizon
+    outcome.flags[1] = environment.steps >= task.horizon

@@ -25,11 +25,18 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import acceptable, review, step
+from recrl.environments.safety_gym.compiled_step import finish, review
+from recrl.environments.safety_gym.gremlin_body import Body, choose_bodies, lead_gremlins
 from recrl.environments.safety_gym.layout import keepouts, sample_goal, sample_layout
 from recrl.environments.safety_gym.scene import make_scene, upright
-from recrl.environments.safety_gym.step_records import ENVIRONMENT, NOT_YET
-from recrl.environments.safety_gym.task_definitions import BUTTON_DELAY, EXCEPTION_REWARD, HORIZON, SafetyTask
+from recrl.environments.safety_gym.step_records import ENVIRONMENT, NOT_YET, Physics, World
+from recrl.environments.safety_gym.task_definitions import (
+    BUTTON_DELAY,
+    EXCEPTION_REWARD,
+    HORIZON,
+    SUBSTEPS,
+    SafetyTask,
+)
 from recrl.environments.safety_gym.task_record import allocate, places_of_objects, task_record
 from recrl.environments.saved_state import SavedState
 from recrl.environments.simulation.environment_batch import (
@@ -43,6 +50,7 @@ from recrl.environments.simulation.mujoco_batch import Simulations
 Integers = npt.NDArray[np.int64]
 
 _NOBODY = np.zeros(0, np.intp)
+_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
 class SafetyGymOutcome(NamedTuple):
@@ -103,7 +111,9 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         gremlin_yaws: radians, [B, gremlins].
         embodied: the gremlin that is a body, or a negative number, [B].
         acceleration: the robot's, in the world's frame, m/s^2, [B, 3].
-        touching: outermost bodies of the model that the robot touches, [B, bodies].
+        touching: bodies of ``scene.touchable`` that the robot touches, [B, bodies].
+        record: the record ``TASK``, for compiled functions.
+        world: all of this, for compiled functions.
     """
 
     def __init__(
@@ -119,9 +129,12 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         self.qpos = self.simulations.state(state.mjSTATE_QPOS, (model.nq,))
         self.qvel = self.simulations.state(state.mjSTATE_QVEL, (model.nv,))
         self.mocap_pos = self.simulations.state(state.mjSTATE_MOCAP_POS, (model.nmocap, 3))
-        self._memory = allocate(self.scene, number)
-        self._task = task_record(self.scene, self._memory, horizon)
-        self._address = int(self._task.ctypes.data)
+        self._controls = self.simulations.state(state.mjSTATE_CTRL, (model.nu,))
+        self._bodies = self._views_of_gremlins() if task.gremlins.number else None
+        self._memory = memory = allocate(self.scene, number)
+        physics = self._views_of_physics()
+        self.world = World(memory.environments, physics, memory.course, memory.outcomes, memory.observations)
+        self.record = task_record(self.scene, horizon)
         self._view_records()
         self.embodied[:] = NOT_YET
 
@@ -139,18 +152,23 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
 
     def set_actions(self, actions: npt.NDArray[Any]) -> bool:
         """Set the actions of the next step, [B, 2]; return False if one is not a number within [-1, 1]."""
-        self._action[...] = actions
-        return acceptable(self._address)
+        self._action[...] = given = np.asarray(actions, np.float64)
+        return bool(np.abs(given).max() <= 1.0)  # False with NaN
 
     def advance(self) -> SafetyGymOutcome:
         """Take one step in every environment, with the actions that were set."""
-        self.simulations.apply(step, self._address)
-        results, flags = self._memory.results.copy(), self._memory.flags.copy()
+        self._controls[...] = self._action
+        if self._bodies is None:
+            self.simulations.step(SUBSTEPS, derive=True)
+        else:
+            self._step_with_gremlins(self._bodies)
+        finish(self.record, self.world)
+        results, (goal_met, truncated) = self._memory.results.copy(), self._memory.flags.copy()
         rewards, costs, terms = results[0], results[1:2], results[2:]
-        goal_met, broken, terminated, truncated = flags[0], flags[1], flags[2], flags[3]
-        if not (self.simulations.any_stopped or 1 in flags.tobytes()):
+        terminated, any_broken = np.zeros(self.number, np.bool_), self.simulations.any_broken()
+        if not (any_broken or goal_met.any() or truncated.any()):
             return SafetyGymOutcome(rewards, costs, terms, goal_met, terminated, truncated, None, _NOBODY)
-        broken |= self.simulations.stopped
+        broken = self.simulations.broken()
         rewards[broken] = EXCEPTION_REWARD
         results[1:, broken] = 0.0
         goal_met &= ~broken
@@ -162,7 +180,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
             terminated[reached] = ~self._renew_goals(reached)
         truncated &= ~terminated
         finished = np.flatnonzero(terminated | truncated)
-        failed = broken if broken.any() else None
+        failed = broken if any_broken else None
         return SafetyGymOutcome(rewards, costs, terms, goal_met, terminated, truncated, failed, finished)
 
     def observations(self) -> Observations:
@@ -171,7 +189,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
 
     def refresh(self, ids: npt.NDArray[np.intp] | None = None) -> None:
         """Recompute distances, costs and observations of some environments, or all."""
-        self.simulations.apply(review, self._address, ids)
+        review(self.record, self.world, np.arange(self.number) if ids is None else ids)
 
     def _own_state(self) -> dict[str, Any]:
         """State of physics, layout, goals and counters."""
@@ -213,6 +231,46 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         self.embodied: Integers = records["embodied"]
         self.acceleration: Floats = records["acceleration"]
         self.touching: Booleans = records["touching"].view(np.bool_)[:, : self.scene.model.nbody]
+
+    def _views_of_physics(self) -> Physics:
+        """Return what MuJoCo computed, live views."""
+        model, robot, output = self.scene.model, self.scene.robot_body, self.simulations.output
+        return Physics(
+            self.qpos,
+            self.qvel,
+            output("qacc", (model.nv,)),
+            output("xpos", (model.nbody, 3))[:, robot],
+            output("xmat", (model.nbody, 9))[:, robot],
+            output("sensordata", (model.nsensordata,)),
+        )
+
+    def _views_of_gremlins(self) -> Body:
+        """Return the state of the gremlins' bodies, live views."""
+        scene, model, state = self.scene, self.scene.model, mujoco.mjtState
+        velocities = slice(scene.gremlin_qvel, scene.gremlin_qvel + 6)
+        turns = self.simulations.state(state.mjSTATE_MOCAP_QUAT, (model.nmocap, 4))
+        return Body(
+            self.qpos[:, scene.gremlin_qpos : scene.gremlin_qpos + 7],
+            self.qvel[:, velocities],
+            self.simulations.state(state.mjSTATE_QFRC_APPLIED, (model.nv,))[:, velocities],
+            self.simulations.state(state.mjSTATE_EQ_ACTIVE, (model.neq,)),
+            turns[:, scene.gremlin_mocap],
+            self._controls,
+            self.mocap_pos.reshape(self.number, -1),
+        )
+
+    def _step_with_gremlins(self, bodies: Body) -> None:
+        """Take the physics steps of one step; leads of gremlins move before each of them."""
+        choose_bodies(self.record, self.world, bodies)
+        is_led = self.embodied >= 0
+        led = np.flatnonzero(is_led)
+        if len(led) < self.number:
+            self.simulations.step(SUBSTEPS, np.flatnonzero(~is_led) if len(led) else None, derive=True)
+        if len(led):
+            numbers = bodies.controls.shape[1] + bodies.places.shape[1]
+            inputs = np.empty((len(led), SUBSTEPS, numbers))
+            lead_gremlins(self.record, self.world, bodies, led, inputs)
+            self.simulations.step_with_inputs(inputs, _INPUTS, led if len(led) < self.number else None)
 
     def _put_down(self, index: int, layout: dict[str, Floats]) -> None:
         """Write one environment's layout into its simulation, with random orientations."""

@@ -11,7 +11,7 @@ Optimisations that do not change the tasks' statistics:
 - Button: only the gremlin near the robot is a body
 (``recrl.environments.safety_gym.gremlins``).
 - The sensors of the robots are computed from the state
-(``recrl.environments.safety_gym.compiled_step``).
+(``recrl.environments.safety_gym.compiled_step``). MuJoCo's own sensors only count contacts.
 
 MuJoCo's newer colliders (``nativeccd``, ``multiccd``) are off: Safety Gym used the older ones.
 
@@ -170,7 +170,20 @@ def scene_xml(task: SafetyTask) -> str:
   </option>
   {robot}
   {_LEAD if task.gremlins.number else ""}
+  <sensor>{"".join(_contacts(body) for bodies in touchable_bodies(task).values() for body in bodies)}</sensor>
 </mujoco>"""
+
+
+def touchable_bodies(task: SafetyTask) -> dict[str, list[str]]:
+    """Return the bodies of each kind of object whose contacts with the robot matter."""
+    kinds = {
+        "vases": ("vase", task.vases.number if "vases_contact" in task.cost_terms else 0),
+        "pillars": ("pillar", task.pillars.number if "pillars" in task.cost_terms else 0),
+        "buttons": ("button", task.buttons.number),
+    }
+    bodies = {kind: [f"{name}{index}" for index in range(number)] for kind, (name, number) in kinds.items()}
+    bodies["gremlins"] = ["gremlin"] if task.gremlins.number else []
+    return {kind: names for kind, names in bodies.items() if names}
 
 
 def gremlin_xml(task: SafetyTask) -> str:
@@ -237,14 +250,9 @@ def rotation_matrices(quaternions: Floats) -> Floats:
 
 
 def _touchable(task: SafetyTask, model: mujoco.MjModel) -> dict[str, slice]:
-    kinds = {
-        "vases": ("vase0", task.vases.number if "vases_contact" in task.cost_terms else 0),
-        "pillars": ("pillar0", task.pillars.number if "pillars" in task.cost_terms else 0),
-        "buttons": ("button0", task.buttons.number),
-        "gremlins": ("gremlin", min(task.gremlins.number, 1)),
-    }
-    first = {kind: model.body(name).id for kind, (name, number) in kinds.items() if number}
-    return {kind: slice(start, start + kinds[kind][1]) for kind, start in first.items()}
+    bodies = touchable_bodies(task)
+    first = {kind: model.body(names[0]).id for kind, names in bodies.items()}
+    return {kind: slice(start, start + len(bodies[kind])) for kind, start in first.items()}
 
 
 def _gremlin_reach(model: mujoco.MjModel) -> float:
@@ -255,6 +263,10 @@ def _gremlin_reach(model: mujoco.MjModel) -> float:
     offsets = np.linalg.norm(data.geom_xpos[limbs] - data.xpos[robot], axis=1)
     reach = float((offsets + model.geom_rbound[limbs]).max())
     return reach + float(model.geom_rbound[model.body_geomadr[gremlin]]) + 0.01
+
+
+def _contacts(body: str) -> str:
+    return f'<contact subtree1="robot" subtree2="{body}" data="found"/>'
 
 
 def _vase(index: int, size: float) -> str:

@@ -1,18 +1,19 @@
-"""Records that the compiled step reads and writes, and access to the fields of ``mjData`` and of the robot.
+"""Records that compiled functions read and write, and MuJoCo's results that they read.
 
 A record ``ENVIRONMENT`` holds the state of one environment. The record ``TASK`` holds what all environments
-of a task share. Their sizes fit every task.
+of a task share. Their sizes fit every task. ``Physics`` has what MuJoCo computed.
 
 Notation: P objects that the lidar sees; R the rotation from the robot's frame to the world frame.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from recrl.environments.simulation.machine_code import array_at, compiled
+from recrl.environments.safety_gym.gremlins import Course
+from recrl.environments.simulation.machine_code import compiled
 
 KINDS = ("goal", "box", "buttons", "hazards", "vases", "pillars", "gremlins")
 """Kinds of objects, in the order of ``TASK``'s fields of seven."""
@@ -22,10 +23,10 @@ TERMS = ("hazards", "vases_contact", "vases_velocity", "pillars", "buttons", "gr
 SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer", "ballquat_rear", "ballangvel_rear")
 """Sensors of a robot, in the order of the field ``TASK["sensor"]``."""
 ACCELEROMETER, VELOCIMETER, GYRO, MAGNETOMETER, BALL, SPIN = range(6)
-FLAGS = ("goal_met", "broken", "terminated", "truncated")
+FLAGS = ("goal_met", "truncated")
 """Results of a step besides rewards, costs and the indicators of the cost terms."""
-MAX_POINTS, MAX_BODIES, MAX_GEOMS, MAX_GREMLINS, MAX_TERMS = 24, 24, 64, 6, 3
-"""Maximum sizes: P objects, bodies and shapes of a model, and so on."""
+MAX_POINTS, MAX_BODIES, MAX_GREMLINS, MAX_TERMS = 24, 24, 6, 3
+"""Maximum sizes: P objects, bodies of a model, and so on."""
 NO_GREMLIN = -1
 """No gremlin is a body: it hovers untied at a place without objects."""
 NOT_YET = -2
@@ -33,39 +34,11 @@ NOT_YET = -2
 
 TASK = np.dtype(
     [
-        ("environments", np.int64),  # address of the records of the environments
-        ("number", np.int64),
-        ("outcomes", np.int64),  # address of the results of the last step, [B] OUTCOMEs
-        ("observations", np.int64),  # address of [B, observed]
-        ("rows", np.int64),  # address of [B, 2, row]: the state after the last step, and room for another
-        ("row", np.int64),  # numbers in a state
-        ("row_fields", np.int32),  # mjtState
-        # Offsets of fields in mjData and mjContact.
-        ("qpos", np.int64),
-        ("qvel", np.int64),
-        ("qacc", np.int64),
-        ("ctrl", np.int64),
-        ("qfrc_applied", np.int64),
-        ("eq_active", np.int64),
-        ("mocap_pos", np.int64),
-        ("mocap_quat", np.int64),
-        ("xpos", np.int64),
-        ("xmat", np.int64),
-        ("ncon", np.int64),
-        ("contact", np.int64),
-        ("contact_size", np.int64),
-        ("contact_geom", np.int64),
-        ("warnings", np.int64, (3,)),  # counts of bad positions, velocities, accelerations
         # The model.
-        ("nq", np.int64),
-        ("nv", np.int64),
-        ("nbody", np.int64),
-        ("nmocap", np.int64),
         ("timestep", np.float64),  # seconds
         ("substeps", np.int64),
-        ("robot", np.int64),  # its body
         ("is_car", np.bool_),
-        ("root", np.int64, (MAX_GEOMS,)),  # the outermost body that each shape is part of
+        ("touchable", np.int64, (MAX_BODIES,)),  # the body whose contacts with the robot each sensor counts
         ("vase_qpos", np.int64),  # the vases' coordinates and velocities are contiguous
         ("vase_qvel", np.int64),
         ("box_qpos", np.int64),
@@ -93,16 +66,12 @@ TASK = np.dtype(
         ("magnetic_field", np.float64),
         # Gremlins: see recrl.environments.safety_gym.gremlins.
         ("gremlin_qpos", np.int64),
-        ("gremlin_qvel", np.int64),
         ("gremlin_lead", np.int64),  # the mocap body that the gremlin is tied to
         ("gremlin_weight", np.float64),  # newtons
         ("gremlin_travel", np.float64),
         ("gremlin_alert", np.float64),  # metres
         ("gremlin_on_course", np.float64),
         ("gremlin_idle_place", np.float64, (3,)),
-        ("course_steps", np.int64),
-        ("course_positions", np.int64),  # addresses of f(t), [course_steps, 3] and [course_steps, 6]
-        ("course_velocities", np.int64),
     ],
     align=True,
 )
@@ -123,7 +92,6 @@ ENVIRONMENT = np.dtype(
         ("measured", np.float64, (2,)),  # as distances, after the step
         ("terms", np.float64, (MAX_TERMS,)),
         ("goal_met", np.bool_),
-        ("broken", np.bool_),
     ],
     align=True,
 )
@@ -136,32 +104,54 @@ OUTCOME = np.dtype(
     align=True,
 )
 
-tasks_at = array_at(TASK)
-environments_at = array_at(ENVIRONMENT)
-outcomes_at = array_at(OUTCOME)
-doubles_at = array_at(np.float64)
-integers_at = array_at(np.int32)
-floats_at = array_at(np.float32)
-bytes_at = array_at(np.uint8)
-addresses_at = array_at(np.int64)
+
+class Physics(NamedTuple):
+    """What MuJoCo has of all environments, [B, ...] each, or of one of them, [...] each.
+
+    Attributes:
+        qpos, qvel, qacc: coordinates, velocities and accelerations.
+        place: the robot's position, metres, [..., 3].
+        rotation: R by rows, [..., 9].
+        contacts: readings of the model's sensors: contacts between the robot and each touchable body.
+    """
+
+    qpos: Any
+    qvel: Any
+    qacc: Any
+    place: Any
+    rotation: Any
+    contacts: Any
+
+
+class World(NamedTuple):
+    """All that compiled functions read and write of all environments.
+
+    Attributes:
+        environments: records ``ENVIRONMENT``, [B].
+        physics: what MuJoCo computed.
+        course: f(t), see ``recrl.environments.safety_gym.gremlins``; empty without gremlins.
+        outcomes: records ``OUTCOME`` of the last step, [B].
+        observations: [B, size].
+    """
+
+    environments: Any
+    physics: Physics
+    course: Course
+    outcomes: Any
+    observations: Any
 
 
 @compiled
-def field(data: int, offset: int, size: int) -> Any:
-    """An array of ``mjData``, [size]."""
-    return doubles_at(addresses_at(data + offset, 1)[0], size)
-
-
-@compiled
-def robot_place(task: Any, data: int) -> Any:
-    """The robot's position, metres, [3]."""
-    return field(data, task.xpos, 3 * task.nbody)[3 * task.robot : 3 * task.robot + 3]
-
-
-@compiled
-def robot_rotation(task: Any, data: int) -> Any:
-    """R by rows, [9]."""
-    return field(data, task.xmat, 9 * task.nbody)[9 * task.robot : 9 * task.robot + 9]
+def physics_of(physics: Any, index: int) -> Any:
+    """Return the physics of one environment."""
+    return Physics(
+        physics.qpos[index],
+        physics.qvel[index],
+        physics.qacc[index],
+        physics.place[index],
+        physics.rotation[index],
+        physics.contacts[index],
+    )
 
 
 @compiled

@@ -1,15 +1,13 @@
-"""The record of a task for compiled code: constants, addresses, and offsets in MuJoCo's structures.
+"""The record of a task for compiled code, and the memory that compiled code writes.
 
 The record is declared in ``recrl.environments.safety_gym.step_records``.
 """
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 import numpy.typing as npt
 
@@ -21,7 +19,6 @@ from recrl.environments.safety_gym.step_records import (
     ENVIRONMENT,
     KINDS,
     MAX_BODIES,
-    MAX_GEOMS,
     MAX_POINTS,
     OUTCOME,
     SENSORS,
@@ -40,24 +37,8 @@ from recrl.environments.safety_gym.task_definitions import (
     VASE_SPEED,
     SafetyTask,
 )
-from recrl.environments.simulation.mujoco_batch import BAD_STATES, ROW
-from recrl.environments.simulation.struct_offsets import structure
 
 _NONE = slice(0, 0)
-_FIELDS = (
-    "qpos",
-    "qvel",
-    "qacc",
-    "ctrl",
-    "qfrc_applied",
-    "eq_active",
-    "mocap_pos",
-    "mocap_quat",
-    "xpos",
-    "xmat",
-    "ncon",
-    "contact",
-)
 
 
 def places_of_objects(task: SafetyTask) -> dict[str, slice]:
@@ -78,8 +59,7 @@ class Memory:
         results: of them rewards, costs and the indicators of each cost term, [2 + terms, B].
         flags: of them ``FLAGS``, [len(FLAGS), B].
         observations: [B, size].
-        rows: room for two states of each environment, [B, 2, row].
-        course: motion of gremlins, if there are any.
+        course: motion of gremlins; empty if there are none.
     """
 
     environments: npt.NDArray[Any]
@@ -87,13 +67,12 @@ class Memory:
     results: Floats
     flags: npt.NDArray[np.bool_]
     observations: npt.NDArray[np.float32]
-    rows: Floats
-    course: Course | None
+    course: Course
 
 
 def allocate(scene: Scene, number: int) -> Memory:
     """Allocate memory for ``number`` environments of a scene."""
-    row = mujoco.mj_stateSize(scene.model, ROW)
+    none = Course(np.zeros((0, 3)), np.zeros((0, 6)))
     outcomes = np.zeros(number, OUTCOME)
     return Memory(
         environments=np.zeros(number, ENVIRONMENT),
@@ -101,48 +80,28 @@ def allocate(scene: Scene, number: int) -> Memory:
         results=outcomes["numbers"].T[: 2 + len(scene.task.cost_terms)],
         flags=outcomes["flags"].view(np.bool_).T,
         observations=np.zeros((number, scene.task.observation_size), np.float32),
-        rows=np.full((number, 2, row), np.nan),
-        course=gremlin_course(scene.task) if scene.task.gremlins.number else None,
+        course=gremlin_course(scene.task) if scene.task.gremlins.number else none,
     )
 
 
-def task_record(scene: Scene, memory: Memory, horizon: int) -> npt.NDArray[Any]:
-    """Return the record ``TASK`` of a scene, an array [1]; it is valid as long as the memory lives."""
-    record = np.zeros(1, TASK)
-    one = record[0]
-    for name in ("environments", "outcomes", "observations", "rows"):
-        one[name] = getattr(memory, name).ctypes.data
-    one["number"], one["row"], one["row_fields"] = len(memory.environments), memory.rows.shape[2], ROW
+def task_record(scene: Scene, horizon: int) -> Any:
+    """Return the record ``TASK`` of a scene."""
+    one = np.zeros(1, TASK)[0]
     one["horizon"] = horizon
-    _describe_memory(one)
     _describe_model(one, scene)
     _describe_task(one, scene)
-    if memory.course is not None:
-        _describe_gremlins(one, scene, memory.course)
-    return record
-
-
-def _describe_memory(one: Any) -> None:
-    """Offsets of fields in MuJoCo's structures."""
-    data, contact, warning = structure("mjData"), structure("mjContact"), structure("mjWarningStat")
-    for name in _FIELDS:
-        one[name] = getattr(data, name).offset
-    first = data.warning.offset + warning.number.offset
-    one["warnings"] = [first + bad * ctypes.sizeof(warning) for bad in BAD_STATES]
-    one["contact_size"], one["contact_geom"] = ctypes.sizeof(contact), contact.geom.offset
+    if scene.task.gremlins.number:
+        _describe_gremlins(one, scene)
+    return one
 
 
 def _describe_model(one: Any, scene: Scene) -> None:
     model = scene.model
-    if model.ngeom > MAX_GEOMS or model.nbody > MAX_BODIES:
-        raise ValueError(
-            f"{scene.task.name}: at most {MAX_GEOMS} shapes and {MAX_BODIES} bodies are possible"
-        )
-    for name in ("nq", "nv", "nbody", "nmocap"):
-        one[name] = getattr(model, name)
+    if model.nbody > MAX_BODIES:
+        raise ValueError(f"{scene.task.name}: at most {MAX_BODIES} bodies are possible")
     one["timestep"], one["substeps"] = model.opt.timestep, SUBSTEPS
-    one["robot"], one["is_car"] = scene.robot_body, scene.task.robot == "Car"
-    one["root"][: model.ngeom] = model.body_rootid[model.geom_bodyid]
+    one["is_car"] = scene.task.robot == "Car"
+    one["touchable"][: model.nsensor] = model.sensor_refid
     vases = len(scene.vase_qpos)  # contiguous, after the robot
     assert scene.vase_qpos == tuple(range(scene.robot_qpos, scene.robot_qpos + 7 * vases, 7))
     assert scene.vase_qvel == tuple(range(scene.robot_qvel, scene.robot_qvel + 6 * vases, 6))
@@ -171,13 +130,10 @@ def _describe_task(one: Any, scene: Scene) -> None:
     one["gravity"], one["magnetic_field"] = GRAVITY, MAGNETIC_FIELD
 
 
-def _describe_gremlins(one: Any, scene: Scene, course: Course) -> None:
+def _describe_gremlins(one: Any, scene: Scene) -> None:
     model = scene.model
-    one["gremlin_qpos"], one["gremlin_qvel"] = scene.gremlin_qpos, scene.gremlin_qvel
-    one["gremlin_lead"], one["gremlin_travel"] = scene.gremlin_mocap, GREMLIN_TRAVEL
+    one["gremlin_qpos"], one["gremlin_lead"] = scene.gremlin_qpos, scene.gremlin_mocap
+    one["gremlin_travel"] = GREMLIN_TRAVEL
     one["gremlin_weight"] = -model.body("gremlin").mass[0] * model.opt.gravity[2]
     one["gremlin_alert"] = scene.gremlin_reach + ALERT
     one["gremlin_on_course"], one["gremlin_idle_place"] = ON_COURSE, IDLE_PLACE
-    one["course_steps"] = len(course.positions)
-    one["course_positions"] = course.positions.ctypes.data
-    one["course_velocities"] = course.velocities.ctypes.data

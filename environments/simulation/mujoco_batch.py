@@ -1,9 +1,8 @@
 """Many MuJoCo simulations of one model, stepped together, with exact save and restore.
 
 They are one MuJoCo batch (``mjbatch.h``, MuJoCo 4), used through its C interface, on MuJoCo's own threads.
-MuJoCo's Python class ``mujoco.batch.Batch`` cannot run a compiled function on each simulation. Nor can it put
-sleeping bodies back to sleep, and sleep is no part of a state row. Here ``load`` does, so that a simulation
-with sleeping bodies continues to the last bit.
+MuJoCo's Python class ``mujoco.batch.Batch`` cannot put sleeping bodies back to sleep, and sleep is no part of
+a state row. Here ``load`` does, so that a simulation with sleeping bodies continues to the last bit.
 
 A batch with several threads cannot be used after a fork: the child process has none of the threads.
 
@@ -17,6 +16,7 @@ import functools
 import os
 import weakref
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -25,7 +25,6 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.saved_state import SavedState
-from recrl.environments.simulation.machine_code import mujoco_library
 
 Integers = npt.NDArray[np.int32]
 Ids = Sequence[int] | npt.NDArray[np.intp] | None
@@ -49,8 +48,12 @@ class _Config(ctypes.Structure):
 
 @functools.cache
 def _library() -> Any:
-    """Return MuJoCo's shared library, with the types of the functions that are used here."""
-    library = mujoco_library()
+    """Load MuJoCo's shared library, and declare the types of the functions that are used here."""
+    folder = Path(mujoco.__file__).parent
+    found = [path for pattern in ("libmujoco*", "mujoco.dll") for path in sorted(folder.glob(pattern))]
+    if not found:
+        raise ImportError(f"MuJoCo's shared library must lie in {folder.name}, found none")
+    library = ctypes.CDLL(str(found[0]))
     pointer, integer = ctypes.c_void_p, ctypes.c_int
     signatures: dict[str, tuple[Any, tuple[Any, ...]]] = {
         "mjb_makeBatch": (
@@ -63,6 +66,15 @@ def _library() -> Any:
         "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
         "mjb_warning": (pointer, (pointer,)),
         "mjb_status": (pointer, (pointer,)),
+        "mjb_output": (
+            pointer,
+            (pointer, ctypes.c_char_p, ctypes.POINTER(integer), ctypes.POINTER(integer)),
+        ),
+        "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
+        "mjb_rollout": (
+            integer,
+            (pointer, pointer, integer, integer, pointer, integer, pointer, integer),
+        ),
         "mjb_forward": (integer, (pointer, pointer, integer, integer)),
         "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
         "mjb_error": (ctypes.c_char_p, (pointer, integer)),
@@ -102,6 +114,8 @@ class _Batch:
     def view(self, address: int, dtype: Any, shape: tuple[int, ...]) -> Any:
         """Return the batch's memory at an address as an array, which keeps the batch alive."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        if not size:
+            return np.zeros(shape, dtype)
         memory = (ctypes.c_char * size).from_address(address)
         memory.batch = self
         return np.frombuffer(memory, dtype).reshape(shape)
@@ -138,6 +152,7 @@ class Simulations:
         view = self._batch.view
         self.rows: Floats = view(self._library.mjb_state(address), np.float64, (number, size))
         self._warnings = view(self._library.mjb_warning(address), np.int32, (number, _NUM_WARNINGS, 2))
+        self._bad_states = self._warnings[:, min(BAD_STATES) : max(BAD_STATES) + 1, 1]
         self._status = view(self._library.mjb_status(address), np.int32, (number,))
         self.stopped = np.zeros(number, np.bool_)
         self.any_stopped = False
@@ -150,19 +165,52 @@ class Simulations:
         view: Floats = self.rows[:, start : start + size.value].reshape(self.number, *shape)
         return view
 
-    def apply(self, function: Any, argument: int, ids: Ids = None) -> None:
-        """Run a compiled function on simulations; it may step them.
+    def output(self, field: str, shape: tuple[int, ...]) -> Floats:
+        """Return a field of ``mjData`` as MuJoCo computed it last, a live view, [B, *shape].
+
+        MuJoCo copies it after each call. Writing to it has no effect on the simulations.
 
         Args:
-            function: from ``machine_code.compiled_for_batch``.
-            argument: an address, passed to the function.
+            field: its name, of numbers in double precision and of a size that the model fixes.
+            shape: of one simulation's.
+        """
+        address = self._library.mjb_output(self._batch.address, field.encode(), None, None)
+        view: Floats = self._batch.view(address, np.float64, (self.number, *shape))
+        return view
+
+    def step(self, count: int, ids: Ids = None, *, derive: bool) -> None:
+        """Take physics steps.
+
+        Args:
+            count: number of steps.
             ids: the simulations, each once; None for all.
+            derive: whether to compute what follows from the last state. Otherwise fields of ``mjData`` are as
+                they were before the last step ended.
 
         Raises:
             ValueError: there is no such simulation, or one is named twice.
             PhysicsError: the simulations use threads, and this process is a fork of their owner.
         """
-        self._call(self._library.mjb_apply, ids, function.address, argument, 1)
+        self._call(self._library.mjb_step, ids, count, _EVERYTHING if derive else _NOTHING)
+
+    def step_with_inputs(self, inputs: Floats, components: int, ids: Ids) -> None:
+        """Take physics steps, each with inputs of its own, and compute what follows; see ``step``.
+
+        Args:
+            inputs: for each step, [n, steps, numbers], contiguous.
+            components: what they are, bits of ``mjtState``.
+            ids: n simulations, in ascending order; None for all.
+        """
+        steps, address = inputs.shape[1], inputs.ctypes.data
+        self._call(self._library.mjb_rollout, ids, steps, address, components, None, 0)
+        self._call(self._library.mjb_forward, ids, _EVERYTHING)
+
+    def compute_body_forces(self) -> None:
+        """Compute the forces on bodies (``cfrc_ext``), which MuJoCo does not compute in a step."""
+        function = ctypes.cast(self._library.mj_rnePostConstraint, ctypes.c_void_p)
+        # MuJoCo passes (model, data, index, argument); this function takes the first two of them.
+        self._call(self._library.mjb_apply, None, function, None, 0)
+        self._call(self._library.mjb_forward, None, _NOTHING)  # copies the outputs
 
     def reset(self, ids: Ids) -> None:
         """Reset some simulations to the model's defaults; then write their rows and call ``forward``."""
@@ -180,11 +228,11 @@ class Simulations:
         After divergence MuJoCo restarts from the model's defaults. If it cannot compute a step, it leaves the
         state unchanged.
         """
-        return np.asarray(self._warnings[:, BAD_STATES, 1].any(axis=1) | self.stopped)
+        return np.asarray(self._bad_states.any(axis=1) | self.stopped)
 
     def any_broken(self) -> bool:
         """Whether any simulation has diverged since its last reset; cheaper than ``broken``."""
-        return self.any_stopped or bool(self._warnings[:, BAD_STATES, 1].any())
+        return self.any_stopped or bool(self._bad_states.any())
 
     def data(self, index: int, into: mujoco.MjData | None = None) -> mujoco.MjData:
         """Copy one simulation, for rendering or any function of MuJoCo; into a new object, or ``into``."""
@@ -228,6 +276,7 @@ class Simulations:
 
             function = ctypes.cast(_BatchFunction(put_back), ctypes.c_void_p)
             self._check(self._library.mjb_apply, [index], function, None, 1)
+        self._check(self._library.mjb_forward, None, _NOTHING)  # copies the outputs
         self._warnings[:, :, 1] = warnings
         self.stopped[...] = stopped
         self.any_stopped = bool(self.stopped.any())
@@ -300,6 +349,14 @@ class Simulations:
         if ids is None:
             return np.arange(self.number, dtype=np.int32)
         chosen = np.asarray(ids)
+        if (
+            chosen.dtype.kind in "iu"
+            and chosen.size
+            and chosen[0] >= 0
+            and chosen[-1] < self.number
+            and (chosen[1:] > chosen[:-1]).all()
+        ):
+            return chosen.astype(np.int32)
         ordered = np.unique(chosen)  # required by MuJoCo
         if chosen.size and (
             chosen.dtype.kind not in "iu"

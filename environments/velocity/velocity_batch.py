@@ -33,7 +33,6 @@ from recrl.environments.saved_state import SavedState
 from recrl.environments.simulation.environment_batch import MOST_STEPS, EnvironmentBatch, Observations
 from recrl.environments.simulation.mujoco_batch import Simulations
 from recrl.environments.velocity.model import make_model
-from recrl.environments.velocity.physics import advance, derive, physics_record
 from recrl.environments.velocity.task_definitions import HORIZON, Booleans, VelocityTask
 
 TORSO = 1
@@ -80,8 +79,8 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
         bound: of the actions, which are within plus or minus this.
         observed: numbers in an observation.
         qpos, qvel: coordinates and velocities, live views, [B, nq] and [B, nv].
-        bodies: fields of the bodies that the task needs, by MuJoCo's name, as computed last, [B, ...].
-        address: of the record ``PHYSICS`` for compiled functions.
+        bodies: fields of the bodies that the task needs, by MuJoCo's name, as computed last, live views,
+            [B, ...].
         places: last measured position of each robot, metres, [B, axes].
         steps: taken in this episode, [B].
     """
@@ -100,9 +99,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
         self._controls = self.simulations.state(state.mjSTATE_CTRL, (model.nu,))
         self._fresh = self.simulations.rows[0].copy()
         self._actions = np.zeros((number, model.nu))
-        self.bodies = self._copies_of_bodies()
-        self._physics = physics_record(task.frame_skip, self.bodies, forces=task.observes_bodies)
-        self.address = int(self._physics.ctypes.data)
+        self.bodies = self._views_of_bodies()
         self.observed = sum(part.shape[1] for part in self._observed_parts())
         self.places = np.zeros((number, task.axes))
         self.steps = np.zeros(number, np.int64)
@@ -115,7 +112,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
         for index in ids:
             self._place_at_random(index)
         if self.bodies:
-            self.simulations.apply(derive, self.address, ids)
+            self.simulations.forward(ids)
         if self.task.observes_bodies:
             self.bodies["cfrc_ext"][ids] = 0.0  # from before the reset
         self.places[ids] = self.measured()[ids]
@@ -129,7 +126,9 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
     def advance(self) -> VelocityOutcome:
         """Take one step with every robot, with the actions that were set."""
         self._controls[...] = self._actions
-        self.simulations.apply(advance, self.address)
+        self.simulations.step(self.task.frame_skip, derive=False)
+        if self.task.observes_bodies:
+            self.simulations.compute_body_forces()
         places = self.measured()
         passed = (places - self.places) / self.seconds
         self.places = places
@@ -203,8 +202,8 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
         else:
             self.qvel[index] = generator.uniform(-task.velocity_noise, task.velocity_noise, model.nv)
 
-    def _copies_of_bodies(self) -> dict[str, Floats]:
-        """Allocate memory for the fields of the bodies that the task needs, by MuJoCo's name, [B, ...]."""
+    def _views_of_bodies(self) -> dict[str, Floats]:
+        """Return the fields of the bodies that the task needs, by MuJoCo's name, [B, ...]."""
         bodies, shapes = self.model.nbody, dict[str, tuple[int, ...]]()
         if self.task.measured == "torso":
             shapes["xpos"] = bodies, 3
@@ -213,7 +212,7 @@ class VelocityBatch(EnvironmentBatch[VelocityTask, VelocityOutcome]):
         if self.task.observes_bodies:
             shapes |= {"cinert": (bodies, 10), "cvel": (bodies, 6)}
             shapes |= {"qfrc_actuator": (self.model.nv,), "cfrc_ext": (bodies, 6)}
-        return {name: np.zeros((self.number, *shape)) for name, shape in shapes.items()}
+        return {name: self.simulations.output(name, shape) for name, shape in shapes.items()}
 
     def measured(self) -> Floats:
         """Return the position of each robot, as MuJoCo computed it last, metres, [B, axes]."""

@@ -58,7 +58,7 @@ def _renderer(batch: VelocityBatch) -> Renderer:
 
 
 def _make(task: VelocityTask, number: int, options: VelocityOptions) -> tuple[Description, VelocityBatch]:
-    """Make the description and the batch of a task; only this function imports MuJoCo and Numba."""
+    """Make the description and the batch of a task; only this function imports MuJoCo."""
     from recrl.environments.velocity.velocity_batch import VelocityBatch  # noqa: PLC0415
 
     batch = VelocityBatch(task, number, horizon=options.horizon, num_threads=options.num_threads)

@@ -29,12 +29,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.safety_gym.compiled_step import observe
+from recrl.environments.safety_gym.compiled_step import perceive
 from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.safety_gym_batch import SafetyGymBatch
-from recrl.environments.safety_gym.step_records import environments_at, tasks_at
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS, SafetyTask
-from recrl.environments.simulation.machine_code import compiled_for_batch
 
 CHUNK = 128
 TOLERANCE = 1e-5
@@ -99,13 +97,6 @@ class StepErrors:
         return self.place <= place and self.velocity <= velocity
 
 
-@compiled_for_batch
-def perceive(_: int, data: int, index: int, argument: int) -> None:
-    """Compute the observation of one environment; objects and accelerations stay as recorded."""
-    task = tasks_at(argument, 1)[0]
-    observe(task, environments_at(task.environments, task.number)[index], data, index)
-
-
 def compare_recording(path: Path) -> list[Comparison]:
     """Compare every episode of one file."""
     task, meta, episodes = _read(path)
@@ -154,7 +145,7 @@ def _compare_episode(
         now = np.minimum(np.arange(start, start + batch.number), length)
         _put_into(batch, meta, episode, at=now, pursuing=now)
         batch.acceleration[...] = _acceleration(task, meta, episode, now)
-        batch.simulations.apply(perceive, batch._address)
+        perceive(batch.record, batch.world)
         seen.append(batch.observations())
         before = np.maximum(now - 1, 0)
         _put_into(batch, meta, episode, at=before, pursuing=before)

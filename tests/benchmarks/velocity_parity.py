@@ -34,22 +34,12 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
-from recrl.environments.simulation.machine_code import compiled_for_batch, mj_forward, mj_rnePostConstraint
-from recrl.environments.velocity.physics import copy_fields, derive, physics_at
 from recrl.environments.velocity.task_definitions import VELOCITY_TASKS, VelocityTask
 from recrl.environments.velocity.velocity_batch import VelocityBatch
 
 TOLERANCE = 1e-5
 STAGES = (0.5, 0.5, 1.0)
 """Where the second to fourth stage of a Runge-Kutta step begin, in steps after its start."""
-
-
-@compiled_for_batch
-def derive_with_forces(model: int, data: int, index: int, argument: int) -> None:
-    """Compute and copy what follows from the state, contact forces included."""
-    mj_forward(model, data)
-    mj_rnePostConstraint(model, data)
-    copy_fields(physics_at(argument, 1)[0], data, index)
 
 
 @dataclass(frozen=True)
@@ -190,7 +180,6 @@ def _see_bodies(batch: VelocityBatch, episode: dict[str, npt.NDArray[Any]]) -> F
     batch.qpos[...], batch.qvel[...] = episode["qpos"], episode["qvel"]
     if not batch.bodies:
         return batch.measured()
-    batch.simulations.apply(derive, batch.address, [0])
     data = mujoco.MjData(batch.model)
     data.qpos[:], data.qvel[:] = episode["qpos"][0], episode["qvel"][0]
     _accelerations(batch.model, data)
@@ -202,8 +191,10 @@ def _see_bodies(batch: VelocityBatch, episode: dict[str, npt.NDArray[Any]]) -> F
         batch.qpos[step + 1], batch.qvel[step + 1], beginnings[step + 1] = last_stage(
             batch.model, data, task.frame_skip
         )
-    function = derive_with_forces if task.observes_bodies else derive
-    batch.simulations.apply(function, batch.address, np.arange(1, batch.number))
+    batch.simulations.forward(None)
+    if task.observes_bodies:
+        batch.simulations.compute_body_forces()
+        batch.bodies["cfrc_ext"][0] = 0.0
     return batch.measured()
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import mujoco
 import numpy as np
 import pytest
 
-from recrl.environments.safety_gym.compiled_step import step
+from recrl.environments.safety_gym.compiled_step import finish
 from recrl.environments.safety_gym.gremlins import gremlin_course
 from recrl.environments.safety_gym.scene import make_scene, rotation_matrices, scene_xml, upright
+from recrl.environments.safety_gym.step_records import Physics, World
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.safety_gym.task_record import allocate, task_record
 
@@ -65,17 +65,24 @@ def test_vases_at_rest_cost_nothing_and_soon_sleep_while_the_robot_never_does() 
 @pytest.mark.parametrize("robot", ["Car", "Point"])
 def test_computed_sensors_are_those_of_mujoco(robot: str) -> None:
     task = SAFETY_TASKS[f"{robot}Goal0"]
-    xml = scene_xml(task).replace("</mujoco>", f"<sensor>{SENSORS}</sensor></mujoco>")
+    xml = scene_xml(task).replace("<sensor>", f"<sensor>{SENSORS}")
     xml = xml.replace("<joint name=", '<site name="robot_middle"/><joint name=', 1)
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    scene = dataclasses.replace(make_scene(task), model=model)
-    memory = allocate(scene, 1)
-    record = task_record(scene, memory, 1000)
+    scene = make_scene(task)
+    memory, record = allocate(scene, 1), task_record(scene, 1000)
+    body, contacts = scene.robot_body, np.zeros(0)
     generator = np.random.default_rng(0)
     for _ in range(100):
-        memory.environments["action"] = generator.uniform(-1.0, 1.0, 2)
-        step.ctypes(model._address, data._address, 0, record.ctypes.data)
+        data.ctrl[:] = generator.uniform(-1.0, 1.0, 2)
+        mujoco.mj_step(model, data, 10)
+        mujoco.mj_forward(model, data)
+        fields = (data.qpos, data.qvel, data.qacc, data.xpos[body], data.xmat[body], contacts)
+        physics = Physics(*[field[None] for field in fields])
+        finish(
+            record,
+            World(memory.environments, physics, memory.course, memory.outcomes, memory.observations),
+        )
         for name, _ in task.components:
             if not name.startswith("ball") and not name.endswith("lidar"):
                 felt = memory.observations[0, task.where(name)]

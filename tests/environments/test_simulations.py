@@ -9,15 +9,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 import pytest
-from numba.core import types
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.safety_gym.scene import make_scene
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.saved_state import SavedState
-from recrl.environments.simulation.machine_code import array_at, compiled_for_batch, mj_forward, mj_step
 from recrl.environments.simulation.mujoco_batch import PhysicsError, Simulations, _Batch
 
 SCENE = make_scene(SAFETY_TASKS["CarGoal2"])
@@ -25,35 +22,8 @@ NUMBER = 2
 COORDINATES = mujoco.mjtState.mjSTATE_QPOS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL
 MANY = 12
-MESSAGE = np.frombuffer(b"no more of this\0", np.uint8)
 FAILS = 5
-numbers_at = array_at(np.int64)
-mju_error = types.ExternalFunction("mju_error", types.void(types.int64))
-
-
-@compiled_for_batch
-def count(_model: int, _data: int, index: int, argument: int) -> None:
-    numbers_at(argument, MANY)[index] += 1
-
-
-@compiled_for_batch
-def advance(model: int, data: int, _index: int, _argument: int) -> None:
-    for _ in range(10):
-        mj_step(model, data)
-    mj_forward(model, data)
-
-
-@compiled_for_batch
-def fail(_model: int, _data: int, index: int, argument: int) -> None:
-    numbers = numbers_at(argument, MANY + 1)
-    numbers[index] += 1
-    if index == FAILS:
-        mju_error(numbers[MANY])
-
-
-def counters() -> npt.NDArray[np.int64]:
-    """What ``count`` and ``fail`` count, [MANY], and the address of an error message."""
-    return np.array([0] * MANY + [MESSAGE.ctypes.data])
+TIME = mujoco.mjtState.mjSTATE_TIME
 
 
 def many(num_threads: int) -> Simulations:
@@ -85,7 +55,7 @@ def run(simulations: Simulations, chosen: Floats) -> list[bytes]:
     past = []
     for number, step in enumerate(chosen):
         control[...] = step
-        simulations.apply(advance, 0)
+        simulations.step(10, derive=True)
         past.append(simulations.rows.tobytes())
         if number % 20 == 19:
             datas = [simulations.data(index) for index in range(NUMBER)]
@@ -144,9 +114,9 @@ def test_simulations_stepped_in_parts_move_as_those_stepped_together() -> None:
     for chosen in controls(50):
         for simulations in (together, apart):
             simulations.state(CONTROL, (2,))[...] = chosen
-        together.apply(advance, 0)
-        apart.apply(advance, 0, [1])
-        apart.apply(advance, 0, [0])
+        together.step(10, derive=True)
+        apart.step(10, [1], derive=True)
+        apart.step(10, [0], derive=True)
     assert together.rows.tobytes() == apart.rows.tobytes()
 
 
@@ -163,7 +133,7 @@ def test_a_diverged_simulation_is_reported_until_it_is_reset(
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
     simulations = crowd()
     simulations.state(COORDINATES, (SCENE.model.nq,))[1, 0] = np.nan
-    simulations.apply(advance, 0)
+    simulations.step(10, derive=True)
     assert simulations.broken().tolist() == [False, True]
     simulations.reset([1])
     simulations.forward([1])
@@ -181,13 +151,61 @@ def test_a_batch_that_mujoco_refuses_to_make_is_reported() -> None:
     assert str(error.value) == "MuJoCo cannot simulate this model in a batch: nsim must be positive"
 
 
+def steps_taken(simulations: Simulations) -> list[int]:
+    """Return how many physics steps each simulation has taken."""
+    time = simulations.state(TIME, (1,))[:, 0]
+    return [round(seconds) for seconds in time / simulations.model.opt.timestep]
+
+
 @pytest.mark.parametrize("num_threads", [1, 2, 5, 20])
-def test_every_simulation_chosen_is_worked_on_once(num_threads: int) -> None:
-    simulations, numbers = many(num_threads), counters()
-    simulations.apply(count, numbers.ctypes.data)
-    simulations.apply(count, numbers.ctypes.data, [7, 2, 11])
-    simulations.apply(count, numbers.ctypes.data, [])
-    assert numbers[:MANY].tolist() == [2 if index in (2, 7, 11) else 1 for index in range(MANY)]
+def test_every_simulation_chosen_is_stepped_once(num_threads: int) -> None:
+    simulations = many(num_threads)
+    simulations.step(1, derive=False)
+    simulations.step(1, [7, 2, 11], derive=True)
+    simulations.step(1, [], derive=True)
+    assert steps_taken(simulations) == [2 if index in (2, 7, 11) else 1 for index in range(MANY)]
+
+
+def test_inputs_of_each_step_are_those_given() -> None:
+    """Steps with inputs end where steps with the same controls, one by one, do."""
+    chosen, together, alone = np.array([3, 8]), many(2), many(1)
+    inputs = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 10, 2))
+    together.step_with_inputs(inputs, int(CONTROL), chosen)
+    for step in range(10):
+        alone.state(CONTROL, (2,))[chosen] = inputs[:, step]
+        alone.step(1, chosen, derive=step == 9)
+    assert together.rows.tobytes() == alone.rows.tobytes()
+
+
+def test_outputs_are_what_mujoco_computed_last() -> None:
+    simulations = crowd()
+    acceleration = simulations.output("qacc", (SCENE.model.nv,))
+    places = simulations.output("xpos", (SCENE.model.nbody, 3))
+    run(simulations, controls(30))
+    for index in range(NUMBER):
+        data = simulations.data(index)
+        assert np.array_equal(acceleration[index], data.qacc)
+        assert np.array_equal(places[index], data.xpos)
+
+
+def test_outputs_of_restored_simulations_are_those_saved() -> None:
+    simulations, restored = crowd(), crowd()
+    run(simulations, controls(30))
+    places = restored.output("xpos", (SCENE.model.nbody, 3))
+    restored.load(SavedState("a test", simulations.save()))
+    assert np.array_equal(places[1], simulations.data(1).xpos)
+
+
+def clouds(num_threads: int) -> Simulations:
+    """Clouds of spheres in the air; that of simulation FAILS has more contacts than its memory is for."""
+    spheres = "".join(f'<geom type="sphere" size="0.05" pos="{0.1 * index} 0 0"/>' for index in range(36))
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><size memory="4000"/><worldbody><geom type="plane" size="5 5 0.1"/>
+        <body pos="0 0 5"><freejoint/>{spheres}</body></worldbody></mujoco>"""
+    )
+    simulations = Simulations(model, MANY, num_threads=num_threads)
+    simulations.state(COORDINATES, (model.nq,))[FAILS, 2] = 0.04
+    return simulations
 
 
 @pytest.mark.parametrize("num_threads", [1, 2])
@@ -195,26 +213,26 @@ def test_an_error_of_mujoco_stops_one_simulation_alone(
     num_threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its errors to a file where it runs
-    broken, numbers = many(num_threads), counters()
-    before = broken.rows.copy()
-    broken.apply(fail, numbers.ctypes.data)
+    broken = clouds(num_threads)
+    before = broken.rows[FAILS].copy()
+    broken.step(1, derive=False)
     others = np.arange(MANY) != FAILS
-    assert numbers[:MANY].tolist() == [1] * MANY
+    assert steps_taken(broken) == others.astype(int).tolist()
     assert broken.any_stopped
     assert np.array_equal(broken.stopped, ~others)
     assert np.array_equal(broken.broken(), ~others)
-    assert np.array_equal(broken.rows, before)
-    broken.apply(count, numbers.ctypes.data, [2, 3])
+    assert np.array_equal(broken.rows[FAILS], before)
+    broken.step(1, [2, 3], derive=False)
     assert np.array_equal(broken.stopped, ~others), "until it is reset"
     broken.reset([FAILS])
     assert not broken.any_stopped
-    broken.apply(count, numbers.ctypes.data)
+    broken.step(1, derive=False)
     assert not broken.stopped.any()
 
 
 def test_a_failure_in_an_interrupted_call_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    broken, numbers = many(2), counters()
+    broken = clouds(2)
     run = broken._run
 
     def interrupted(*arguments: Any) -> None:
@@ -223,7 +241,7 @@ def test_a_failure_in_an_interrupted_call_is_told(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(broken, "_run", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        broken.apply(fail, numbers.ctypes.data)
+        broken.step(1, derive=False)
     assert np.flatnonzero(broken.broken()).tolist() == [FAILS]
     assert broken.any_stopped
 
@@ -231,7 +249,7 @@ def test_a_failure_in_an_interrupted_call_is_told(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize("ids", [[3, 3, 4], [-1], [MANY], [True] * MANY, [0.5]])
 def test_simulations_that_are_not_there_or_named_twice_are_refused(ids: list[Any]) -> None:
     with pytest.raises(ValueError, match=r"must be different whole numbers from 0 to 11, got \["):
-        many(2).apply(count, counters().ctypes.data, ids)
+        many(2).step(1, ids, derive=False)
 
 
 def test_a_view_outlives_its_simulations() -> None:
@@ -241,23 +259,22 @@ def test_a_view_outlives_its_simulations() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-@pytest.mark.parametrize(("num_threads", "exit_code"), [(1, 1), (2, 42)])
+@pytest.mark.parametrize(("num_threads", "exit_code"), [(1, 2), (2, 42)])
 def test_a_fork_uses_simulations_of_one_thread_and_gets_an_error_that_says_to_make_others(
     num_threads: int, exit_code: int
 ) -> None:
     simulations = many(num_threads)
-    simulations.apply(count, counters().ctypes.data)
-    child = multiprocessing.get_context("fork").Process(target=_count_and_exit, args=(simulations,))
+    simulations.step(1, derive=False)
+    child = multiprocessing.get_context("fork").Process(target=_step_and_exit, args=(simulations,))
     child.start()
     del simulations
     child.join(60.0)
     assert child.exitcode == exit_code
 
 
-def _count_and_exit(simulations: Simulations) -> None:
-    numbers = counters()
+def _step_and_exit(simulations: Simulations) -> None:
     try:
-        simulations.apply(count, numbers.ctypes.data)
+        simulations.step(1, derive=False)
     except PhysicsError as error:
         assert str(error) == (
             "simulations with num_threads = 2 cannot be used in a forked process: "
@@ -265,4 +282,4 @@ def _count_and_exit(simulations: Simulations) -> None:
         )
         del simulations
         os._exit(42)
-    os._exit(int(numbers[:MANY].min()))
+    os._exit(min(steps_taken(simulations)))
