@@ -448,6 +448,24 @@ def test_a_run_deleted_by_hand_is_made_again(write: Callable[..., SweepStore]) -
     assert everything(store) == shown
 
 
+def test_two_processes_make_one_run_of_a_trial(
+    half_and_done: tuple[SweepStore, SweepStore], tmp_path: Path
+) -> None:
+    store, done = half_and_done
+    uri = tracking_uri(store, None)
+    started = trial_titled(store, DYNAMIC).folder
+    shutil.move(started, tmp_path / "not-yet")
+    launch = mlflow_sync.Tracker(store, uri)
+    assert launch.bring_up_to_date(live=True).trials == 1
+    shutil.move(tmp_path / "not-yet", started)
+    assert sync(store, uri).points > 0  # as `recrl-sweep sync` does during the launch
+    grow(store, done, DYNAMIC)
+    assert launch.bring_up_to_date(live=True).points > 0
+    run = runs(store)[DYNAMIC]  # `runs` refuses two runs of one name
+    assert run.info.status == "FINISHED"
+    assert len(history(store, run)["agent/kl"]) == 40
+
+
 def test_a_run_whose_maker_died_over_it_gets_its_params(write: Callable[..., SweepStore]) -> None:
     store = write()
     uri = tracking_uri(store, None)
