@@ -137,7 +137,6 @@ def launch_grid(
     listener = listener or LaunchListener()
     store = SweepStore(options.root, grid.name)
     place = sweep_place(store, options.storage)
-    place.prepare()
     executor = _executor(grid, place, options)
     at_once, where = room(
         grid.resources,

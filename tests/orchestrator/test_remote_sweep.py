@@ -169,6 +169,18 @@ def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
     assert main([*plan, "--rerun-changed"]) == ExitCode.WRONG_INPUT
 
 
+@pytest.mark.parametrize(
+    "mistake", [("--only", "method=nonsense"), ("--rerun-changed",), ("--address", "auto")]
+)
+def test_a_refused_launch_does_not_make_the_folder_a_copy(tmp_path: Path, mistake: tuple[str, ...]) -> None:
+    (tmp_path / "grid.yaml").write_bytes(grid().text)
+    launch = ["launch", str(tmp_path / "grid.yaml"), "--root", str(tmp_path / "runs"), *INLINE]
+    storage = ("--storage", (tmp_path / "bucket").as_uri())
+    assert main([*launch, *storage, *mistake]) == ExitCode.WRONG_INPUT
+    assert not (tmp_path / "runs" / "small" / "storage.json").exists()
+    assert not (tmp_path / "bucket").exists()
+
+
 def test_a_trial_is_not_ended_before_its_signs_of_life_can_arrive(tmp_path: Path) -> None:
     here = machine(tmp_path, "here").storage
     assert here.shortest_silence_seconds == 50.0  # as the option's description says
