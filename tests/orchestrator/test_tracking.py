@@ -28,6 +28,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.process_scope import process_scope
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
@@ -248,7 +249,7 @@ def test_a_place_that_mlflow_cannot_keep_a_sweep_in_is_refused(tmp_path: Path, g
 )
 def test_run_states_are_true(status: TrialState, live: bool, expected: str) -> None:
     record = TrialRecord(
-        status=status, attempt=1, heartbeat=time.time(), host=socket.gethostname(), pid=os.getpid()
+        status=status, attempt=1, heartbeat=time.time(), pid=os.getpid(), pid_scope=process_scope()
     )
     assert trial_run_status(record, live=live, silence_seconds=300.0) == expected
 
@@ -257,10 +258,10 @@ def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     here = TrialRecord(
-        status=TrialState.RUNNING, heartbeat=time.time(), host=socket.gethostname(), pid=process.pid
+        status=TrialState.RUNNING, heartbeat=time.time(), pid=process.pid, pid_scope=process_scope()
     )
     assert trial_run_status(here, live=True, silence_seconds=300.0) == "KILLED"
-    elsewhere = replace(here, host="elsewhere")
+    elsewhere = replace(here, pid_scope="another container of this host")
     assert trial_run_status(elsewhere, live=True, silence_seconds=300.0) == "RUNNING"
     silent = replace(elsewhere, heartbeat=time.time() - 301.0)
     assert trial_run_status(silent, live=True, silence_seconds=300.0) == "KILLED"
