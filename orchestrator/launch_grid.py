@@ -199,7 +199,8 @@ def room(
     if address and not inline:
         from recrl.orchestrator.ray.ray_executor import room_on_cluster  # noqa: PLC0415  (imports ray)
 
-        return most or max(1, room_on_cluster(address, resources)), "on the cluster at present"
+        fitting = max(1, room_on_cluster(address, resources))
+        return min(fitting, most or fitting), "on the cluster at present"
     if resources.gpus_per_trial and not inline and cores is None:
         from recrl.orchestrator.trial.device import usable_gpus  # noqa: PLC0415  (imports torch)
 
