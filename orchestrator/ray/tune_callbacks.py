@@ -149,7 +149,8 @@ def _last_error(trial: Any) -> BaseException | None:
     path = trial.pickled_error_file
     if path is None:
         return None
-    error: BaseException = cloudpickle.loads(Path(path).read_bytes())  # Tune wrote it a moment ago
+    # written a moment ago; Trial.get_pickled_error would look in the storage, where it is not yet
+    error: BaseException = cloudpickle.loads(Path(path).read_bytes())
     return error.cause if isinstance(error, RayTaskError) else error
 
 
