@@ -19,7 +19,7 @@ class GridError(RecrlError):
         self.problems = problems
 
 
-class UncalledError(RecrlError):
+class UntrustedGridError(RecrlError):
     """A grid was checked without its import paths, which were not followed; no mistake was found.
 
     Attributes:

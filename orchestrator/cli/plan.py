@@ -10,7 +10,7 @@ from rich.console import Console
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import number_of_trials, print_table, say, short
 from recrl.orchestrator.cli.requests import GridRequest, PlanRequest, ValidateRequest
-from recrl.orchestrator.errors import UncalledError
+from recrl.orchestrator.errors import UntrustedGridError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.curriculum_warnings import no_deployment_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -28,7 +28,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
     """Check a grid file; nothing is started or written."""
     try:
         grid = read_grid(request.grid, build=True)
-    except UncalledError as error:
+    except UntrustedGridError as error:
         say(console, f"{error}; everything else is right")
         return ExitCode.OK
     sizes = (len(grid.tasks), len(grid.agents), len(grid.methods), len(grid.seeds))

@@ -126,10 +126,10 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
         "it require a token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
     )
     with scratch_folder(tempfile.gettempdir()) as scratch:
-        environment: dict[str, Any] = {"env_vars": WORKER}
+        runtime_env: dict[str, Any] = {"env_vars": WORKER}
         if ship_package:
-            environment["py_modules"] = [str(folder) for folder in copy_package(scratch)]
-        with _connection(failure, hint, address=address, runtime_env=environment):
+            runtime_env["py_modules"] = [str(folder) for folder in copy_package(scratch)]
+        with _connection(failure, hint, address=address, runtime_env=runtime_env):
             yield
 
 

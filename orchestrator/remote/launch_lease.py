@@ -26,7 +26,7 @@ from recrl.orchestrator.errors import StorageError, SweepBusyError
 from recrl.orchestrator.process_scope import has_ended, process_scope
 from recrl.orchestrator.remote.object_store import ObjectStore
 
-LOOK_SECONDS = 5.0  # between two checks for a stop request
+LEASE_CHECK_SECONDS = 5.0  # between two checks for a stop request
 BEAT_SECONDS = 15.0  # between two signs of life of a launch
 EMPTY_SECONDS = 1.0  # time after which a write has become visible
 SILENT_SECONDS = 90.0  # without a sign of life, after which its sweep is free
@@ -131,7 +131,7 @@ class LaunchLease:
     def _hold(self, own: dict[str, Any], stop: threading.Event, over: threading.Event) -> None:
         """Write signs of life, and check for requests."""
         spoke_at = time.monotonic()
-        while not over.wait(LOOK_SECONDS):
+        while not over.wait(LEASE_CHECK_SECONDS):
             try:
                 if self._objects.read(STOP_REQUEST) is not None:
                     stop.set()

@@ -319,7 +319,7 @@ def test_one_launch_at_a_time_and_a_dead_one_frees_the_sweep(tmp_path: Path) -> 
 
 
 def test_a_launch_that_is_taken_over_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LEASE_CHECK_SECONDS", 0.01)
     monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.BEAT_SECONDS", 0.01)
     here, stop = machine(tmp_path, "here"), threading.Event()
     with here.storage.held(stop):
@@ -333,7 +333,7 @@ def test_a_launch_that_is_taken_over_stops(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LEASE_CHECK_SECONDS", 0.01)
     here, there, stop = machine(tmp_path, "here"), machine(tmp_path, "there"), threading.Event()
     assert not there.storage.request_stop()()
     with here.storage.held(stop):
