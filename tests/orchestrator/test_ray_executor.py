@@ -28,6 +28,7 @@ from recrl.orchestrator.errors import ClusterError, TeacherUnavailableError
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.stop_file import StopFile
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.ray import hang_watchdog, nodes
 from recrl.orchestrator.ray.clusters import existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
@@ -142,7 +143,9 @@ def test_a_stopped_sweep_is_finished_by_the_next_run_with_other_workers(
     assert record.status is TrialState.WAITING
     assert 20 <= record.update < LONG.num_updates
     left = [spec for spec in (*reversed(SWEEP), LONG) if not store.trial(spec).record().status.is_finished]
-    RayExecutor(max_concurrent=1, teacher="inline").run(left, SweepPlace(store), threading.Event())
+    RayExecutor(resources=Resources(max_concurrent=1, teacher="inline")).run(
+        left, SweepPlace(store), threading.Event()
+    )
     assert_equal_bytes((LONG, *SWEEP), store, inline)
 
 
@@ -275,7 +278,9 @@ def test_what_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
         ClusterError,
         match=r"^a trial asks for 3 CPU, 0 GPU, this cluster has 2 CPU, 0 GPU; ask for less or add machines$",
     ):
-        RayExecutor(cpus_per_trial=3).run(SWEEP, SweepPlace(SweepStore(tmp_path, "sweep")), threading.Event())
+        RayExecutor(resources=Resources(cpus_per_trial=3)).run(
+            SWEEP, SweepPlace(SweepStore(tmp_path, "sweep")), threading.Event()
+        )
 
 
 @pytest.mark.usefixtures("cluster")

@@ -26,6 +26,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.launch_plan import TrialSelection
 from recrl.orchestrator.ray.ray_executor import RayExecutor
 from recrl.orchestrator.remote.commit_upload import Upload
@@ -184,7 +185,7 @@ def test_a_refused_launch_does_not_make_the_folder_a_copy(tmp_path: Path, mistak
 def test_a_trial_is_not_ended_before_its_signs_of_life_can_arrive(tmp_path: Path) -> None:
     here = machine(tmp_path, "here").storage
     assert here.shortest_silence_seconds == 50.0  # as the option's description says
-    executor = RayExecutor(silence_seconds=5.0)
+    executor = RayExecutor(resources=Resources(silence_seconds=5.0))
     assert executor.silence_of(here) == 50.0
     assert executor.silence_of(SweepPlace(here.store)) == 5.0
 
