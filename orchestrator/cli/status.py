@@ -9,10 +9,11 @@ import time
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import number_of_trials, print_table, say, short
+from recrl.orchestrator.cli.output import print_table, say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
 from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.curriculum_warnings import (
@@ -90,7 +91,7 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
     trials = len(listed | {trial.folder.name for trial in orphans})
     say(
         console,
-        f"{store.name}: {number_of_trials(trials)} checked, {len(problems) or 'no'} wrong "
+        f"{store.name}: {counted(trials, 'trial')} checked, {len(problems) or 'no'} wrong "
         f"file{'' if len(problems) == 1 else 's'}",
     )
     if problems and store.storage_path.exists():

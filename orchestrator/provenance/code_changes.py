@@ -23,6 +23,7 @@ from typing import Any
 
 from recrl.agents.registry import AGENTS
 from recrl.environments.registry import TASKS
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.provenance.own_package import digest_of_files, folder_of
@@ -109,10 +110,9 @@ def other_code_sentence(complete: int, begun: int) -> str:
     """
     parts = []
     if complete:
-        parts.append(f"{complete} complete trial{'' if complete == 1 else 's'}")
+        parts.append(counted(complete, "complete trial"))
     if begun:
-        noun = f"one{'' if begun == 1 else 's'}" if complete else f"trial{'' if begun == 1 else 's'}"
-        parts.append(f"{begun} begun {noun}")
+        parts.append(counted(begun, "begun one" if complete else "begun trial"))
     if not parts:
         return ""
     comes = "comes" if complete + begun == 1 else "come"

@@ -64,6 +64,7 @@ ADAPTERS = {
 LAYERS = (
     (
         "background_thread",
+        "counting",
         "errors",
         "exit_codes",
         "located_yaml",
