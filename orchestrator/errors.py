@@ -114,6 +114,12 @@ def described(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {text}".split()).removesuffix(":")
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error, or all lines as one if the first only announces the others."""
+    first = next(iter(str(error).splitlines()), "")
+    return " ".join(str(error).split()) if first.endswith(":") else first
+
+
 def missing(path: Path) -> str:
     """Describe a missing file: the folder that was searched, and similar names in it."""
     folder = path.absolute().parent

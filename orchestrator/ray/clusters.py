@@ -15,7 +15,7 @@ from typing import Any
 
 import ray
 
-from recrl.orchestrator.errors import ClusterError
+from recrl.orchestrator.errors import ClusterError, first_line
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.provenance.own_package import copy_package
 from recrl.orchestrator.ray.private_api import (
@@ -181,9 +181,3 @@ def _token() -> str:
 def _short_folder() -> str:
     folder = tempfile.gettempdir()
     return folder if len(folder) <= LONGEST_SOCKET_FOLDER - len(f"/{PREFIX}12345678/{RAY_FOLDER}") else "/tmp"
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error, or all lines as one if the first only announces the others."""
-    first = next(iter(str(error).splitlines()), "")
-    return " ".join(str(error).split()) if first.endswith(":") else first

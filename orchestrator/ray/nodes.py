@@ -14,7 +14,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from recrl.orchestrator.errors import ClusterError
+from recrl.orchestrator.errors import ClusterError, first_line
 from recrl.orchestrator.launch_plan import trials_on_gpus
 
 DISTRIBUTIONS = ("recrl", "ray", "torch", "numpy")
@@ -122,7 +122,7 @@ def _asked(
             answers.append((address, ray.get(answer)))
         except RayError as error:
             cause = error.cause if isinstance(error, RayTaskError) else error
-            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {_first_line(cause)}")
+            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {first_line(cause)}")
     return answers, problems
 
 
@@ -130,10 +130,6 @@ def _nodes() -> list[dict[str, Any]]:
     """Return the present nodes, as Ray describes them."""
     described: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
     return [node for node in described if node["Alive"]]
-
-
-def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), "")
 
 
 def _torch_without_gpu() -> str:

@@ -20,9 +20,8 @@ from ray.exceptions import (
 )
 from ray.tune.search import BasicVariantGenerator
 
-from recrl.orchestrator.errors import StorageError, TeacherUnavailableError
+from recrl.orchestrator.errors import StorageError, TeacherUnavailableError, first_line
 from recrl.orchestrator.files.stop_file import StopSign
-from recrl.orchestrator.ray.clusters import first_line
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.services import LostServices
 from recrl.orchestrator.ray.tune_trial import spec_of
