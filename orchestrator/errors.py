@@ -19,7 +19,7 @@ class GridError(RecrlError):
         self.problems = problems
 
 
-class UncalledError(RecrlError):
+class UntrustedGridError(RecrlError):
     """A grid was checked without its import paths, which were not followed; no mistake was found.
 
     Attributes:
@@ -112,6 +112,12 @@ def described(error: BaseException) -> str:
     except Exception:  # a user's own class may fail here
         text = "its text cannot be read"
     return " ".join(f"{type(error).__name__}: {text}".split()).removesuffix(":")
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error, or all lines as one if the first only announces the others."""
+    first = next(iter(str(error).splitlines()), "")
+    return " ".join(str(error).split()) if first.endswith(":") else first
 
 
 def missing(path: Path) -> str:

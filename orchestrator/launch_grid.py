@@ -137,7 +137,6 @@ def launch_grid(
     listener = listener or LaunchListener()
     store = SweepStore(options.root, grid.name)
     place = sweep_place(store, options.storage)
-    place.prepare()
     executor = _executor(grid, place, options)
     at_once, where = room(
         grid.resources,
@@ -200,7 +199,8 @@ def room(
     if address and not inline:
         from recrl.orchestrator.ray.ray_executor import room_on_cluster  # noqa: PLC0415  (imports ray)
 
-        return most or max(1, room_on_cluster(address, resources)), "on the cluster at present"
+        fitting = max(1, room_on_cluster(address, resources))
+        return min(fitting, most or fitting), "on the cluster at present"
     if resources.gpus_per_trial and not inline and cores is None:
         from recrl.orchestrator.trial.device import usable_gpus  # noqa: PLC0415  (imports torch)
 
@@ -224,16 +224,9 @@ def _executor(grid: GridSpec, place: SweepPlace, options: LaunchOptions) -> Exec
         raise RecrlError(f"{place.uri}: is memory of a single process; use --executor inline")
     from recrl.orchestrator.ray.ray_executor import RayExecutor  # noqa: PLC0415  (imports ray)
 
-    return RayExecutor(
-        address=options.address,
-        ship_package=options.ship_package,
-        cpus_per_trial=grid.resources.cpus_per_trial,
-        gpus_per_trial=grid.resources.gpus_per_trial,
-        custom_per_trial=grid.resources.custom_per_trial,
-        max_concurrent=options.max_concurrent or grid.resources.max_concurrent,
-        teacher=grid.resources.teacher,
-        silence_seconds=grid.resources.silence_seconds,
-    )
+    most = options.max_concurrent or grid.resources.max_concurrent
+    resources = grid.resources.model_copy(update={"max_concurrent": most})
+    return RayExecutor(address=options.address, ship_package=options.ship_package, resources=resources)
 
 
 def _inline_executor(grid: GridSpec, options: LaunchOptions) -> Executor:

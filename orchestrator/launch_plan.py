@@ -17,7 +17,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import select
-from recrl.orchestrator.provenance.code_changes import has_other_code
+from recrl.orchestrator.provenance.code_changes import InstalledCode, has_other_code
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
 
 # Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the MLflow
@@ -165,12 +165,12 @@ def make_plan(specs: Sequence[TrialSpec], store: SweepStore, selection: TrialSel
     """
     selection = selection or TrialSelection()
     wanted = {spec.folder_name for spec in specs}
-    trials = []
+    trials, installed = [], InstalledCode()
     for spec in select(specs, selection.only):
         trial = store.trial(spec)
         record = trial.verified_record() if selection.rerun_damaged else trial.record()
         action = _planned_action(record, selection)
-        changed = has_other_code(trial, spec)
+        changed = has_other_code(trial, spec, installed)
         if (changed and selection.rerun_changed) or trial.rerun_has_begun:
             action = PlannedAction.RERUN
         trials.append(PlannedTrial(spec, action, record, changed))

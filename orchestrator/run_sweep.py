@@ -115,6 +115,7 @@ def run_sweep(settings: SweepRunSettings, *, stop: threading.Event) -> SweepResu
         place.require_reruns()
     specs = settings.grid.trials()
     select(specs, settings.selection.only)  # a mistake in ``only`` must leave no files
+    place.prepare()
     with store.lock(), _stopping_on_request(store, stop), place.held(stop):
         place.pull()
         _write_files(settings.grid, specs, store)

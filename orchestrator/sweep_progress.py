@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -13,6 +11,7 @@ from enum import StrEnum
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.process_scope import has_ended
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 
@@ -144,17 +143,5 @@ def display_status(record: TrialRecord, *, now: float, silence_seconds: float) -
             return DisplayStatus.STOPPED if record.attempt else DisplayStatus.WAITING
         case TrialState.RUNNING:
             silent = abs(now - record.heartbeat) > silence_seconds  # also if another clock is ahead
-            return DisplayStatus.INTERRUPTED if silent or _has_no_process(record) else DisplayStatus.RUNNING
-
-
-def _has_no_process(record: TrialRecord) -> bool:
-    """Whether the trial's process was on this machine and has ended."""
-    if record.host != socket.gethostname():
-        return False
-    try:
-        os.kill(record.pid, 0)  # signal 0 only checks
-    except ProcessLookupError:
-        return True
-    except PermissionError:
-        pass  # a process of another user, so it exists
-    return False
+            is_dead = silent or has_ended(record.pid, record.pid_scope)
+            return DisplayStatus.INTERRUPTED if is_dead else DisplayStatus.RUNNING

@@ -26,6 +26,7 @@ import numpy as np
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from recrl.analysis.data.archives import UNREADABLE, unpacked
 from recrl.analysis.data.exact_values import DETERMINISTIC, STOCHASTIC
 from recrl.analysis.data.labels import TRIAL
 from recrl.analysis.data.sweep_data import (
@@ -40,7 +41,6 @@ from recrl.analysis.data.sweep_data import (
 )
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.errors import DamagedError, RecrlError, missing
-from recrl.orchestrator.files.archives import UNREADABLE, unpacked
 from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, UPDATE_COLUMNS

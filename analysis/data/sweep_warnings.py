@@ -17,7 +17,7 @@ from recrl.orchestrator.files.curriculum_warnings import (
     landed_hard,
     no_curriculum_sentence,
 )
-from recrl.orchestrator.provenance.code_changes import other_code, other_code_sentence
+from recrl.orchestrator.provenance.code_changes import InstalledCode, other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
 
 BASELINE = "none"  # of ``metrics.comparisons``
@@ -32,7 +32,8 @@ def damages(sweep: Sweep) -> list[str]:
 
 def doubts(sweep: Sweep) -> list[str]:
     """Return sentences on trials of other code than is installed, on mixed code and ineffective curricula."""
-    changed = [it for it in sweep.facts if other_code(attempts(it), it.spec)]
+    installed = InstalledCode()
+    changed = [it for it in sweep.facts if other_code(attempts(it), it.spec, installed)]
     complete = sum(it.status is TrialState.COMPLETE for it in changed)
     code = other_code_sentence(complete, len(changed) - complete)
     if code and sweep.folder is None:

@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from recrl.orchestrator.background_thread import background_thread
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.launch_plan import Estimate, Plan, PlannedAction
 from recrl.orchestrator.spec import TrialState
@@ -69,7 +70,7 @@ def plan_sentence(plan: Plan) -> str:
         PlannedAction.DAMAGED: "damaged",
     }
     parts = [f"{number} {words[action]}" for action, number in plan.counts.items() if number]
-    return f"{_counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
+    return f"{counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
 
 
 def estimate_sentence(estimate: Estimate, where: str) -> str:
@@ -77,7 +78,7 @@ def estimate_sentence(estimate: Estimate, where: str) -> str:
     if not estimate.concurrent:
         return "nothing to do"
     memory = f"about {estimate.gigabytes:.1f} GB of memory"
-    at_once = f"{_counted(estimate.concurrent, 'trial')} at once {where}"
+    at_once = f"{counted(estimate.concurrent, 'trial')} at once {where}"
     if estimate.wall_seconds is None:
         names = ", ".join(dict.fromkeys(estimate.unknown))
         return f"time unknown until a first trial has run ({names}); {at_once}, {memory}"
@@ -260,7 +261,3 @@ def _table(*columns: str) -> Table:
 
 def _styled(word: str) -> Text:
     return Text(str(word), style=_STYLES.get(str(word), ""))
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -15,7 +15,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
-from recrl.orchestrator.provenance.code_changes import has_other_code, other_code_sentence
+from recrl.orchestrator.provenance.code_changes import InstalledCode, has_other_code, other_code_sentence
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
@@ -81,7 +81,8 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
 
 def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> None:
     """Print the number of trials that ran other code than evaluated them."""
-    changed = [saved for saved in evaluated if has_other_code(saved.store, saved.spec)]
+    installed = InstalledCode()
+    changed = [saved for saved in evaluated if has_other_code(saved.store, saved.spec, installed)]
     complete = sum(saved.store.record().status is TrialState.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
         say(console, f"warning: {sentence}; these evaluations use the installed code")

@@ -15,6 +15,7 @@ from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.plan import say_other_code, say_plan, selection_of
 from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
 from recrl.orchestrator.cli.status import say_failures
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -180,10 +181,9 @@ def _say_result(
         say(console, f"Stopped; nothing is lost. Continue with: {again}")
         return ExitCode.STOPPED
     if damaged := result.progress.with_status(DisplayStatus.DAMAGED):
-        them = f"{len(damaged)} damaged trial{'' if len(damaged) == 1 else 's'}"
         rerun = again if options.selection.rerun_damaged else f"{again} --rerun-damaged"
         how = "" if place.uri else f"; to move the damaged files aside and run again: {rerun}"
-        say(console, f"{them} left alone{how}")
+        say(console, f"{counted(len(damaged), 'damaged trial')} left alone{how}")
     if result.failed:
         retry = again if options.selection.retry_failed else f"{again} --retry-failed"
         say(console, f"Try what failed again with: {retry}")

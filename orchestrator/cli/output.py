@@ -79,11 +79,6 @@ def say(console: Console, sentence: str) -> None:
     console.print(shown(sentence), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
-def number_of_trials(number: int) -> str:
-    """Return the number in words of a sentence: "1 trial", "12 trials"."""
-    return f"{number} trial{'' if number == 1 else 's'}"
-
-
 def show(table: pd.DataFrame, console: Console) -> None:
     """Print a table of finished text."""
     print_table(display.text_table(list(map(str, table)), table.to_numpy().tolist()), console)

@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import number_of_trials, print_table, say, short
+from recrl.orchestrator.cli.output import print_table, say, short
 from recrl.orchestrator.cli.requests import GridRequest, PlanRequest, ValidateRequest
-from recrl.orchestrator.errors import UncalledError
+from recrl.orchestrator.counting import counted
+from recrl.orchestrator.errors import UntrustedGridError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.curriculum_warnings import no_deployment_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -28,14 +29,14 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
     """Check a grid file; nothing is started or written."""
     try:
         grid = read_grid(request.grid, build=True)
-    except UncalledError as error:
+    except UntrustedGridError as error:
         say(console, f"{error}; everything else is right")
         return ExitCode.OK
     sizes = (len(grid.tasks), len(grid.agents), len(grid.methods), len(grid.seeds))
     product = " x ".join(str(size) for size in sizes)
     say(
         console,
-        f"{request.grid}: {grid.name} is right: {number_of_trials(len(grid.trials()))}, from "
+        f"{request.grid}: {grid.name} is right: {counted(len(grid.trials()), 'trial')}, from "
         f"tasks x agents x methods x seeds = {product}",
     )
     _warn_of_deployment(grid.trials(), console)

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from recrl.orchestrator.cli.output import number_of_trials, say, short
+from recrl.orchestrator.cli.output import say, short
 from recrl.orchestrator.cli.requests import ExportRequest, FiguresRequest, MergeRequest, SourceRequest
 from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import read_name
@@ -77,7 +78,7 @@ def say_warnings(sweep: Sweep, console: Console) -> None:
 def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
     complete = sum(trial.status is TrialState.COMPLETE for trial in sweep.facts)
     size = f"{path.stat().st_size / 1000:,.0f} kB"
-    say(console, f"{short(path)}: {number_of_trials(len(sweep.facts))}, {complete} of them complete, {size}")
+    say(console, f"{short(path)}: {counted(len(sweep.facts), 'trial')}, {complete} of them complete, {size}")
 
 
 def source(request: SourceRequest) -> tuple[Sweep, Path]:

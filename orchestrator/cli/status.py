@@ -9,10 +9,11 @@ import time
 from rich.console import Console
 
 from recrl.orchestrator.cli import display
-from recrl.orchestrator.cli.output import number_of_trials, print_table, say, short
+from recrl.orchestrator.cli.output import print_table, say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
-from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.cli.sweeps import open_place, open_store
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.curriculum_warnings import (
@@ -23,7 +24,6 @@ from recrl.orchestrator.files.curriculum_warnings import (
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.launch_plan import make_plan
-from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.run_sweep import REQUEST_SECONDS
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import (
@@ -90,7 +90,7 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
     trials = len(listed | {trial.folder.name for trial in orphans})
     say(
         console,
-        f"{store.name}: {number_of_trials(trials)} checked, {len(problems) or 'no'} wrong "
+        f"{store.name}: {counted(trials, 'trial')} checked, {len(problems) or 'no'} wrong "
         f"file{'' if len(problems) == 1 else 's'}",
     )
     if problems and store.storage_path.exists():
@@ -121,8 +121,8 @@ def _listed(store: SweepStore) -> list[TrialSpec]:
 
 def run_stop(request: StopRequest, console: Console) -> ExitCode:
     """Ask the launch that runs a sweep to save its trials and end, and wait until it has."""
-    store = open_store(request)
-    place = sweep_place(store, request.storage)
+    place = open_place(request)
+    store = place.store
     still_runs = place.request_stop()
     if not still_runs():
         say(console, f"{store.name}: no launch runs this sweep")
@@ -137,15 +137,14 @@ def run_stop(request: StopRequest, console: Console) -> ExitCode:
 
 def run_logs(request: LogsRequest, console: Console) -> ExitCode:
     """Print a trial's log, or the path of its folder."""
-    store = open_store(request)
-    text = " ".join(request.trial)
+    place = open_place(request)
+    store, text = place.store, " ".join(request.trial)
     if request.folder:
         say(console, str(short(_trial(store, text).folder)))
         return ExitCode.OK
     with contextlib.ExitStack() as following:
         if request.follow:
             if not store.is_locked():
-                place = sweep_place(store, request.storage)
                 following.enter_context(place.kept_up_to_date(threading.Event()))
             _wait_for_start(store, text, console)
         trial = _trial(store, text)

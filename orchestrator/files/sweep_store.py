@@ -72,14 +72,14 @@ from recrl.orchestrator.files.atomic_files import (
 from recrl.orchestrator.files.locks import look_at_lock, open_lock
 from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.row_files import Extent
-from recrl.orchestrator.files.trial_files import Below
+from recrl.orchestrator.files.trial_files import PathIn
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 
 SPECS_FORMAT = 2
 INFO_FORMAT = 2
 SILENCE_SECONDS = 300.0  # an update of large networks takes a minute or two
-LOOK_SECONDS = 10.0  # total time for which readers may hold the lock to see whether a sweep is locked
+PROBE_SECONDS = 10.0  # total time for which readers may hold the lock to see whether a sweep is locked
 
 _TRIAL = re.compile(r"__[0-9a-f]{10}$")
 
@@ -91,16 +91,16 @@ class SweepStore:
         folder: ``<root>/<sweep>``.
     """
 
-    grid_path = Below("grid.yaml")
-    specs_path = Below("trials.jsonl")
-    info_path = Below("sweep.json")
-    trials_folder = Below("trials")
-    figures_folder = Below("figures")
-    mlflow_database = Below("mlflow.db")
-    mlflow_artifacts = Below("mlartifacts")
-    sync_folder = Below("mlflow-sync")
-    stop_request_path = Below("stop.request")
-    storage_path = Below("storage.json")
+    grid_path = PathIn("grid.yaml")
+    specs_path = PathIn("trials.jsonl")
+    info_path = PathIn("sweep.json")
+    trials_folder = PathIn("trials")
+    figures_folder = PathIn("figures")
+    mlflow_database = PathIn("mlflow.db")
+    mlflow_artifacts = PathIn("mlartifacts")
+    sync_folder = PathIn("mlflow-sync")
+    stop_request_path = PathIn("stop.request")
+    storage_path = PathIn("storage.json")
 
     def __init__(self, root: Path, name: str) -> None:
         self.folder = root.absolute() / name
@@ -321,7 +321,7 @@ def _try_lock(file: IO[str]) -> bool:
 
     ``SweepStore.is_locked`` holds a shared lock for a moment, so it tries again for some time.
     """
-    end = time.monotonic() + LOOK_SECONDS
+    end = time.monotonic() + PROBE_SECONDS
     while True:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

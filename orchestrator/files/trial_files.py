@@ -36,7 +36,7 @@ class FileKind(Enum):
     LOCAL = "of the machine that runs the trial; not uploaded"
 
 
-class Below:
+class PathIn:
     """The path of a file or folder, an attribute of what has a ``folder``."""
 
     def __init__(self, name: str) -> None:
@@ -47,7 +47,7 @@ class Below:
         return folder / self.name
 
 
-class TrialFile(Below):
+class TrialFile(PathIn):
     """The path of a file of a trial.
 
     Attributes:
@@ -80,10 +80,10 @@ class TrialFiles:
     lock_path = TrialFile(".lock", FileKind.LOCAL)
     rerun_path = TrialFile("rerun.request", FileKind.LOCAL)
     pulled_path = TrialFile(".pulled.json", FileKind.LOCAL)
-    checkpoints_folder = Below("checkpoints")
-    evaluations_folder = Below("evaluations")
-    videos_folder = Below("videos")
-    aside_folder = Below("aside")
+    checkpoints_folder = PathIn("checkpoints")
+    evaluations_folder = PathIn("evaluations")
+    videos_folder = PathIn("videos")
+    aside_folder = PathIn("aside")
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

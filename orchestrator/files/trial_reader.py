@@ -26,7 +26,7 @@ from recrl.orchestrator.spec import TrialSpec, TrialState
 
 RECORD_FORMAT = 2
 SPEC_FORMAT = 2
-LOOKS = 3  # reads of files that an attempt may be changing, before they are called damaged
+READ_TRIES = 3  # reads of files that an attempt may be changing, before they are called damaged
 
 Found = TypeVar("Found")
 
@@ -85,7 +85,7 @@ class TrialReader(TrialFiles):
     def _looked_at(self, look: Callable[[TrialRecord], Found]) -> tuple[TrialRecord, Found]:
         """The record, and what is wrong with the files by it; looked at again where the record changes."""
         stated = None
-        for _ in range(LOOKS):
+        for _ in range(READ_TRIES):
             stated, before = self._stated(), stated
             found = look(stated)
             if not found or stated == before:
@@ -211,7 +211,7 @@ class TrialReader(TrialFiles):
             DamagedError: they differ from the commit.
         """
         stated: TrialRecord | None = None
-        for _ in range(LOOKS):
+        for _ in range(READ_TRIES):
             stated, before = self.stated(), stated
             extent = stated.extents.get(path.name, Extent())
             data = _head(path, extent.length)

@@ -27,6 +27,7 @@ class TrialRecord:
         steps_per_second: environment steps per wall second, over the last interval.
         host: the machine of the last attempt.
         pid: its process.
+        pid_scope: where that id has a meaning, see ``process_scope``; empty if unknown.
         committed: lengths in bytes of the files, by their names, as of the last commit.
         digests: SHA-256 of the committed bytes of each.
         checkpoint: name of the checkpoint of the last commit, or empty.
@@ -48,6 +49,7 @@ class TrialRecord:
     steps_per_second: float = 0.0
     host: str = ""
     pid: int = 0
+    pid_scope: str = ""
     committed: dict[str, int] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     checkpoint: str = ""

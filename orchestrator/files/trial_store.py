@@ -31,6 +31,7 @@ from recrl.orchestrator.files.trial_files import FileKind, files_of
 from recrl.orchestrator.files.trial_reader import RECORD_FORMAT, SPEC_FORMAT, TrialReader
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
 from recrl.orchestrator.files.trial_writer import PROVENANCE_FORMAT, TrialWriter
+from recrl.orchestrator.process_scope import process_scope
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
 RESERVE_BYTES = 16 * 1024  # room for a record and a traceback
@@ -107,6 +108,7 @@ class TrialStore(TrialReader):
                 heartbeat=time.time(),
                 host=socket.gethostname(),
                 pid=os.getpid(),
+                pid_scope=process_scope(),
                 error="",
             )
             self.write_record(record)

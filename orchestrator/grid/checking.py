@@ -35,7 +35,7 @@ from recrl.environments.plugins import (
     trusted_attribute,
 )
 from recrl.environments.registry import task_options
-from recrl.orchestrator.errors import USERS_ERRORS, GridError, UncalledError, described, missing
+from recrl.orchestrator.errors import USERS_ERRORS, GridError, UntrustedGridError, described, missing
 from recrl.orchestrator.grid.building import BuildError, build_own, cmdp_of
 from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
 from recrl.orchestrator.grid.curriculum_checks import unsuitable
@@ -71,7 +71,7 @@ def read_grid(path: Path, *, build: bool = False) -> GridSpec:
 
     Raises:
         GridError: the file is missing or wrong; one located sentence for each mistake.
-        UncalledError: no mistake was found, but import paths were not checked, as they are refused here.
+        UntrustedGridError: no mistake was found, but import paths were not checked, as they are refused here.
     """
     return parse_grid(_read(path), source=str(path), build=build)
 
@@ -86,7 +86,7 @@ def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
 
     Raises:
         GridError: one located sentence for each mistake.
-        UncalledError: see ``read_grid``.
+        UntrustedGridError: see ``read_grid``.
     """
     check = _Check(data)
     grid = check.grid()
@@ -96,7 +96,7 @@ def parse_grid(data: bytes, *, source: str, build: bool = False) -> GridSpec:
     if check.problems:
         raise GridError(check.problems.located(source))
     if grid is None:
-        raise UncalledError(source, check.uncalled)
+        raise UntrustedGridError(source, check.uncalled)
     return grid
 
 

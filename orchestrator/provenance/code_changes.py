@@ -23,6 +23,7 @@ from typing import Any
 
 from recrl.agents.registry import AGENTS
 from recrl.environments.registry import TASKS
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.provenance.own_package import digest_of_files, folder_of
@@ -43,35 +44,48 @@ KINDS = (
 )
 
 
+class InstalledCode:
+    """The code that is installed now; each package is read once, for many trials."""
+
+    def __init__(self) -> None:
+        self._module_of = functools.cache(_module_of)
+        self._digests_of = functools.cache(_digests_of)
+
+    def of(self, spec: TrialSpec) -> dict[str, str]:
+        """Return digests of a trial's code: recrl's, and those of the user's top-level packages or modules.
+
+        These are the named ones, and those of the same project that they import. A package that is not
+        installed here is left out.
+        """
+        found = {OURS: _own_digest()}
+        for kind, group, ours in KINDS:
+            choice = getattr(spec, kind)
+            names = [] if choice.name in ours else [self._module_of(choice.name, group)]
+            if isinstance(identity := choice.options.get("id"), str) and ":" in identity:
+                names.append(identity)  # an id of Gymnasium: ``module:name``
+            if isinstance(network := choice.options.get("network"), str):
+                names.append(network)
+            for name in filter(None, names):
+                found |= self._digests_of(name.partition(":")[0].partition(".")[0])
+        return found
+
+
 def code_of(spec: TrialSpec) -> dict[str, str]:
-    """Return digests of a trial's code: recrl's, and one for each top-level package or module of the user.
-
-    These are the named ones, and those of the same project that they import. A package that is not
-    installed here is left out.
-    """
-    found = {OURS: _own_digest()}
-    for kind, group, ours in KINDS:
-        choice = getattr(spec, kind)
-        names = [] if choice.name in ours else [_module_of(choice.name, group)]
-        if isinstance(identity := choice.options.get("id"), str) and ":" in identity:
-            names.append(identity)  # an id of Gymnasium: ``module:name``
-        if isinstance(network := choice.options.get("network"), str):
-            names.append(network)
-        for name in filter(None, names):
-            package = name.partition(":")[0].partition(".")[0]
-            for each, files in _with_imports(package).items():
-                found[each] = digest_of_files(files)[:16]
-    return found
+    """Return ``InstalledCode.of`` one trial."""
+    return InstalledCode().of(spec)
 
 
-def other_code(attempts: Iterable[Mapping[str, Any]], spec: TrialSpec) -> bool:
+def other_code(
+    attempts: Iterable[Mapping[str, Any]], spec: TrialSpec, installed: InstalledCode | None = None
+) -> bool:
     """Whether an attempt of a trial ran other code than is installed now; False if unknown.
 
     Args:
         attempts: of ``TrialStore.provenance``.
         spec: the trial.
+        installed: shared by the trials of one pass; None to read the code for this one.
     """
-    now = code_of(spec)
+    now = (installed or InstalledCode()).of(spec)
     for attempt in attempts:
         code = attempt.get("code", {})
         if any(name in now and digest != now[name] for name, digest in code.items()):
@@ -79,10 +93,10 @@ def other_code(attempts: Iterable[Mapping[str, Any]], spec: TrialSpec) -> bool:
     return False
 
 
-def has_other_code(trial: TrialStore, spec: TrialSpec) -> bool:
+def has_other_code(trial: TrialStore, spec: TrialSpec, installed: InstalledCode | None = None) -> bool:
     """Apply ``other_code`` to the trial's files; False if these are damaged."""
     try:
-        return other_code(trial.provenance(), spec)
+        return other_code(trial.provenance(), spec, installed)
     except StorageError:
         return False
 
@@ -96,10 +110,9 @@ def other_code_sentence(complete: int, begun: int) -> str:
     """
     parts = []
     if complete:
-        parts.append(f"{complete} complete trial{'' if complete == 1 else 's'}")
+        parts.append(counted(complete, "complete trial"))
     if begun:
-        noun = f"one{'' if begun == 1 else 's'}" if complete else f"trial{'' if begun == 1 else 's'}"
-        parts.append(f"{begun} begun {noun}")
+        parts.append(counted(begun, "begun one" if complete else "begun trial"))
     if not parts:
         return ""
     comes = "comes" if complete + begun == 1 else "come"
@@ -130,6 +143,11 @@ def _own_digest() -> str:
     if missing := [str(path) for path in trial.values() if not path.is_file()]:
         raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is missing")
     return digest_of_files({**files, **trial})[:16]
+
+
+def _digests_of(package: str) -> dict[str, str]:
+    """Return the digest of a top-level package or module, and of those of its project that it imports."""
+    return {name: digest_of_files(files)[:16] for name, files in _with_imports(package).items()}
 
 
 def _with_imports(package: str) -> dict[str, dict[str, Path]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import socket
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,6 +14,7 @@ from typing import Any
 import ray
 
 from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.process_scope import is_own_scope
 from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.sweep_place import SweepPlace
@@ -86,13 +86,13 @@ def look_seconds(silence_seconds: float) -> float:
 
 
 def _end_process(record: TrialRecord | None, actor: Any) -> None:
-    """Kill a trial's process; directly if it is on this machine, because a stopped process serves no request.
+    """Kill a trial's process; directly if it is visible here, because a stopped process serves no request.
 
     Args:
         record: the process's own record, if any.
         actor: Ray's handle of it, if any.
     """
-    if record is not None and record.host == socket.gethostname() and _is_worker(record.pid):
+    if record is not None and is_own_scope(record.pid_scope) and _is_worker(record.pid):
         with suppress(ProcessLookupError):  # it has just ended
             os.kill(record.pid, signal.SIGKILL)
     elif actor is not None:

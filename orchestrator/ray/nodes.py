@@ -14,12 +14,12 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from recrl.orchestrator.errors import ClusterError
+from recrl.orchestrator.errors import ClusterError, first_line
 from recrl.orchestrator.launch_plan import trials_on_gpus
 
 DISTRIBUTIONS = ("recrl", "ray", "torch", "numpy")
 ANSWER_SECONDS = 180.0  # a node may have to start its first process
-SIGHT = "what keeps it from the results"
+ACCESS_PROBLEM = "what keeps it from the results"
 
 
 def trials_that_fit(wanted: Mapping[str, float]) -> int:
@@ -83,17 +83,17 @@ def differences(address: str, here: Mapping[str, str], there: Mapping[str, str],
     Args:
         address: of the node.
         here: versions on this machine, by name.
-        there: versions on the node; under SIGHT the problem if it does not see the place.
+        there: versions on the node; under ACCESS_PROBLEM the problem if it does not see the place.
         place: a folder or the address of an object store.
     """
     others = [
         f"{name} {there.get(name) or 'missing'} (here {value})"
         for name, value in here.items()
-        if name != SIGHT and there.get(name) != value
+        if name != ACCESS_PROBLEM and there.get(name) != value
     ]
     found = [f"{address} has {', '.join(others)}"] if others else []
-    if there.get(SIGHT):
-        found.append(f"{address} does not see {place}{there[SIGHT]}")
+    if there.get(ACCESS_PROBLEM):
+        found.append(f"{address} does not see {place}{there[ACCESS_PROBLEM]}")
     return found
 
 
@@ -122,7 +122,7 @@ def _asked(
             answers.append((address, ray.get(answer)))
         except RayError as error:
             cause = error.cause if isinstance(error, RayTaskError) else error
-            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {_first_line(cause)}")
+            problems.append(f"{address} cannot run anything: {type(cause).__name__}: {first_line(cause)}")
     return answers, problems
 
 
@@ -130,10 +130,6 @@ def _nodes() -> list[dict[str, Any]]:
     """Return the present nodes, as Ray describes them."""
     described: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
     return [node for node in described if node["Alive"]]
-
-
-def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), "")
 
 
 def _torch_without_gpu() -> str:

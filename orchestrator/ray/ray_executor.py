@@ -30,7 +30,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import ray
 from ray import tune
@@ -39,7 +39,7 @@ from ray.tune.search import BasicVariantGenerator
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.stop_file import StopSign
-from recrl.orchestrator.files.sweep_store import SILENCE_SECONDS
+from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.launch_plan import usable_cores
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
@@ -52,9 +52,6 @@ from recrl.orchestrator.ray.tune_trial import TuneTrial
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep_place import SweepPlace
 
-if TYPE_CHECKING:
-    from recrl.orchestrator.grid.file_models import Resources
-
 logger = logging.getLogger("recrl.sweep")
 
 
@@ -66,28 +63,17 @@ class RayExecutor:
         num_cpus: cores of the cluster that is started on this machine; all that this process may use if None.
         address: an existing cluster (``auto``, ``host:port``) to use instead.
         ship_package: whether to send recrl itself to that cluster's nodes.
-        cpus_per_trial: cores per trial, above 0; may be a fraction.
-        gpus_per_trial: GPUs per trial, at least 0; may be a fraction.
-        custom_per_trial: custom resources per trial, by the names given to the nodes, above 0.
-        max_concurrent: largest number of parallel trials, at least 1; if None, as fit at the start.
-        teacher: ``service`` for one actor for the whole sweep, ``inline`` for a teacher in every worker. The
-            results are the same.
+        resources: of the grid. Without a ``max_concurrent`` as many trials run as fit at the start.
         max_failures: largest number of restarts after the death of a trial's process, at least 0.
         commit_seconds: wall seconds between a trial's checkpoints, above 0.
-        silence_seconds: wall seconds without a heartbeat after which a trial counts as hanging, above 0.
     """
 
     num_cpus: int | None = None
     address: str | None = None
     ship_package: bool = False
-    cpus_per_trial: float = 1.0
-    gpus_per_trial: float = 0.0
-    custom_per_trial: Mapping[str, float] = field(default_factory=dict)
-    max_concurrent: int | None = None
-    teacher: Literal["service", "inline"] = "service"
+    resources: Resources = field(default_factory=Resources)
     max_failures: int = 3
     commit_seconds: float = 20.0
-    silence_seconds: float = SILENCE_SECONDS
 
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if any.
@@ -102,7 +88,7 @@ class RayExecutor:
         with environment(QUIET | WORKER), lost.watched(self._cluster()), place.new_stop_sign() as stop_sign:
             if self.address:
                 check_nodes(stop_sign.place, stop_sign.uri)
-            if self.gpus_per_trial:
+            if self.resources.gpus_per_trial:
                 check_gpus()
             queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
             watchdog = HangWatchdog(place, self.silence_of(place))
@@ -111,7 +97,7 @@ class RayExecutor:
 
     def silence_of(self, place: SweepPlace) -> float:
         """Return the wall seconds without a heartbeat after which a trial of a place counts as hanging."""
-        return max(self.silence_seconds, place.shortest_silence_seconds)
+        return max(self.resources.silence_seconds, place.shortest_silence_seconds)
 
     def _cluster(self) -> AbstractContextManager[None]:
         if ray.is_initialized():
@@ -128,7 +114,7 @@ class RayExecutor:
         queue: BasicVariantGenerator,
         watch: DriverWatch,
     ) -> None:
-        service_name = f"teacher-{secrets.token_hex(8)}" if self.teacher == "service" else ""
+        service_name = f"teacher-{secrets.token_hex(8)}" if self.resources.teacher == "service" else ""
         service = start_teacher_service(service_name) if service_name else None
         parameters = {
             "spec": tune.grid_search([json.dumps(spec.to_json()) for spec in specs]),
@@ -146,7 +132,7 @@ class RayExecutor:
         self, parameters: dict[str, Any], queue: BasicVariantGenerator, watch: DriverWatch, scratch: Path
     ) -> tune.Tuner:
         return tune.Tuner(
-            tune.with_resources(TuneTrial, dict(self._wanted)),
+            tune.with_resources(TuneTrial, wanted(self.resources)),
             param_space=parameters,
             tune_config=tune.TuneConfig(
                 search_alg=queue,
@@ -165,26 +151,22 @@ class RayExecutor:
             ),
         )
 
-    @property
-    def _wanted(self) -> Mapping[str, float]:
-        """Return the resources of one trial, by Ray's names."""
-        return {"CPU": self.cpus_per_trial, "GPU": self.gpus_per_trial, **self.custom_per_trial}
-
     def _slots(self) -> int:
         """Return the number of parallel trials."""
-        slots = trials_that_fit(self._wanted)
+        asked, most = wanted(self.resources), self.resources.max_concurrent
+        slots = trials_that_fit(asked)
         if self.address:  # an existing cluster may grow
             if not slots:
-                logger.warning("no node has room for a trial (%s) yet; they wait", _amounts(self._wanted))
-            return self.max_concurrent or max(1, slots)
+                logger.warning("no node has room for a trial (%s) yet; they wait", _amounts(asked))
+            return most or max(1, slots)
         if slots < 1:
             resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-            there = {name: resources.get(name, 0.0) for name in self._wanted}
+            there = {name: resources.get(name, 0.0) for name in asked}
             raise ClusterError(
-                f"a trial asks for {_amounts(self._wanted)}, this cluster has {_amounts(there)}; "
+                f"a trial asks for {_amounts(asked)}, this cluster has {_amounts(there)}; "
                 "ask for less or add machines"
             )
-        return min(slots, self.max_concurrent or slots)
+        return min(slots, most or slots)
 
 
 def room_on_cluster(address: str, resources: Resources) -> int:
@@ -198,13 +180,12 @@ def room_on_cluster(address: str, resources: Resources) -> int:
         ClusterError: it cannot be reached.
     """
     with environment(QUIET | WORKER), existing_cluster(address):
-        return trials_that_fit(
-            {
-                "CPU": resources.cpus_per_trial,
-                "GPU": resources.gpus_per_trial,
-                **resources.custom_per_trial,
-            }
-        )
+        return trials_that_fit(wanted(resources))
+
+
+def wanted(resources: Resources) -> dict[str, float]:
+    """Return the resources of one trial, by Ray's names."""
+    return {"CPU": resources.cpus_per_trial, "GPU": resources.gpus_per_trial, **resources.custom_per_trial}
 
 
 def _tune_trial_id(trial: Any) -> str:

@@ -25,7 +25,7 @@ from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.exit_codes import ExitCode
 
-LOOK_SECONDS = 3.0  # between two checks
+SERVICE_CHECK_SECONDS = 3.0  # between two checks
 CONNECT_SECONDS = 2.0
 OWN_PATIENCE_SECONDS = 5.0  # services of recrl's own cluster are not restarted
 OTHERS_PATIENCE_SECONDS = 40.0  # below the minute after which Ray ends a process without a head service
@@ -67,7 +67,7 @@ class Service:
         return OWN_PATIENCE_SECONDS if self.host.startswith("127.") else OTHERS_PATIENCE_SECONDS
 
     @property
-    def obituary(self) -> str:
+    def message(self) -> str:
         """Describe its end."""
         return (
             f"Ray's {self.name} at {self.host}:{self.port} has died; nothing that was saved is "
@@ -119,12 +119,12 @@ class LostServices:
 
     def _look(self, over: threading.Event) -> None:
         seen: dict[Service, float] = {}
-        while not self.problem and not over.wait(LOOK_SECONDS):
+        while not self.problem and not over.wait(SERVICE_CHECK_SECONDS):
             for service in self._services:
                 if service.is_there():
                     seen[service] = time.monotonic()
                 elif time.monotonic() - seen.setdefault(service, time.monotonic()) > service.patience:
-                    self.problem = service.obituary
+                    self.problem = service.message
         if self.problem and not over.wait(LEAVE_SECONDS):
             logger.error("%s", self.problem)
             if token := os.environ.get(TOKEN_VARIABLE):

@@ -18,7 +18,7 @@ from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
 NAMESPACE = "recrl"
-ANSWER_SECONDS = 30.0
+ANSWER_SECONDS = 30.0  # timeout of one call
 PATIENCE_SECONDS = 120.0
 LONGEST_PAUSE_SECONDS = 5.0
 
@@ -64,7 +64,6 @@ class RayTeacher:
         spec: TeacherSpec,
         service: Any,
         *,
-        answer_seconds: float = ANSWER_SECONDS,
         patience_seconds: float = PATIENCE_SECONDS,
     ) -> None:
         """Make a proxy, without a call yet.
@@ -72,12 +71,10 @@ class RayTeacher:
         Args:
             spec: the teacher.
             service: handle of a ``TeacherService`` actor.
-            answer_seconds: timeout of one call.
             patience_seconds: total time of repeated calls; longer than the loss of the service's node takes.
         """
         self._spec = spec
         self._service = service
-        self._answer_seconds = answer_seconds
         self._patience_seconds = patience_seconds
 
     def start(self) -> tuple[CurriculumStep, TeacherState]:
@@ -95,7 +92,7 @@ class RayTeacher:
         while True:
             try:
                 answer: tuple[CurriculumStep, TeacherState] = ray.get(
-                    method.remote(*question), timeout=self._answer_seconds
+                    method.remote(*question), timeout=ANSWER_SECONDS
                 )
                 return answer
             except RayTaskError as error:  # an error of the teacher itself: raised here as well

@@ -20,9 +20,8 @@ from ray.exceptions import (
 )
 from ray.tune.search import BasicVariantGenerator
 
-from recrl.orchestrator.errors import StorageError, TeacherUnavailableError
+from recrl.orchestrator.errors import StorageError, TeacherUnavailableError, first_line
 from recrl.orchestrator.files.stop_file import StopSign
-from recrl.orchestrator.ray.clusters import first_line
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.services import LostServices
 from recrl.orchestrator.ray.tune_trial import spec_of
@@ -149,7 +148,8 @@ def _last_error(trial: Any) -> BaseException | None:
     path = trial.pickled_error_file
     if path is None:
         return None
-    error: BaseException = cloudpickle.loads(Path(path).read_bytes())  # Tune wrote it a moment ago
+    # written a moment ago; Trial.get_pickled_error would look in the storage, where it is not yet
+    error: BaseException = cloudpickle.loads(Path(path).read_bytes())
     return error.cause if isinstance(error, RayTaskError) else error
 
 

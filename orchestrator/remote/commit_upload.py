@@ -34,7 +34,7 @@ from recrl.orchestrator.remote.remote_trial import (
 from recrl.orchestrator.remote.retries import retry_while_down
 from recrl.orchestrator.spec import TrialSpec, TrialState
 
-LOOK_SECONDS = 0.5  # between two checks of the trial's folder
+FOLDER_CHECK_SECONDS = 0.5  # between two checks of the trial's folder
 ALIVE_SECONDS = 15.0  # between two signs of life
 KEPT_COMMITS = 2  # a reader may still use the last but one
 
@@ -247,7 +247,7 @@ def _follow(upload: Upload, over: threading.Event) -> None:
     """Send commits until the end."""
     hint = "the trial continues, and the upload is tried again"
     try:
-        retries.repeat_until(upload.follow, over, every=LOOK_SECONDS, hint=hint)
+        retries.repeat_until(upload.follow, over, every=FOLDER_CHECK_SECONDS, hint=hint)
     except LostLeaseError as error:
         logger.warning("%s", error)
         upload.revoke()

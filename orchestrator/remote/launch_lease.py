@@ -19,14 +19,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import StorageError, SweepBusyError
+from recrl.orchestrator.process_scope import has_ended, process_scope
 from recrl.orchestrator.remote.object_store import ObjectStore
 
-LOOK_SECONDS = 5.0  # between two checks for a stop request
+LEASE_CHECK_SECONDS = 5.0  # between two checks for a stop request
 BEAT_SECONDS = 15.0  # between two signs of life of a launch
 EMPTY_SECONDS = 1.0  # time after which a write has become visible
 SILENT_SECONDS = 90.0  # without a sign of life, after which its sweep is free
@@ -61,7 +61,7 @@ class LaunchLease:
             "token": secrets.token_hex(8),
             "pid": os.getpid(),
             "host": socket.gethostname(),
-            "boot": _boot(),
+            "boot": process_scope(),
         }
         self._take(own)
         self._token = str(own["token"])
@@ -131,7 +131,7 @@ class LaunchLease:
     def _hold(self, own: dict[str, Any], stop: threading.Event, over: threading.Event) -> None:
         """Write signs of life, and check for requests."""
         spoke_at = time.monotonic()
-        while not over.wait(LOOK_SECONDS):
+        while not over.wait(LEASE_CHECK_SECONDS):
             try:
                 if self._objects.read(STOP_REQUEST) is not None:
                     stop.set()
@@ -164,20 +164,6 @@ def _is_alive(holder: dict[str, Any]) -> bool:
     try:
         if abs(time.time() - float(holder["at"])) > SILENT_SECONDS:  # also if another clock is ahead
             return False
-        if not _boot() or holder["boot"] != _boot():
-            return True
-        os.kill(int(holder["pid"]), 0)  # signal 0 only checks
-    except (KeyError, TypeError, ValueError, ProcessLookupError):
+        return not has_ended(int(holder["pid"]), str(holder["boot"]))
+    except (KeyError, TypeError, ValueError):
         return False
-    except PermissionError:
-        pass  # a process of another user, so it exists
-    return True
-
-
-def _boot() -> str:
-    """Return the scope of process ids: machine, boot and namespace; empty if unknown."""
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
-    except OSError:
-        return ""

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
-from recrl.orchestrator.errors import RecrlError, StorageError
+from recrl.orchestrator.errors import RecrlError, StorageError, first_line
 
 EXAMPLE = "s3://bucket/folder"
 FOLDERS = ("file", "local")  # schemes where parents must be created before a file; a bucket must not be
@@ -221,6 +221,5 @@ def _package(protocol: str) -> str:
 
 def _reason(error: BaseException) -> str:
     """Return the first line of an error, without queries in addresses, which may contain signatures."""
-    text = next(iter(str(error).splitlines()), "")
-    text = re.sub(r"\?[^\s'\")]*", "", re.sub(r"(://)[^\s@]*@", r"\1", text))
+    text = re.sub(r"\?[^\s'\")]*", "", re.sub(r"(://)[^\s@]*@", r"\1", first_line(error)))
     return f"{type(error).__name__}: {text[:REASON_LENGTH]}" if text else type(error).__name__

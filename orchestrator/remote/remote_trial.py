@@ -50,8 +50,8 @@ from recrl.orchestrator.remote.commit_format import (
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.spec import TrialState
 
-LOOKS = 3  # wait for a newer commit, before a damaged one is reported
-LOOK_SECONDS = 0.25  # between two of them
+COMMIT_TRIES = 3  # wait for a newer commit, before a damaged one is reported
+COMMIT_PAUSE_SECONDS = 0.25  # between two of them
 
 ALIVE = "alive.json"
 ASIDE = "aside"
@@ -143,14 +143,14 @@ class RemoteTrial:
             DamagedError: none is intact.
             StorageError: the store cannot be read, or does not find an object that it lists.
         """
-        for _ in range(LOOKS - 1):
+        for _ in range(COMMIT_TRIES - 1):
             commits = _commits(keys)
             if not commits:
                 return None
             try:
                 return self._pull_commit(trial, commits[0], checkpoints=checkpoints)
             except (ValueError, _MissingError):
-                time.sleep(LOOK_SECONDS)
+                time.sleep(COMMIT_PAUSE_SECONDS)
                 keys = self.objects.keys_in()
         return self._pull_any(trial, keys, checkpoints=checkpoints)
 

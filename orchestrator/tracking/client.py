@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote
 
-from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.errors import TrackingError, described
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import redacted
 
@@ -143,4 +143,4 @@ def is_away(error: Exception) -> bool:
 
 def one_line(error: Exception) -> str:
     """Return an error as one line without secrets."""
-    return " ".join(redacted(f"{type(error).__name__}: {error}").split())[:500]
+    return redacted(described(error))[:500]

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.errors import TrackingError, first_line
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.redaction import redacted
@@ -70,7 +70,7 @@ class ExportUpload:
         try:
             self._upload()
         except Exception as error:  # a server may accept small files only; the runs are shown nevertheless
-            return parent, redacted(next(iter(str(error).splitlines()), type(error).__name__))
+            return parent, redacted(first_line(error) or type(error).__name__)
         finally:
             ended = now()
             self._due = ended + max(INTERVAL_SECONDS, REST * (ended - began))

@@ -62,7 +62,12 @@ class SweepRuns:
                 self.client.set_tag(run_id, "mlflow.parentRunId", self.parent_id)
 
     def of_trial(self, trial_id: str) -> str | None:
-        """Return the run of a trial, None if there is none."""
+        """Return the run of a trial, None if there is none.
+
+        A run that is not known is searched for: another process may have created it since.
+        """
+        if trial_id not in self._of_trials:
+            self._of_trials |= self._find_runs(f" and tags.`recrl.trial_id` = '{trial_id}'")
         return self._of_trials.get(trial_id)
 
     def create(self, trial: TrialStore, record: TrialRecord) -> str:
@@ -137,18 +142,22 @@ class SweepRuns:
                 with suppress(MlflowException):
                     self.client.set_experiment_tag(self.experiment_id, key, value)
 
-    def _find_runs(self) -> dict[str, str]:
-        """Return runs by trial id, the parent by the empty id; the oldest if there are several."""
+    def _find_runs(self, condition: str = "") -> dict[str, str]:
+        """Return runs by trial id, the parent by the empty id; the oldest if there are several.
+
+        Args:
+            condition: more of MLflow's query, from ``and`` on.
+        """
         found: dict[str, str] = {}
-        for run in sorted(self._own_runs(), key=lambda run: run.info.start_time or 0):
+        for run in sorted(self._own_runs(condition), key=lambda run: run.info.start_time or 0):
             run_id = str(run.info.run_id)
             found.setdefault(run.data.tags.get("recrl.trial_id", ""), run_id)
             self._artifacts[run_id] = str(run.info.artifact_uri)
         return found
 
-    def _own_runs(self) -> list[Run]:
-        """Return all runs of this sweep; MLflow sends them in pages."""
-        query = f"tags.`recrl.sweep_id` = '{self._tags['recrl.sweep_id']}'"
+    def _own_runs(self, condition: str) -> list[Run]:
+        """Return the runs of this sweep that fulfil a condition; MLflow sends them in pages."""
+        query = f"tags.`recrl.sweep_id` = '{self._tags['recrl.sweep_id']}'{condition}"
         runs: list[Run] = []
         token: str | None = None
         while token is None or token:

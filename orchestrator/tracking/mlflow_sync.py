@@ -20,7 +20,6 @@ export file (``export_download``): MLflow's points are only for its charts.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -50,7 +49,6 @@ class SyncReport:
         points: points sent.
         problem: one line on why MLflow is not up to date, or empty.
         remark: one line on why the export file could not be uploaded, or empty.
-        finished_at: when the pass ended, seconds since 1970.
         experiment_id: the sweep's experiment, or empty if MLflow could not be reached.
     """
 
@@ -59,7 +57,6 @@ class SyncReport:
     points: int = 0
     problem: str = ""
     remark: str = ""
-    finished_at: float = 0.0
     experiment_id: str = ""
 
     @property
@@ -88,7 +85,8 @@ def sync(
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:
     """Return the report of the last finished pass of any process; None if there was none."""
     try:
-        return SyncReport(**json.loads((sync_folder(store, uri) / "report.json").read_text()))
+        told = json.loads((sync_folder(store, uri) / "report.json").read_text())
+        return SyncReport(**{key: told[key] for key in SyncReport.__dataclass_fields__ if key in told})
     except (OSError, ValueError, TypeError):
         return None
 
@@ -132,7 +130,6 @@ class Tracker:
                 points=sum(points),
                 problem=problems[0] if problems else "",
                 remark=remark,
-                finished_at=time.time(),
                 experiment_id=view.runs.experiment_id if view else "",
             )
             write_json(sync_folder(self.store, self.uri) / "report.json", asdict(report))

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recrl.orchestrator.errors import DamagedError
-from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -70,9 +69,7 @@ class TrialSync:
         position = self._position(trial, record)
         if position.shown == shown:
             return 0
-        data = _committed_rows(trial, record)
-        if data is None:
-            return 0  # the file is just being truncated; the next pass sees the result
+        data = trial.committed_bytes(trial.updates_path)
         if not position.fits(data):
             self._runs.delete(position.run_id)
             position = Position(self._runs.create(trial, record))
@@ -166,24 +163,6 @@ def _shown(
         "error": record.error,
         "added": [file_mark(path) for path in _added_afterwards(trial)],
     }
-
-
-def _committed_rows(trial: TrialStore, record: TrialRecord) -> bytes | None:
-    """Return the committed bytes of ``updates.csv``; None while it is shorter.
-
-    Raises:
-        DamagedError: they differ from the commit.
-    """
-    extent = record.extents.get(trial.updates_path.name, Extent())
-    data = b""
-    if extent.length:
-        with trial.updates_path.open("rb") as file:
-            data = file.read(extent.length)
-    if len(data) < extent.length:
-        return None
-    if Extent.of(data) != extent:
-        raise DamagedError(f"{trial.updates_path.name} is not what was committed: its checksum differs")
-    return data
 
 
 def _points_to_send(

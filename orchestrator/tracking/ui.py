@@ -20,6 +20,8 @@ from recrl.orchestrator.tracking.positions import sync_folder
 # Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.
 SETTINGS = ("DO_NOT_TRACK=true", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false")
 
+START_SECONDS = 120.0  # until the server must answer
+
 
 def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
     """Return the command of an MLflow server for a database, on this machine only, with one process."""
@@ -60,14 +62,13 @@ class UI:
             self.process.wait()
 
 
-def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 120.0) -> UI:
+def open_ui(store: SweepStore, uri: str, *, port: int = 5000) -> UI:
     """Start MLflow's server at the loopback address and wait until it answers.
 
     Args:
         store: the sweep.
         uri: of ``tracking_uri``; for a server's address nothing is started.
         port: of 127.0.0.1.
-        timeout: seconds until it must answer.
 
     Raises:
         TrackingError: the port is taken, or the server does not start.
@@ -85,7 +86,7 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000, timeout: float = 1
     with open(os.open(log_path, flags, 0o600), "wb") as log:
         environment = {**os.environ, "MLFLOW_BACKEND_STORE_URI": uri}
         server = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
-    end = time.monotonic() + timeout
+    end = time.monotonic() + START_SECONDS
     while time.monotonic() < end and server.poll() is None:
         if _answers(port):
             return UI(url, server)

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from io import TextIOWrapper
 
-import torch
-
 from recrl.agents.evaluation import StoppedError
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
@@ -28,6 +26,7 @@ from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.trial.device import device_name, learning_on
 from recrl.orchestrator.trial.heartbeat import Heartbeat
+from recrl.orchestrator.trial.one_thread import one_thread
 from recrl.orchestrator.trial.trial import Trial, open_environments
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Teacher
@@ -135,6 +134,7 @@ def _located(where: str, writer: TrialWriter) -> Iterator[None]:
         raise
 
 
+@one_thread()  # equal bytes on all machines, and no load on other trials' cores
 def run_recorded(
     spec: TrialSpec,
     store: TrialStore,
@@ -164,7 +164,6 @@ def run_recorded(
     Raises:
         TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
     """
-    torch.set_num_threads(1)  # equal bytes on all machines, and no load on other trials' cores
     provenance = {
         **collect_provenance(),
         "code": code_of(spec),

@@ -181,8 +181,6 @@ def train(
         >>> training.policy.act([1.0, 0.0], deterministic=True) in (0, 1)
         True
     """
-    from recrl.orchestrator.trial.one_thread import one_thread  # noqa: PLC0415  (imports torch)
-
     with modules_here(), ExitStack() as stack:
         place = Path(folder) if folder is not None else _scratch(stack)
         grid = {
@@ -195,7 +193,7 @@ def train(
             "deploy_limits": deploy_limits,
             "run": {"total_steps": total_steps, **run},
         }
-        with one_thread(), shown_progress(progress):
+        with shown_progress(progress):
             try:
                 sweep = launch(
                     grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False

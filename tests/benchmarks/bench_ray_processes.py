@@ -1,10 +1,9 @@
-"""What Ray, the driver and the teacher service use beside trials of CarGoal2, with our settings and without.
+"""What Ray, the driver and the teacher service use beside trials of CarGoal2.
 
-    OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_ray_processes [--seconds 30] [--trials 2] [--pairs 1]
+    OMP_NUM_THREADS=1 python -m tests.benchmarks.bench_ray_processes [--seconds 30] [--trials 2]
 
-CPU time from the kernel's schedule statistics, in per cent of one core. Each pair is a cluster of ours and
-one as ``ray.init`` starts it (but for the dashboard, which is off in both). First it has one idle actor, the
-teacher service; then trials run on it, a core each, with their teacher in that service.
+CPU time from the kernel's schedule statistics, in per cent of one core. First the cluster has one idle actor,
+the teacher service; then trials run on it, a core each, with their teacher in that service.
 
 A worker's main thread is its trial; its other threads are Ray's, but for the heartbeat, and count as such.
 What is around a trial is there once on a machine, however many trials run beside each other. It goes by the
@@ -18,16 +17,14 @@ import argparse
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.ray import ray_executor
 from recrl.orchestrator.ray.clusters import local_cluster
+from recrl.orchestrator.ray.process_state import environment
 from recrl.orchestrator.ray.ray_executor import RayExecutor
 from recrl.orchestrator.ray.teacher_service import start_teacher_service
 from recrl.orchestrator.spec import TrialSpec
@@ -38,21 +35,7 @@ from tests.benchmarks.bench_overhead import car_trial, family
 SETTLING_SECONDS = 8.0
 OTHERS = "Ray: others"
 TRIALS = "trials"
-NICENESS = {"worker_niceness": 0}  # of trials: on a busy machine they would get no core at Ray's 15
-
-
-@contextmanager
-def settings(*, ours: bool) -> Iterator[None]:
-    """Start clusters with our settings meanwhile, or without."""
-    before: Mapping[str, Any] = {name: getattr(ray_executor, name) for name in ("SELDOM", "LEFT_OUT")}
-    now = {**before, "SELDOM": {**before["SELDOM"], **NICENESS}}
-    for name, value in (now if ours else {"SELDOM": NICENESS, "LEFT_OUT": {}}).items():
-        setattr(ray_executor, name, value)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            setattr(ray_executor, name, value)
+NICENESS = {"RAY_worker_niceness": "0"}  # of trials: on a busy machine they would get no core at Ray's 15
 
 
 def used() -> dict[tuple[int, int], tuple[str, float]]:
@@ -112,22 +95,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--trials", type=int, default=2, help="beside each other; 0 for the idle clusters only"
     )
-    parser.add_argument("--pairs", type=int, default=1)
     arguments = parser.parse_args(argv)
     specs = [replace(car_trial(10_000), seed=seed) for seed in range(arguments.trials)]
-    for ours in (True, False) * arguments.pairs:
-        name = "ours" if ours else "Ray's own"
-        began = time.monotonic()
-        with settings(ours=ours), local_cluster(num_cpus=max(1, len(specs))):
-            print(f"{name}: started in {time.monotonic() - began:.1f} s", flush=True)
-            service = start_teacher_service("idle")
-            time.sleep(SETTLING_SECONDS)
-            show_shares(f"{name}, an idle actor", arguments.seconds)
-            del service
-            if specs:
-                with tempfile.TemporaryDirectory() as folder:
-                    title = f"{name}, beside {len(specs)} trials"
-                    watch_trials(specs, Path(folder), title, arguments.seconds)
+    began = time.monotonic()
+    with environment(NICENESS), local_cluster(num_cpus=max(1, len(specs))):
+        print(f"started in {time.monotonic() - began:.1f} s", flush=True)
+        service = start_teacher_service("idle")
+        time.sleep(SETTLING_SECONDS)
+        show_shares("an idle actor", arguments.seconds)
+        del service
+        if specs:
+            with tempfile.TemporaryDirectory() as folder:
+                title = f"beside {len(specs)} trials"
+                watch_trials(specs, Path(folder), title, arguments.seconds)
 
 
 if __name__ == "__main__":

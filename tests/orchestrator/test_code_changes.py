@@ -305,6 +305,21 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
     assert has_other_code(store.trial(spec), spec)  # its first attempt ran other code
 
 
+def test_a_plan_reads_the_users_code_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1, 2"))
+    specs = read_grid(folder / "grid.yaml").trials()
+    read: list[str] = []
+    digests = code_changes._digests_of
+
+    def count(package: str) -> dict[str, str]:
+        read.append(package)
+        return digests(package)
+
+    monkeypatch.setattr(code_changes, "_digests_of", count)
+    assert len(make_plan(specs, SweepStore(folder / "runs", "small")).trials) == 3
+    assert read == ["my_scaled_task"]
+
+
 def test_the_code_of_a_task_is_found_without_running_it(folder: Path) -> None:
     (spec,) = read_grid(folder / "grid.yaml").trials()
     (folder / "my_scaled_task.py").write_text("raise SystemExit\n")

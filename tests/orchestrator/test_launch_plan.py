@@ -172,3 +172,15 @@ def test_no_more_trials_run_than_fit_on_the_gpus(
     assert room(resources, address=None, max_concurrent=64)[0] == fitting
     assert room(resources, address=None, max_concurrent=1)[0] == 1
     assert room(resources, address=None, max_concurrent=None, cores=16)[0] == 16, "another machine's cores"
+
+
+@pytest.mark.parametrize(
+    ("there", "most", "shown"), [(6, None, 6), (6, 4, 4), (6, 64, 6), (0, None, 1), (0, 8, 1)]
+)
+def test_a_limit_does_not_hide_the_size_of_a_cluster(
+    monkeypatch: pytest.MonkeyPatch, there: int, most: int | None, shown: int
+) -> None:
+    monkeypatch.setattr("recrl.orchestrator.ray.ray_executor.room_on_cluster", lambda *_: there)
+    for resources, given in ((Resources(), most), (Resources(max_concurrent=most), None)):
+        at_once, where = room(resources, address="head:6379", max_concurrent=given)
+        assert (at_once, where) == (shown, "on the cluster at present")

@@ -12,14 +12,14 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.provenance.own_package import copy_package, source_digest
 from recrl.orchestrator.ray.clusters import existing_cluster
-from recrl.orchestrator.ray.nodes import SIGHT, differences
+from recrl.orchestrator.ray.nodes import ACCESS_PROBLEM, differences
 
 HERE = {
     "Python": "3.11.7",
     "recrl": "0.1.0",
     "ray": "2.60.0",
     "recrl's source": "0123456789",
-    SIGHT: "",
+    ACCESS_PROBLEM: "",
 }
 GRID = """\
 name: small
@@ -44,7 +44,7 @@ def test_every_difference_of_a_node_is_named_with_what_is_here() -> None:
 
 
 def test_a_node_that_does_not_see_the_results_is_named() -> None:
-    there = {**HERE, SIGHT: ", which must be on a file system that all nodes share"}
+    there = {**HERE, ACCESS_PROBLEM: ", which must be on a file system that all nodes share"}
     assert differences("10.0.0.1", HERE, there, "/r/s") == [
         "10.0.0.1 does not see /r/s, which must be on a file system that all nodes share"
     ]

@@ -27,6 +27,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.launch_plan import TrialSelection
 from recrl.orchestrator.ray.ray_executor import RayExecutor
 from recrl.orchestrator.remote.commit_upload import Upload
@@ -170,10 +171,22 @@ def test_trials_in_an_object_store_are_not_run_again(tmp_path: Path) -> None:
     assert main([*plan, "--rerun-changed"]) == ExitCode.WRONG_INPUT
 
 
+@pytest.mark.parametrize(
+    "mistake", [("--only", "method=nonsense"), ("--rerun-changed",), ("--address", "auto")]
+)
+def test_a_refused_launch_does_not_make_the_folder_a_copy(tmp_path: Path, mistake: tuple[str, ...]) -> None:
+    (tmp_path / "grid.yaml").write_bytes(grid().text)
+    launch = ["launch", str(tmp_path / "grid.yaml"), "--root", str(tmp_path / "runs"), *INLINE]
+    storage = ("--storage", (tmp_path / "bucket").as_uri())
+    assert main([*launch, *storage, *mistake]) == ExitCode.WRONG_INPUT
+    assert not (tmp_path / "runs" / "small" / "storage.json").exists()
+    assert not (tmp_path / "bucket").exists()
+
+
 def test_a_trial_is_not_ended_before_its_signs_of_life_can_arrive(tmp_path: Path) -> None:
     here = machine(tmp_path, "here").storage
     assert here.shortest_silence_seconds == 50.0  # as the option's description says
-    executor = RayExecutor(silence_seconds=5.0)
+    executor = RayExecutor(resources=Resources(silence_seconds=5.0))
     assert executor.silence_of(here) == 50.0
     assert executor.silence_of(SweepPlace(here.store)) == 5.0
 
@@ -308,7 +321,7 @@ def test_one_launch_at_a_time_and_a_dead_one_frees_the_sweep(tmp_path: Path) -> 
 
 
 def test_a_launch_that_is_taken_over_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LEASE_CHECK_SECONDS", 0.01)
     monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.BEAT_SECONDS", 0.01)
     here, stop = machine(tmp_path, "here"), threading.Event()
     with here.storage.held(stop):
@@ -322,7 +335,7 @@ def test_a_launch_that_is_taken_over_stops(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_launch_is_stopped_from_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("recrl.orchestrator.remote.launch_lease.LEASE_CHECK_SECONDS", 0.01)
     here, there, stop = machine(tmp_path, "here"), machine(tmp_path, "there"), threading.Event()
     assert not there.storage.request_stop()()
     with here.storage.held(stop):

@@ -1,6 +1,10 @@
 """Progress is read from files alone, and the silence of a trial is noticed."""
 
 import io
+import os
+import socket
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +19,7 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.launch_plan import make_plan
+from recrl.orchestrator.process_scope import process_scope
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.sweep_progress import (
     DisplayStatus,
@@ -49,6 +54,21 @@ def test_a_silent_trial_is_interrupted() -> None:
             assert display_status(RUNNING, now=now, silence_seconds=silence) is DisplayStatus.RUNNING
             now += 0.1 * sign
             assert display_status(RUNNING, now=now, silence_seconds=silence) is DisplayStatus.INTERRUPTED
+
+
+def test_a_trial_in_another_container_of_the_same_host_is_not_taken_for_dead() -> None:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    ended = replace(RUNNING, host=socket.gethostname(), pid=process.pid, pid_scope=process_scope())
+    elsewhere = replace(ended, pid_scope=f"{process_scope()} of another container")
+    old = {name: value for name, value in ended.to_json().items() if name != "pid_scope"}
+    for record, status in (
+        (ended, DisplayStatus.INTERRUPTED),
+        (replace(ended, pid=os.getpid()), DisplayStatus.RUNNING),
+        (elsewhere, DisplayStatus.RUNNING),
+        (TrialRecord.from_json(old), DisplayStatus.RUNNING),  # until its silence is too long
+    ):
+        assert display_status(record, now=1000.0, silence_seconds=300.0) is status
 
 
 @pytest.mark.parametrize(("told", "expected"), [(None, 300.0), (5.0, 300.0), (3600.0, 3600.0)])

@@ -28,6 +28,7 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.process_scope import process_scope
 from recrl.orchestrator.spec import TrialState
 from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
@@ -245,7 +246,7 @@ def test_a_place_that_mlflow_cannot_keep_a_sweep_in_is_refused(tmp_path: Path, g
 )
 def test_run_states_are_true(status: TrialState, live: bool, expected: str) -> None:
     record = TrialRecord(
-        status=status, attempt=1, heartbeat=time.time(), host=socket.gethostname(), pid=os.getpid()
+        status=status, attempt=1, heartbeat=time.time(), pid=os.getpid(), pid_scope=process_scope()
     )
     assert trial_run_status(record, live=live, silence_seconds=300.0) == expected
 
@@ -254,10 +255,10 @@ def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     here = TrialRecord(
-        status=TrialState.RUNNING, heartbeat=time.time(), host=socket.gethostname(), pid=process.pid
+        status=TrialState.RUNNING, heartbeat=time.time(), pid=process.pid, pid_scope=process_scope()
     )
     assert trial_run_status(here, live=True, silence_seconds=300.0) == "KILLED"
-    elsewhere = replace(here, host="elsewhere")
+    elsewhere = replace(here, pid_scope="another container of this host")
     assert trial_run_status(elsewhere, live=True, silence_seconds=300.0) == "RUNNING"
     silent = replace(elsewhere, heartbeat=time.time() - 301.0)
     assert trial_run_status(silent, live=True, silence_seconds=300.0) == "KILLED"
@@ -443,6 +444,24 @@ def test_a_run_deleted_by_hand_is_made_again(write: Callable[..., SweepStore]) -
         connect(store).delete_run(run.info.run_id)
     sync(store, uri)
     assert everything(store) == shown
+
+
+def test_two_processes_make_one_run_of_a_trial(
+    half_and_done: tuple[SweepStore, SweepStore], tmp_path: Path
+) -> None:
+    store, done = half_and_done
+    uri = tracking_uri(store, None)
+    started = trial_titled(store, DYNAMIC).folder
+    shutil.move(started, tmp_path / "not-yet")
+    launch = mlflow_sync.Tracker(store, uri)
+    assert launch.bring_up_to_date(live=True).trials == 1
+    shutil.move(tmp_path / "not-yet", started)
+    assert sync(store, uri).points > 0  # as `recrl-sweep sync` does during the launch
+    grow(store, done, DYNAMIC)
+    assert launch.bring_up_to_date(live=True).points > 0
+    run = runs(store)[DYNAMIC]  # `runs` refuses two runs of one name
+    assert run.info.status == "FINISHED"
+    assert len(history(store, run)["agent/kl"]) == 40
 
 
 def test_a_run_whose_maker_died_over_it_gets_its_params(write: Callable[..., SweepStore]) -> None:

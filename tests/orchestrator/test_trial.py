@@ -181,6 +181,26 @@ def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path
     np.testing.assert_equal(final_tree(store), final_tree(undisturbed))
 
 
+def test_a_trial_uses_one_thread_and_leaves_pytorch_those_it_had(
+    tmp_path: Path, undisturbed: TrialStore
+) -> None:
+    store, seen = SweepStore(tmp_path, "sweep").trial(SPEC), set()
+
+    def look() -> bool:
+        seen.add(torch.get_num_threads())
+        return False
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert run_recorded(SPEC, store, should_stop=look) is TrialState.COMPLETE
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert seen == {1}
+    assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
+
+
 def test_the_last_part_is_deployment_under_the_deploy_limits(undisturbed: TrialStore) -> None:
     updates = undisturbed.updates()
     assert updates["phase"].tolist() == ["training"] * 19 + ["deployment"]

@@ -47,7 +47,7 @@ API_OF_CLI = {
 ADAPTERS = {
     "PIL": r"orchestrator\.trial\.videos",
     "av": r"orchestrator\.trial\.videos",
-    "torch": r"agents\..*|orchestrator\.trial\.(trial|attempt|one_thread|device)",
+    "torch": r"agents\..*|orchestrator\.trial\.(trial|one_thread|device)",
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\.rivergrid\..*",
     "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
@@ -65,9 +65,11 @@ ADAPTERS = {
 LAYERS = (
     (
         "background_thread",
+        "counting",
         "errors",
         "exit_codes",
         "located_yaml",
+        "process_scope",
         "redaction",
         "spec",
         "untrusted",
@@ -200,11 +202,32 @@ def test_no_package_file_imports_anything() -> None:
             assert list(imports(parsed(path))) == [], path
 
 
+# What may load pickles, with the reason.
+MAY_UNPICKLE = {
+    # Tune hands the error of a trial to a callback only as a file that this process wrote a moment before, in
+    # a private folder. Ray's Trial.get_pickled_error reads the storage, where the file is not yet.
+    "orchestrator.ray.tune_callbacks": {"cloudpickle"},
+}
+
+
+def unpicklers(tree: ast.AST) -> set[str]:
+    """The modules that load pickles among the imports, those of other packages too: ``ray.cloudpickle``."""
+    parts = {part for name in imports(tree) for part in name.split(".")}
+    return parts & {"pickle", "cloudpickle", "dill", "marshal", "shelve"}
+
+
+@pytest.mark.parametrize(
+    "line", ["from ray import cloudpickle", "import ray.cloudpickle as cp", "import dill"]
+)
+def test_a_pickle_of_another_package_is_found(line: str) -> None:
+    assert unpicklers(ast.parse(line))
+
+
 def test_nothing_that_is_read_can_run_code() -> None:
     """No pickles, no unsafe YAML, no eval; tensors are loaded as weights only."""
     for path in FILES:
         tree = parsed(path)
-        assert not {"pickle", "cloudpickle", "dill", "marshal", "shelve"} & set(imports(tree)), path
+        assert unpicklers(tree) == MAY_UNPICKLE.get(dotted(path), set()), path
         for node in ast.walk(tree):
             if isinstance(node, ast.Call):
                 called = ast.unparse(node.func)

@@ -6,7 +6,7 @@ import zipfile
 
 import pytest
 
-from recrl.orchestrator.files.archives import METHODS, UNREADABLE, unpacked
+from recrl.analysis.data.archives import METHODS, UNREADABLE, unpacked
 
 
 def packed(members: dict[str, bytes], method: int) -> bytes:
