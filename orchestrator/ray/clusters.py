@@ -7,7 +7,7 @@ import os
 import secrets
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -20,6 +20,7 @@ from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.provenance.own_package import copy_package
 from recrl.orchestrator.ray.private_api import (
     at_loopback,
+    fewer_processes,
     own_sessions,
     quiet_driver,
     require_known_ray,
@@ -53,6 +54,19 @@ WORKER = {
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
 }
 
+# Ray's processes poll up to ten times a second. Recrl's own cluster has one machine, no large objects and no
+# reader of metrics; none of these settings affects the detection of dead processes. They are set in Ray's
+# environment, where a version that does not know one ignores it.
+SELDOM: Mapping[str, int] = {
+    "enable_metrics_collection": 0,
+    "gcs_pull_resource_loads_period_milliseconds": 10_000,  # for an autoscaler
+    "kill_idle_workers_interval_ms": 1_000,
+    "local_fs_monitor_interval_ms": 10_000,  # before objects are spilled to disk
+    "memory_monitor_refresh_ms": 2_000,
+    "object_manager_timer_freq_ms": 1_000,
+    "prestart_worker_first_driver": 0,  # an idle worker wakes a hundred times a second
+    "raylet_check_gc_period_milliseconds": 10_000,
+}
 LOOPBACK = "127.0.0.1"
 
 logger = logging.getLogger("recrl.sweep")
@@ -76,7 +90,8 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
         token_path = folder / TOKEN
         with open(os.open(token_path, os.O_CREAT | os.O_WRONLY, 0o600), "w") as file:
             file.write(_token())
-        with environment(QUIET | WORKER | {TOKEN_VARIABLE: str(token_path)}):
+        seldom = {f"RAY_{name}": str(value) for name, value in SELDOM.items()}
+        with environment(QUIET | WORKER | seldom | {TOKEN_VARIABLE: str(token_path)}):
             for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
                 os.environ.pop(name, None)  # Ray uses the mode only if it is set before Ray starts
             with (
@@ -153,7 +168,7 @@ def _connect(**settings: Any) -> None:
     """Call ``ray.init`` again if a busy machine took longer than the time that Ray allows."""
     for tries_left in range(CONNECT_TRIES - 1, -1, -1):
         try:
-            with own_signal_handlers(), own_sessions():
+            with own_signal_handlers(), own_sessions(), fewer_processes():
                 ray.init(log_to_driver=False, logging_level=logging.CRITICAL, **settings)
             return
         except Exception as error:  # Ray raises a bare Exception for a node that starts too slowly

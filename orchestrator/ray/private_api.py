@@ -7,8 +7,9 @@ new version.
 
 from __future__ import annotations
 
+import inspect
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -20,10 +21,14 @@ from recrl.orchestrator.errors import ClusterError
 NEWEST = (2, 60)  # version of Ray that these names were checked with
 RANGE = "ray[tune]>=2.48,<2.61"
 NAMES = (
+    "parameter.RayParams",
     "ray_constants.ENABLE_RAY_CLUSTER",
     "services.ConsolePopen",
     "worker._worker_logs_enabled",
 )
+# Processes that ``ray start`` can omit and ``ray.init`` cannot. One copies the workers' output to the driver,
+# which does not need it (trials have logs). The other requests machines from an autoscaler.
+LEFT_OUT: Mapping[str, Any] = {"include_log_monitor": False, "no_monitor": True}
 
 logger = logging.getLogger("recrl.sweep")
 
@@ -57,6 +62,16 @@ def own_sessions() -> Iterator[None]:
     """
     popen = getattr(*_place("services.ConsolePopen"))
     with _replaced("services.ConsolePopen", partial(popen, start_new_session=True)):
+        yield
+
+
+@contextmanager
+def fewer_processes() -> Iterator[None]:
+    """Do not start the processes of LEFT_OUT; an existing cluster starts none anyway."""
+    whole = getattr(*_place("parameter.RayParams"))
+    known = inspect.signature(whole).parameters
+    fewer = partial(whole, **{name: value for name, value in LEFT_OUT.items() if name in known})
+    with _replaced("parameter.RayParams", fewer):
         yield
 
 

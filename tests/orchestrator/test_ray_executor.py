@@ -341,6 +341,13 @@ def test_only_this_user_can_read_the_clusters_token() -> None:
     assert stat.S_IMODE(token.parent.stat().st_mode) == 0o700
 
 
+def commands_running() -> Iterator[bytes]:
+    """The command line of every process, but of those that end meanwhile."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            yield path.read_bytes()
+
+
 def listening_addresses(pids: set[int]) -> set[str]:
     """The addresses, in the kernel's hexadecimal form, at which some processes take connections."""
     sockets = set()
@@ -360,13 +367,13 @@ def listening_addresses(pids: set[int]) -> set[str]:
 @pytest.mark.usefixtures("cluster")
 def test_nothing_of_a_cluster_of_ours_listens_beyond_this_machine() -> None:
     worker = start_teacher_service("listening")
-    names = ("ray::", "raylet", "gcs_server", "python")
+    names = ("ray::", "raylet", "gcs_server")
     pids = {os.getpid(), process_of(worker)}
     for path in Path("/proc").glob("[0-9]*/comm"):
         with suppress(OSError):
             if path.read_text().startswith(names) and of_this_cluster(path.parent):
                 pids.add(int(path.parent.name))
-    assert len(pids) >= 8  # this process, head, node, two monitors, two agents, a worker
+    assert len(pids) >= 6  # this process, head, node, two agents, a worker
     mapped = "0000000000000000FFFF00000100007F"  # 127.0.0.1, in the table of IPv6
     assert listening_addresses(pids) == {"0100007F", mapped}
 
@@ -378,6 +385,13 @@ def of_this_cluster(process: Path) -> bool:
 
 
 @pytest.mark.usefixtures("cluster")
+def test_a_cluster_of_ours_has_no_process_that_serves_nobody() -> None:
+    folder = os.environ["RAY_AUTH_TOKEN_PATH"].removesuffix("token").encode()
+    commands = [command for command in commands_running() if folder in command]
+    assert any(b"gcs_server" in command for command in commands)
+    assert not any(name in command for command in commands for name in (b"log_monitor", b"monitor.py"))
+
+
 def test_rays_signal_handlers_do_not_replace_ours(cluster: object) -> None:
     assert signal.getsignal(signal.SIGTERM) is cluster
 

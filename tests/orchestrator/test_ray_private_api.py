@@ -14,9 +14,10 @@ from recrl.orchestrator.ray import private_api
 WHAT_TO_DO = """\
 Ray has changed a private name that recrl uses. In orchestrator/ray/private_api.py, for each name:
 1. own_sessions: how does Ray start its processes now? Ctrl-C must not reach them (test_ray_services.py).
-2. at_loopback: does ray.init(_node_ip_address="127.0.0.1") keep to it now? If so, drop it. Never drop it
+2. fewer_processes: may be dropped; then a local cluster has two idle processes more.
+3. at_loopback: does ray.init(_node_ip_address="127.0.0.1") keep to it now? If so, drop it. Never drop it
    otherwise: Ray's services would listen on the network (test_ray_services.py).
-3. quiet_driver: may be dropped; then Ray prints a paragraph about every dead process.
+4. quiet_driver: may be dropped; then Ray prints a paragraph about every dead process.
 Then run tests/orchestrator/test_ray_*.py, and set NEWEST and RANGE there and the range in pyproject.toml.
 """
 
@@ -25,6 +26,13 @@ Then run tests/orchestrator/test_ray_*.py, and set NEWEST and RANGE there and th
 def test_the_installed_ray_has_the_names(name: str) -> None:
     module, attribute = private_api._place(name)
     assert hasattr(module, attribute), WHAT_TO_DO
+
+
+def test_the_installed_ray_has_the_parameters_that_are_set() -> None:
+    import inspect  # noqa: PLC0415
+
+    known = inspect.signature(ray._private.parameter.RayParams).parameters
+    assert known.keys() >= private_api.LEFT_OUT.keys(), WHAT_TO_DO
 
 
 def test_the_project_declares_the_range_that_was_tested() -> None:
@@ -58,6 +66,7 @@ def test_a_newer_ray_is_used_with_a_warning(
     ("patch", "name"),
     [
         (private_api.own_sessions, "services.ConsolePopen"),
+        (private_api.fewer_processes, "parameter.RayParams"),
         (private_api.at_loopback, "ray_constants.ENABLE_RAY_CLUSTER"),
     ],
 )
