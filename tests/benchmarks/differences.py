@@ -63,17 +63,25 @@ def differences(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> pd.Da
     return table.assign(p_holm=holm(table["p"].to_numpy()))
 
 
+def paired(differences: Floats) -> tuple[float, float, float, float]:
+    """The mean of paired differences, the ends of its interval, and the p value; p is 1 if all are 0."""
+    if not differences.any():
+        return 0.0, 0.0, 0.0, 1.0
+    test = stats.ttest_1samp(differences, 0.0)
+    low, high = test.confidence_interval(CONFIDENCE)
+    return float(differences.mean()), float(low), float(high), float(test.pvalue)
+
+
 def paired_differences(rows: pd.DataFrame, baseline: str, column: str) -> pd.DataFrame:
-    """A row a task, agent and curriculum: it minus the baseline, over the seeds that have both."""
+    """A row a task, agent and curriculum: it minus the baseline, over the two or more seeds with both."""
     wide = rows.pivot(index=["task", "agent", "seed"], columns="method", values=column)
     found = []
     for method in wide.columns.drop(baseline):
         pairs = wide[[method, baseline]].dropna()
         for (task, agent), pair in pairs.groupby(level=["task", "agent"]):
-            test = stats.ttest_rel(pair[method], pair[baseline])
-            low, high = test.confidence_interval(CONFIDENCE)
-            mean = float((pair[method] - pair[baseline]).mean())
-            found.append((task, agent, method, len(pair), mean, low, high, float(test.pvalue)))
+            each = (pair[method] - pair[baseline]).to_numpy()
+            if len(each) > 1:
+                found.append((task, agent, method, len(each), *paired(each)))
     table = pd.DataFrame(found, columns=["task", "agent", "method", "n", column, "low", "high", "p"])
     table = table.sort_values(["task", "agent", "method"])
     return table.assign(p_holm=holm(table["p"].to_numpy()))
