@@ -152,6 +152,7 @@ class Simulations:
         view = self._batch.view
         self.rows: Floats = view(self._library.mjb_state(address), np.float64, (number, size))
         self._warnings = view(self._library.mjb_warning(address), np.int32, (number, _NUM_WARNINGS, 2))
+        # they are neighbours in mjtWarning, so that this is a view
         self._bad_states = self._warnings[:, min(BAD_STATES) : max(BAD_STATES) + 1, 1]
         self._status = view(self._library.mjb_status(address), np.int32, (number,))
         self.stopped = np.zeros(number, np.bool_)
@@ -208,7 +209,8 @@ class Simulations:
     def compute_body_forces(self) -> None:
         """Compute the forces on bodies (``cfrc_ext``), which MuJoCo does not compute in a step."""
         function = ctypes.cast(self._library.mj_rnePostConstraint, ctypes.c_void_p)
-        # MuJoCo passes (model, data, index, argument); this function takes the first two of them.
+        # MuJoCo passes (model, data, index, argument). This function takes the first two. The calling
+        # conventions of the processors that MuJoCo supports ignore the others; the parity of Humanoid shows it.
         self._call(self._library.mjb_apply, None, function, None, 0)
         self._call(self._library.mjb_forward, None, _NOTHING)  # copies the outputs
 

@@ -124,7 +124,7 @@ def within(name: str, package: str) -> bool:
 
 
 def may_import(path: Path, name: str) -> bool:
-    """Whether a module may import a name of ours; a package by itself if it may import a part of it."""
+    """Whether a module may import a name of ours. It may import a package of which it may import a part."""
     own = package(path)
     allowed = [f"recrl.{own}", *ALLOWED[own]]
     if re.fullmatch(WITH_ANALYSIS, dotted(path)):
