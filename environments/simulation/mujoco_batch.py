@@ -210,7 +210,7 @@ class Simulations:
         """Compute the forces on bodies (``cfrc_ext``), which MuJoCo does not compute in a step."""
         function = ctypes.cast(self._library.mj_rnePostConstraint, ctypes.c_void_p)
         # MuJoCo passes (model, data, index, argument). This function takes the first two. The calling
-        # conventions of the processors that MuJoCo supports ignore the others; the parity of Humanoid shows it.
+        # conventions of the processors that MuJoCo supports ignore the others; Humanoid's parity shows it.
         self._call(self._library.mjb_apply, None, function, None, 0)
         self._call(self._library.mjb_forward, None, _NOTHING)  # copies the outputs
 
