@@ -55,7 +55,8 @@ def test_the_task_of_the_template_can_be_filmed(folder: Path) -> None:
         environment.step(1)
     frame = environment.render()
     assert isinstance(frame, np.ndarray)
-    assert (frame.shape, frame.dtype) == ((48, 312, 3), np.uint8)
+    assert frame.shape == (48, 312, 3)
+    assert frame.dtype == np.uint8
     assert (frame[24, -24:] != 255).any()  # at the goal, and not beyond the image
 
 

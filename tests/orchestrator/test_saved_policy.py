@@ -249,7 +249,7 @@ def test_an_error_of_a_tasks_own_rendering_is_kept(
         raise NotImplementedError("only for people")
 
     monkeypatch.setattr(RiverGridEnv, "render", render)
-    with pytest.raises(RecrlError, match="cannot be filmed: NotImplementedError: only for people$"):
+    with pytest.raises(RecrlError, match=r"cannot be filmed: NotImplementedError: only for people$"):
         SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
