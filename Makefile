@@ -6,7 +6,11 @@
 # make chaos     install, kill whatever a sweep is made of for ten minutes: SECONDS=600 SEED=0
 # make storage-test   install, run a sweep on a cluster that shares an S3 server and no folder, and harm it: needs root, says so
 # make cluster-test   install, run docker/compose.yaml's cluster in network namespaces and harm it: needs root, says so
+#
+# By default pip installs torch with CUDA, several GB that only a GPU needs. For CPUs only, at the first make:
+#   make install TORCH_INDEX=https://download.pytorch.org/whl/cpu
 PYTHON ?= python3
+TORCH_INDEX ?=
 BIN := .venv/bin
 
 .PHONY: install demo test lint docs chaos cluster-test storage-test clean
@@ -17,7 +21,7 @@ install: .venv/installed
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "recrl needs Python 3.11 or newer: make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt $(if $(TORCH_INDEX),--no-deps --index-url $(TORCH_INDEX)) torch
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 

@@ -24,6 +24,7 @@ from recrl.agents.agent import FinalPolicy
 from recrl.agents.collection import Collector, FinishedEpisode
 from recrl.agents.spaces import environment_actions
 from recrl.environments.cmdp import Floats
+from recrl.environments.registry import NotDrawnError
 from recrl.environments.vector import CMDPVectorEnv
 
 CHUNK_STEPS = 100
@@ -146,7 +147,7 @@ def film(
         Shots, the last step included; none after ``MAX_FILMED_STEPS`` steps, even if the episode goes on.
 
     Raises:
-        ValueError: the environment does not render an RGB frame.
+        NotDrawnError: the environment does not render an RGB frame.
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
@@ -169,10 +170,16 @@ def film(
 
 
 def _frame(environment: gymnasium.Env[Any, Any]) -> npt.NDArray[np.uint8]:
-    drawn: Any = environment.render()
+    wanted = "an RGB image, a uint8 array of shape (H, W, 3)"
+    try:
+        drawn: Any = environment.render()
+    except NotImplementedError as error:
+        if type(environment.unwrapped).render is not gymnasium.Env.render:  # the user's own error
+            raise
+        raise NotDrawnError(f"it has no render(), which must return {wanted}") from error
     if not (isinstance(drawn, np.ndarray) and drawn.dtype == np.uint8 and drawn.shape[2:] == (3,)):
         kind = f"{drawn.dtype} {drawn.shape}" if isinstance(drawn, np.ndarray) else type(drawn).__name__
-        raise ValueError(f"a frame must be uint8 of shape [height, width, 3], got {kind}")
+        raise NotDrawnError(f"render() must return {wanted}, got {kind}")
     frame: npt.NDArray[np.uint8] = drawn
     return frame
 

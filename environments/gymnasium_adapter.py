@@ -242,9 +242,11 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
     def _step(self, index: int, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         returned = self._environments[index].step(action)
         if not isinstance(returned, tuple) or len(returned) != 5 or not isinstance(returned[4], dict):
+            six = isinstance(returned, tuple) and len(returned) == 6
+            hint = "; six values: put the cost into info['cost'], by a wrapper as in examples/cost_wrapper"
             raise ValueError(
                 f"{self.cmdp.name}: step must return (observation, reward, terminated, truncated, info), "
-                f"got {_brief(returned)}"
+                f"got {_brief(returned)}{hint if six else ''}"
             )
         for name, flag in zip(("terminated", "truncated"), returned[2:4], strict=True):
             if not _is_flag(flag):

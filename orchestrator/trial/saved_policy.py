@@ -147,6 +147,8 @@ class SavedTrial:
             write_video(path, frames, frames_per_second=speed / every)
         except RecrlError:
             raise
+        except NotDrawnError as error:
+            raise RecrlError(f"{self.spec.title}: the task {task.name} cannot be filmed: {error}") from error
         except USERS_ERRORS as error:  # the user's task, or a missing graphics library
             raise RecrlError(f"{self.spec.title}: cannot be filmed: {described(error)}") from error
         finally:

@@ -104,7 +104,7 @@ def _mp4(frames: Iterable[Frame], frames_per_second: float) -> bytes:
         import av  # noqa: PLC0415  (optional)
     except ImportError as error:
         raise RecrlError(
-            "MP4 needs the package av (pip install 'recrl[video]'), which is missing; GIF needs no package"
+            "MP4 needs the package av, which is missing: pip install av; GIF needs no package"
         ) from error
     data = io.BytesIO()
     with av.open(data, "w", format="mp4") as container:

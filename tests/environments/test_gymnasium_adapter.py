@@ -376,6 +376,19 @@ def test_what_an_environment_returns_is_looked_at(field: str, value: Any, senten
     assert str(caught.value).startswith(sentence)
 
 
+@pytest.mark.parametrize(("values", "wrapper"), [(4, False), (6, True), (7, False)])
+def test_a_separate_cost_is_told_of_the_wrapper(values: int, wrapper: bool) -> None:
+    class Separate(Steered):
+        def step(self, action: Any) -> Any:
+            return (np.zeros(2, np.float32), *[0.0] * values)[:values]
+
+    environments = SyncCMDPVectorEnv("separate", [Separate])
+    environments.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^separate: step must return \(observation, reward, ") as caught:
+        environments.step(np.zeros((1, 2)))
+    assert str(caught.value).endswith("by a wrapper as in examples/cost_wrapper") == wrapper
+
+
 class Observing(Countdown):
     """Has an observation space, and returns the observation that it was given, in the space or not."""
 

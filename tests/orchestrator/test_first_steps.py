@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 import yaml
 
 from recrl.agents.registry import AGENTS
-from recrl.environments.registry import TASKS
+from recrl.environments.plugins import modules_in
+from recrl.environments.registry import TASKS, make_drawn
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.cli.requests import TEMPLATES
 from recrl.orchestrator.exit_codes import ExitCode
@@ -42,6 +44,20 @@ def test_every_template_is_a_right_grid(
     out = output(capsys, "init", "--template", template)
     assert out.endswith(f"Next: recrl-sweep launch {template}.yaml\n")
     assert f"{template} is right" in output(capsys, "validate", f"{template}.yaml", "--trust")
+
+
+def test_the_task_of_the_template_can_be_filmed(folder: Path) -> None:
+    main(["init", "--template", "own-task"])
+    with modules_in(folder):
+        environment = make_drawn("my_task:make", options={"length": 12})
+    environment.reset(seed=0)
+    for _ in range(7):
+        environment.step(1)
+    frame = environment.render()
+    assert isinstance(frame, np.ndarray)
+    assert frame.shape == (48, 312, 3)
+    assert frame.dtype == np.uint8
+    assert (frame[24, -24:] != 255).any()  # at the goal, and not beyond the image
 
 
 def test_the_demo_is_that_of_the_repository() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
@@ -217,11 +218,38 @@ def test_a_task_without_rendering_is_a_sentence(complete: TrialStore) -> None:
         SavedTrial.load(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
-def test_a_task_that_fails_to_render_is_a_sentence(
+@pytest.mark.parametrize(
+    ("render", "reason"),
+    [
+        (lambda _: None, "render() must return an RGB image, a uint8 array of shape (H, W, 3), got NoneType"),
+        (
+            lambda _: np.zeros((4, 4, 3)),
+            "render() must return an RGB image, a uint8 array of shape (H, W, 3), got float64 (4, 4, 3)",
+        ),
+        (
+            gymnasium.Env.render,
+            "it has no render(), which must return an RGB image, a uint8 array of shape (H, W, 3)",
+        ),
+    ],
+)
+def test_a_task_that_does_not_render_rgb_is_a_sentence(
+    crossing: TrialStore, monkeypatch: pytest.MonkeyPatch, render: Any, reason: str
+) -> None:
+    monkeypatch.setattr(RiverGridEnv, "render", render)
+    with pytest.raises(RecrlError) as error:
+        SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+    title = "rivergrid-1a ppo-lag none seed 5"
+    assert str(error.value) == f"{title}: the task rivergrid-1a cannot be filmed: {reason}"
+
+
+def test_an_error_of_a_tasks_own_rendering_is_kept(
     crossing: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(RiverGridEnv, "render", lambda _: None)
-    with pytest.raises(RecrlError, match="cannot be filmed: ValueError: a frame must be uint8"):
+    def render(_: RiverGridEnv) -> None:
+        raise NotImplementedError("only for people")
+
+    monkeypatch.setattr(RiverGridEnv, "render", render)
+    with pytest.raises(RecrlError, match=r"cannot be filmed: NotImplementedError: only for people$"):
         SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 

@@ -75,7 +75,7 @@ def test_mp4_without_its_package_is_one_clear_sentence(
     with pytest.raises(RecrlError) as error:
         write_video(tmp_path / "film.mp4", [plain(BLUE)], frames_per_second=10.0)
     assert str(error.value) == (
-        "MP4 needs the package av (pip install 'recrl[video]'), which is missing; GIF needs no package"
+        "MP4 needs the package av, which is missing: pip install av; GIF needs no package"
     )
     assert list(tmp_path.iterdir()) == []
 
