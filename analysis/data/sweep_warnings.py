@@ -17,7 +17,12 @@ from recrl.orchestrator.files.curriculum_warnings import (
     landed_hard,
     no_curriculum_sentence,
 )
-from recrl.orchestrator.provenance.code_changes import InstalledCode, other_code, other_code_sentence
+from recrl.orchestrator.provenance.code_changes import (
+    InstalledCode,
+    compare,
+    missing_modules_sentence,
+    other_code_sentence,
+)
 from recrl.orchestrator.spec import TrialState
 
 BASELINE = "none"  # of ``metrics.comparisons``
@@ -31,14 +36,16 @@ def damages(sweep: Sweep) -> list[str]:
 
 
 def doubts(sweep: Sweep) -> list[str]:
-    """Return sentences on trials of other code than is installed, on mixed code and ineffective curricula."""
+    """Return sentences on changed, missing and mixed code, and on ineffective curricula."""
     installed = InstalledCode()
-    changed = [it for it in sweep.facts if other_code(attempts(it), it.spec, installed)]
+    codes = [compare(attempts(it), it.spec, installed) for it in sweep.facts]
+    changed = [it for it, code in zip(sweep.facts, codes, strict=True) if code.differs]
     complete = sum(it.status is TrialState.COMPLETE for it in changed)
-    code = other_code_sentence(complete, len(changed) - complete)
-    if code and sweep.folder is None:
-        code += ", in a sweep's own folder"
-    return [*filter(None, (code, mixed_code_sentence(sweep))), *curriculum_warnings(sweep)]
+    other = other_code_sentence(complete, len(changed) - complete)
+    if other and sweep.folder is None:
+        other += ", in a sweep's own folder"
+    missing = missing_modules_sentence(code.missing for code in codes)
+    return [*filter(None, (other, missing, mixed_code_sentence(sweep))), *curriculum_warnings(sweep)]
 
 
 def mixed_code_sentence(sweep: Sweep) -> str:
