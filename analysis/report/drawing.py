@@ -68,6 +68,7 @@ from recrl.analysis.statistics.curves import MEAN, CurveAverage, interquartile
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.errors import RecrlError, described
+from recrl.orchestrator.files.outcomes_file import FAILED, INFEASIBLE
 from recrl.orchestrator.spec import TrialState
 
 RELOAD_SECONDS = 120  # of the page of a sweep that runs
@@ -244,7 +245,7 @@ def _list(sentences: Sequence[str]) -> list[str]:
 
 def _marked(table: pd.DataFrame) -> pd.DataFrame:
     """Return the verdict table with violations and failures in bold."""
-    bad = (verdict_texts.INFEASIBLE, verdict_texts.FAILED)
+    bad = (INFEASIBLE, FAILED)
     texts = [f"**{text}**" if any(word in text for word in bad) else text for text in table["verdict"]]
     return table.assign(verdict=texts)
 

@@ -14,13 +14,13 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report.table_formats import not_corrected, with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 from recrl.environments.registry import TASKS
+from recrl.orchestrator.files.outcomes_file import FAILED, FEASIBLE, INFEASIBLE, PENDING, SOLVED
 from recrl.orchestrator.spec import TrialState
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
 DIFFERENCE = "difference to none"
-SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
-FAILED, PENDING, UNEVALUATED = "failed", "no result yet", "not evaluated"
+UNEVALUATED = "not evaluated"
 WARNINGS = {
     "no_curriculum": (
         "curriculum without effect",

@@ -16,9 +16,10 @@ import pandas as pd
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdicts import is_cost, within_limit
+from recrl.orchestrator.files.outcomes_file import VERDICT_MEASURE
 from recrl.orchestrator.spec import TrialState
 
-FINAL = Measure.STOCHASTIC
+FINAL = Measure(VERDICT_MEASURE)
 
 
 def count_verdicts(

@@ -14,14 +14,19 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from recrl.orchestrator.files.outcomes_file import (
+    FAILED,
+    FEASIBLE,
+    INFEASIBLE,
+    OUTCOMES_FILE,
+    PENDING,
+    SOLVED,
+    VERDICT_MEASURE,
+)
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialState
 from recrl.orchestrator.tracking.positions import file_mark
-
-FILE_NAME = "outcomes.csv"  # in the sweep's figures folder
-MEASURE = "stochastic"  # the measure of the report's verdicts
-SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class FinalOutcomes:
 
     def __init__(self, store: SweepStore) -> None:
         self._store = store
-        self._path = store.figures_folder / FILE_NAME
+        self._path = store.figures_folder / OUTCOMES_FILE
         self._mark = ""
         self._found: dict[str, FinalOutcome] = {}  # by trial id, as labels may be those of an earlier grid
 
@@ -128,7 +133,7 @@ class FinalOutcomes:
             if mark == self._mark:
                 return
             with self._path.open(encoding="utf-8", newline="") as file:
-                rows = [row for row in csv.DictReader(file) if row.get("measure") == MEASURE]
+                rows = [row for row in csv.DictReader(file) if row.get("measure") == VERDICT_MEASURE]
             outcomes = list(map(_outcome, rows))
         except FileNotFoundError:
             mark, outcomes = "", []
@@ -194,7 +199,7 @@ def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialState]) -> st
             up_to = "up to " if len(chosen) > 1 else ""
             by = f" by {up_to}{_text(max(it.excess for it in chosen))}" if verdict == INFEASIBLE else ""
             parts.append(f"{verdict}{count}{by}")
-    without = {"failed": failed, "no result yet": total - len(seeds) - failed}
+    without = {FAILED: failed, PENDING: total - len(seeds) - failed}
     for name, number in without.items():
         if number > 0:
             parts.append(f"{name} {number} of {total}" if number < total else name)
