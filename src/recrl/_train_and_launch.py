@@ -21,6 +21,7 @@ from recrl.environments.plugins import modules_here
 from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.spec import TrialState
@@ -68,7 +69,7 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
 def launch(
     grid: Grid,
     *,
-    root: str | Path = "runs",
+    root: str | Path = DEFAULT_ROOT,
     executor: str = "ray",
     address: str | None = None,
     max_concurrent: int | None = None,
