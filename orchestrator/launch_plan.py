@@ -18,7 +18,7 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import select
 from recrl.orchestrator.provenance.code_changes import CodeComparison, InstalledCode, compare_files
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 
 # Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the MLflow
 # sync; rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers are additional.
@@ -261,15 +261,15 @@ def usable_cores(quota_file: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
 
 def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAction:
     match record.status:
-        case TrialState.COMPLETE:
+        case TrialStatus.COMPLETE:
             return PlannedAction.COMPLETE
-        case TrialState.FAILED:
+        case TrialStatus.FAILED:
             return PlannedAction.RETRY if selection.retry_failed else PlannedAction.FAILED
-        case TrialState.DAMAGED:
-            was_ended = record.claims in (TrialState.COMPLETE, TrialState.FAILED)
+        case TrialStatus.DAMAGED:
+            was_ended = record.claims in (TrialStatus.COMPLETE, TrialStatus.FAILED)
             left_alone = was_ended and not selection.rerun_damaged
             return PlannedAction.DAMAGED if left_alone else PlannedAction.REPAIR
-        case TrialState.WAITING | TrialState.RUNNING:
+        case TrialStatus.WAITING | TrialStatus.RUNNING:
             return PlannedAction.RESUME if record.attempt else PlannedAction.NEW
 
 

@@ -21,7 +21,7 @@ from recrl.orchestrator.provenance.code_changes import (
     missing_modules_sentence,
     other_code_sentence,
 )
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
@@ -89,7 +89,7 @@ def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> No
     installed = InstalledCode()
     codes = [compare_files(saved.store, saved.spec, installed) for saved in evaluated]
     changed = [saved for saved, code in zip(evaluated, codes, strict=True) if code.differs]
-    complete = sum(saved.store.record().status is TrialState.COMPLETE for saved in changed)
+    complete = sum(saved.store.record().status is TrialStatus.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
         say(console, f"warning: {sentence}; these evaluations use the installed code")
     if sentence := missing_modules_sentence(code.missing for code in codes):

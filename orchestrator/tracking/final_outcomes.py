@@ -25,7 +25,7 @@ from recrl.orchestrator.files.outcomes_file import (
 )
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.positions import file_mark
 
 
@@ -96,7 +96,7 @@ class FinalOutcomes:
         """
         self._refresh()
         found = self._found.get(spec.trial_id)
-        if found is None or record.status is not TrialState.COMPLETE:
+        if found is None or record.status is not TrialStatus.COMPLETE:
             return None
         is_of_this_run = found.cpu_seconds is None or found.cpu_seconds == record.cpu_seconds
         return found if is_of_this_run else None
@@ -119,7 +119,8 @@ class FinalOutcomes:
         evaluated = (spec for spec in self._store.specs() if spec.evaluation_episodes)
         records = ((spec, self._store.trial(spec).record()) for spec in evaluated)
         return any(
-            record.status is TrialState.COMPLETE and self.of(spec, record) is None for spec, record in records
+            record.status is TrialStatus.COMPLETE and self.of(spec, record) is None
+            for spec, record in records
         )
 
     def has_sampled(self) -> bool:
@@ -163,7 +164,7 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
 
 
 def verdict_lines(
-    outcomes: Sequence[FinalOutcome], states: Mapping[tuple[str, str, str], Sequence[TrialState]]
+    outcomes: Sequence[FinalOutcome], states: Mapping[tuple[str, str, str], Sequence[TrialStatus]]
 ) -> list[str]:
     """Return the table of verdicts in Markdown, one row per task, agent and curriculum.
 
@@ -187,9 +188,9 @@ def verdict_lines(
     return lines
 
 
-def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialState]) -> str:
+def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> str:
     """Count a group's verdicts: ``solved 2 of 5, infeasible 2 of 5 by up to 0.28, failed 1 of 5``."""
-    failed = states.count(TrialState.FAILED)
+    failed = states.count(TrialStatus.FAILED)
     total = len(states)
     parts = []
     for verdict in (SOLVED, FEASIBLE, INFEASIBLE):

@@ -24,7 +24,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -214,7 +214,7 @@ def train(
 def _require_complete(trial: TrialStore, title: str) -> None:
     """Raise the error of a trial that failed, with its traceback as a note."""
     record = trial.record()
-    if record.status is TrialState.COMPLETE:
+    if record.status is TrialStatus.COMPLETE:
         return
     failed = RecrlError(f"{title}: {record.error or 'is not complete'}")
     if trial.error_path.exists():

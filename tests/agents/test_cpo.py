@@ -14,7 +14,7 @@ from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.agents.trust_region.local_model import LocalModel, improvement
 from recrl.environments.cmdp import Floats
@@ -40,7 +40,9 @@ def improve(
     rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=0.0), 2)
     experience = Experience.of(policy, batch, advantages, constraints)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
-    old = StochasticPolicy(3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0))
+    old = StochasticPolicy(
+        3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
+    )
     rows = batch.unique_observations
     moved = old.distribution(rows).divergence(policy.distribution(rows))  # type: ignore[arg-type]
     metrics["kl"] = float(torch.dot(batch.observation_weights, moved))

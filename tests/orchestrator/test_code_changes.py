@@ -34,7 +34,7 @@ from recrl.orchestrator.provenance.code_changes import (
 )
 from recrl.orchestrator.ray.tune_callbacks import DriverWatch
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
 from tests.orchestrator.launches import INLINE
@@ -255,7 +255,7 @@ def test_a_rerun_that_is_killed_while_it_moves_old_files_goes_on(
     (planned,) = make_plan(grid.trials(), store).trials
     assert planned.action is PlannedAction.RERUN
     run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
-    assert trial.record().status is TrialState.COMPLETE
+    assert trial.record().status is TrialStatus.COMPLETE
     assert trial.record().attempt == 1
     assert not trial.damages()
     assert not trial.rerun_path.exists()
@@ -275,11 +275,11 @@ def test_a_failed_trial_of_other_code_is_run_again_too(folder: Path) -> None:
     store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml", build=False)
     run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     (spec,) = grid.trials()
-    assert store.trial(spec).record().status is TrialState.FAILED
+    assert store.trial(spec).record().status is TrialStatus.FAILED
     change(folder)
     result = _rerun(grid, store, InlineExecutor())
     assert not result.plan.other_code
-    assert store.trial(spec).record().status is TrialState.COMPLETE
+    assert store.trial(spec).record().status is TrialStatus.COMPLETE
     assert not store.trial(spec).error_path.exists()
 
 
